@@ -1,0 +1,193 @@
+//! The seam between SGC and a local ROS 2 network: discovery in, raw samples in and out.
+//!
+//! Nothing here knows a DDS implementation; `sgc-dds` implements [`RosNetwork`] with Cyclone DDS,
+//! [`crate::fake`] in memory for tests. Payloads are serialised samples: the four-byte encapsulation
+//! header (RTPS 2.5, 10.2) and the body, untouched.
+
+use std::fmt;
+
+use bytes::Bytes;
+use sgc_wire::Qos;
+
+/// GUID of a DDS entity: 12 bytes of prefix, 4 of entity id (RTPS 2.5, 9.3.1).
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Guid(pub [u8; 16]);
+
+impl Guid {
+    /// True if the endpoint's type has no key: entity kind ends in 3 (writer) or 4 (reader)
+    /// (RTPS 2.5, table 9.1).
+    pub fn is_keyless(&self) -> bool {
+        matches!(self.0[15] & 0x0f, 3 | 4)
+    }
+}
+
+impl fmt::Debug for Guid {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (i, b) in self.0.iter().enumerate() {
+            if i > 0 && i % 4 == 0 {
+                f.write_str(".")?;
+            }
+            write!(f, "{b:02x}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Which end of a topic an endpoint is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum EndpointKind {
+    /// A DDS data reader.
+    Reader,
+    /// A DDS data writer.
+    Writer,
+}
+
+/// A DDS endpoint seen on the local network. Topic and type are the DDS names
+/// (`rt/chatter`, `std_msgs::msg::dds_::String_`).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DiscoveredEndpoint {
+    /// Reader or writer.
+    pub kind: EndpointKind,
+    /// Its GUID, unique on the network while it lives.
+    pub guid: Guid,
+    /// DDS topic name.
+    pub topic: String,
+    /// DDS type name.
+    pub type_name: String,
+    /// True if the type has no key.
+    pub keyless: bool,
+    /// `RIHS01_…` type hash from USER_DATA, if the endpoint carries one (REP 2016).
+    pub type_hash: Option<String>,
+    /// What it offers or requests.
+    pub qos: Qos,
+}
+
+/// What happens in the local graph. Endpoints made by SGC, this process's or another's, never appear.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum DiscoveryEvent {
+    /// An endpoint is there.
+    Appeared(DiscoveredEndpoint),
+    /// An endpoint is gone.
+    Vanished {
+        /// Which.
+        guid: Guid,
+    },
+}
+
+/// What to create on the local network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EndpointSpec {
+    /// DDS topic name.
+    pub topic: String,
+    /// DDS type name.
+    pub type_name: String,
+    /// True if the type has no key; must agree with the remote side or nothing matches.
+    pub keyless: bool,
+    /// Type hash to put in USER_DATA, as rmw does from Iron on.
+    pub type_hash: Option<String>,
+    /// Quality of service to offer or request.
+    pub qos: Qos,
+}
+
+/// What a received sample says about its instance.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SampleKind {
+    /// Data.
+    Write,
+    /// The instance was disposed of; the payload holds the key.
+    Dispose,
+    /// The writer unregistered the instance; the payload holds the key.
+    Unregister,
+}
+
+/// One serialised sample taken from a reader.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Sample {
+    /// Data or the end of an instance.
+    pub kind: SampleKind,
+    /// GUID of the writer, if the network tells.
+    pub writer: Option<Guid>,
+    /// Source time stamp, nanoseconds since the Unix epoch.
+    pub source_timestamp_ns: i64,
+    /// Encapsulation header and body.
+    pub payload: Bytes,
+}
+
+/// Receives the samples of one reader, on a thread of that reader alone: it may block, and while it
+/// does nothing but that reader waits.
+pub type SampleHandler = Box<dyn FnMut(Sample) + Send>;
+
+/// Receives discovery events on a thread of the network; must not block.
+pub type DiscoveryHandler = Box<dyn FnMut(DiscoveryEvent) + Send>;
+
+/// Why the local network refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RosError {
+    /// The DDS domain could not be joined.
+    #[error("cannot join ROS domain {domain}: {reason}")]
+    Domain {
+        /// Domain id.
+        domain: u32,
+        /// What the implementation said.
+        reason: String,
+    },
+    /// An endpoint could not be made.
+    #[error("cannot create a {kind} on {topic} [{type_name}]: {reason}")]
+    Create {
+        /// `"reader"` or `"writer"`.
+        kind: &'static str,
+        /// DDS topic.
+        topic: String,
+        /// DDS type.
+        type_name: String,
+        /// What the implementation said.
+        reason: String,
+    },
+    /// A payload that is no serialised sample: shorter than its header, or too large.
+    #[error("a payload of {bytes} bytes is not a serialised sample")]
+    Payload {
+        /// Its length.
+        bytes: usize,
+    },
+    /// A reliable write was not accepted in time: a local reader does not acknowledge.
+    #[error("the local network accepted no sample for {waited_ms} ms")]
+    WriteTimeout {
+        /// How long the write blocked.
+        waited_ms: u64,
+    },
+    /// Any other failure of a write.
+    #[error("write failed: {reason}")]
+    Write {
+        /// What the implementation said.
+        reason: String,
+    },
+}
+
+/// A local ROS 2 network.
+///
+/// Dropping the network ends discovery and waits for its threads; dropping a reader or writer deletes
+/// the entity and its topic, and waits for the thread that served it.
+pub trait RosNetwork: Send + Sync + 'static {
+    /// A reader; lives until dropped.
+    type Reader: Send + 'static;
+    /// A writer; lives until dropped.
+    type Writer: RosWriter;
+
+    /// Starts discovery; each endpoint already there is told as an appearance. Call once.
+    fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError>;
+
+    /// Creates a reader whose samples go to `handler`.
+    fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<Self::Reader, RosError>;
+
+    /// Creates a writer.
+    fn create_writer(&self, spec: &EndpointSpec) -> Result<Self::Writer, RosError>;
+}
+
+/// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.
+pub trait RosWriter: Send + Sync + 'static {
+    /// Writes, disposes or unregisters with the given source time stamp (nanoseconds since the Unix epoch).
+    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError>;
+
+    /// How many local readers are matched at present.
+    fn matched_readers(&self) -> u32;
+}

@@ -1,0 +1,530 @@
+//! Control frames between neighbours, and the signed bodies that travel in them from end to end.
+//!
+//! A frame is one type byte and its fields. What is signed is kept as the bytes that were signed
+//! ([`Signed`]), so that no re-encoding can change what a signature covers. Checking signatures is
+//! `sgc-trust`'s, acting on frames `sgc-router`'s and `sgc-endpoint`'s.
+
+use bytes::Bytes;
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::ids::{Blind, Name, SinkId, UnixMillis};
+
+/// Longest control frame, bytes.
+pub const CONTROL_FRAME_BYTES_MAX: usize = 1024 * 1024;
+/// Most names in one advertisement.
+pub const ADVERT_NAMES_MAX: usize = 256;
+/// Most names in one interest, or in one notice that names are out of reach.
+pub const NAMES_PER_FRAME_MAX: usize = 4096;
+/// Most certificates in a chain, leaf first.
+pub const CHAIN_CERTS_MAX: usize = 4;
+/// Longest certificate, bytes.
+pub const CERT_BYTES_MAX: usize = 4096;
+/// Longest signature, bytes (RSA 4096).
+pub const SIGNATURE_BYTES_MAX: usize = 512;
+/// Longest public key for replies, bytes (room for hybrid post-quantum keys).
+pub const REPLY_KEY_BYTES_MAX: usize = 2048;
+/// Longest sealed content of an answer, bytes.
+pub const SEALED_BYTES_MAX: usize = 768 * 1024;
+
+/// A frame between neighbours.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Control {
+    /// First on every link, both ways.
+    Hello(Hello),
+    /// A signed advertisement, and how many links it crossed.
+    Advert {
+        /// Links crossed so far; the owner's own node sends 0.
+        hops: u8,
+        /// An [`AdvertBody`].
+        signed: Signed,
+    },
+    /// The sender can no longer reach these names.
+    Unreach {
+        /// Which.
+        names: Vec<Name>,
+    },
+    /// The sender wants to hear where these names are.
+    Interest {
+        /// Which.
+        names: Vec<Name>,
+    },
+    /// The sender no longer wants to hear of these names.
+    Uninterest {
+        /// Which.
+        names: Vec<Name>,
+    },
+    /// A signed request to join a name's tree; travels towards the owner.
+    Join {
+        /// Name and sink as in the body, for routers that only pass it on.
+        signed: Signed,
+    },
+    /// A sink is gone; travels towards the owner.
+    Leave {
+        /// Name.
+        name: Name,
+        /// Sink.
+        sink: SinkId,
+    },
+    /// The owner's signed answer to a join; travels along the branch to the sink.
+    Answer {
+        /// An [`AnswerBody`].
+        signed: Signed,
+    },
+    /// A router refuses a join, or cuts a branch.
+    Reject {
+        /// Name.
+        name: Name,
+        /// Sink.
+        sink: SinkId,
+        /// Why.
+        reason: RejectReason,
+    },
+    /// The sender closes in good order: all it advertised is withdrawn.
+    Goodbye,
+}
+
+/// The first frame of a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Hello {
+    /// Minor version of the protocol; the major one is in the transport's negotiation.
+    pub minor: u16,
+    /// Random number of this run of the process: another one means that all state of the last is void.
+    pub incarnation: u64,
+    /// True for a router, which carries others' names; false for a node that only serves itself.
+    pub transit: bool,
+}
+
+/// Why a router refuses a join.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum RejectReason {
+    /// The name is not reachable from here.
+    NoRoute,
+    /// The request's certificate, signature or time does not verify.
+    NotVerified,
+    /// A limit of the router is reached.
+    Limit,
+    /// The owner or a router on the way took too long.
+    TimedOut,
+    /// The branch is cut because the way to the owner changed or broke.
+    RouteLost,
+}
+
+/// Bytes and a signature over them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Signed {
+    /// What was signed.
+    pub body: Bytes,
+    /// Signature by the key of the first certificate in the body's chain or of the name's owner.
+    pub signature: Bytes,
+}
+
+/// What an owner advertises.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AdvertBody {
+    /// Certificates of the owner, leaf first, DER.
+    pub chain: Vec<Bytes>,
+    /// Grows with every advertisement of the owner.
+    pub seq: u64,
+    /// When it was signed.
+    pub issued_at: UnixMillis,
+    /// For how long it holds, milliseconds from its arrival.
+    pub lease_ms: u32,
+    /// True if these names are withdrawn.
+    pub withdraw: bool,
+    /// One per name: `name = SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
+    pub blinds: Vec<Blind>,
+}
+
+/// What a joiner wants to be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Role {
+    /// Receives what is published under the name.
+    Subscribe,
+    /// Publishes under the name.
+    Publish,
+}
+
+/// A request to join.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct JoinBody {
+    /// The name.
+    pub name: Name,
+    /// This incarnation of the joiner.
+    pub sink: SinkId,
+    /// Role.
+    pub role: Role,
+    /// When it was signed.
+    pub issued_at: UnixMillis,
+    /// Certificates of the joiner, leaf first, DER.
+    pub chain: Vec<Bytes>,
+    /// Fresh HPKE public key that the answer is sealed to.
+    pub reply_key: Bytes,
+}
+
+/// An owner's answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AnswerBody {
+    /// The name.
+    pub name: Name,
+    /// Whom it answers.
+    pub sink: SinkId,
+    /// Grows with every answer to that sink.
+    pub serial: u64,
+    /// Yes or no.
+    pub answer: Answer,
+}
+
+/// Yes, with what was asked for, or no, with the reason.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Answer {
+    /// Granted; the content is sealed to the request's reply key (HPKE, RFC 9180).
+    Grant {
+        /// Encapsulated key.
+        enc: Bytes,
+        /// Sealed content.
+        sealed: Bytes,
+    },
+    /// Refused, or a grant taken back.
+    Refuse {
+        /// Why.
+        reason: RefuseReason,
+    },
+}
+
+/// Why an owner refuses.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum RefuseReason {
+    /// The requester is not in the share's `to`.
+    NotPermitted,
+    /// The owner does not share that name (any more).
+    NotShared,
+    /// The request's certificate, signature or time does not verify at the owner.
+    NotVerified,
+    /// The share does not offer that role.
+    RoleNotOffered,
+    /// A limit of the owner is reached.
+    Limit,
+}
+
+macro_rules! tags {
+    ($type:ident, $field:literal, $($variant:ident = $tag:literal),+ $(,)?) => {
+        impl Encode for $type {
+            fn encode(&self, w: &mut Writer) {
+                w.u8(match self { $(Self::$variant => $tag),+ });
+            }
+        }
+
+        impl Decode for $type {
+            fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+                match r.u8()? {
+                    $($tag => Ok(Self::$variant),)+
+                    v => Err(DecodeError::value($field, v.into())),
+                }
+            }
+        }
+    };
+}
+
+tags!(Role, "role", Subscribe = 0, Publish = 1);
+tags!(RejectReason, "reject reason", NoRoute = 0, NotVerified = 1, Limit = 2, TimedOut = 3, RouteLost = 4);
+tags!(
+    RefuseReason,
+    "refuse reason",
+    NotPermitted = 0,
+    NotShared = 1,
+    NotVerified = 2,
+    RoleNotOffered = 3,
+    Limit = 4
+);
+
+impl std::fmt::Display for RejectReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::NoRoute => "the router knows no way to the owner",
+            Self::NotVerified => "the router could not verify the request",
+            Self::Limit => "a limit of the router is reached",
+            Self::TimedOut => "the owner did not answer in time",
+            Self::RouteLost => "the way to the owner broke",
+        })
+    }
+}
+
+impl std::fmt::Display for RefuseReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::NotPermitted => "the owner does not share it with this node",
+            Self::NotShared => "the owner does not share it",
+            Self::NotVerified => "the owner could not verify the request",
+            Self::RoleNotOffered => "the owner does not offer that role",
+            Self::Limit => "a limit of the owner is reached",
+        })
+    }
+}
+
+fn encode_chain(w: &mut Writer, chain: &[Bytes]) {
+    w.list(chain, |w, c| w.bytes(c));
+}
+
+fn decode_chain(r: &mut Reader<'_>) -> Result<Vec<Bytes>, DecodeError> {
+    r.list("certificate chain", CHAIN_CERTS_MAX, |r| blob(r, "certificate", CERT_BYTES_MAX))
+}
+
+fn blob(r: &mut Reader<'_>, field: &'static str, max: usize) -> Result<Bytes, DecodeError> {
+    r.bytes(field, max).map(Bytes::copy_from_slice)
+}
+
+fn encode_names(w: &mut Writer, names: &[Name]) {
+    w.list(names, |w, n| n.encode(w));
+}
+
+fn decode_names(r: &mut Reader<'_>) -> Result<Vec<Name>, DecodeError> {
+    r.list("names", NAMES_PER_FRAME_MAX, Name::decode)
+}
+
+impl Encode for Signed {
+    fn encode(&self, w: &mut Writer) {
+        w.bytes(&self.body);
+        w.bytes(&self.signature);
+    }
+}
+
+impl Decode for Signed {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            body: blob(r, "signed body", CONTROL_FRAME_BYTES_MAX)?,
+            signature: blob(r, "signature", SIGNATURE_BYTES_MAX)?,
+        })
+    }
+}
+
+impl Encode for AdvertBody {
+    fn encode(&self, w: &mut Writer) {
+        encode_chain(w, &self.chain);
+        w.u64(self.seq);
+        self.issued_at.encode(w);
+        w.u32(self.lease_ms);
+        w.bool(self.withdraw);
+        w.list(&self.blinds, |w, b| b.encode(w));
+    }
+}
+
+impl Decode for AdvertBody {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            chain: decode_chain(r)?,
+            seq: r.u64()?,
+            issued_at: UnixMillis::decode(r)?,
+            lease_ms: r.u32()?,
+            withdraw: r.bool("withdraw")?,
+            blinds: r.list("advertised names", ADVERT_NAMES_MAX, Blind::decode)?,
+        })
+    }
+}
+
+impl Encode for JoinBody {
+    fn encode(&self, w: &mut Writer) {
+        self.name.encode(w);
+        self.sink.encode(w);
+        self.role.encode(w);
+        self.issued_at.encode(w);
+        encode_chain(w, &self.chain);
+        w.bytes(&self.reply_key);
+    }
+}
+
+impl Decode for JoinBody {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            name: Name::decode(r)?,
+            sink: SinkId::decode(r)?,
+            role: Role::decode(r)?,
+            issued_at: UnixMillis::decode(r)?,
+            chain: decode_chain(r)?,
+            reply_key: blob(r, "reply key", REPLY_KEY_BYTES_MAX)?,
+        })
+    }
+}
+
+impl Encode for AnswerBody {
+    fn encode(&self, w: &mut Writer) {
+        self.name.encode(w);
+        self.sink.encode(w);
+        w.u64(self.serial);
+        match &self.answer {
+            Answer::Grant { enc, sealed } => {
+                w.u8(0);
+                w.bytes(enc);
+                w.bytes(sealed);
+            }
+            Answer::Refuse { reason } => {
+                w.u8(1);
+                reason.encode(w);
+            }
+        }
+    }
+}
+
+impl Decode for AnswerBody {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            name: Name::decode(r)?,
+            sink: SinkId::decode(r)?,
+            serial: r.u64()?,
+            answer: match r.u8()? {
+                0 => Answer::Grant {
+                    enc: blob(r, "encapsulated key", REPLY_KEY_BYTES_MAX)?,
+                    sealed: blob(r, "sealed content", SEALED_BYTES_MAX)?,
+                },
+                1 => Answer::Refuse { reason: RefuseReason::decode(r)? },
+                v => return Err(DecodeError::value("answer", v.into())),
+            },
+        })
+    }
+}
+
+impl Encode for Control {
+    fn encode(&self, w: &mut Writer) {
+        match self {
+            Self::Hello(hello) => {
+                w.u8(1);
+                w.u16(hello.minor);
+                w.u64(hello.incarnation);
+                w.bool(hello.transit);
+            }
+            Self::Advert { hops, signed } => {
+                w.u8(2);
+                w.u8(*hops);
+                signed.encode(w);
+            }
+            Self::Unreach { names } => {
+                w.u8(3);
+                encode_names(w, names);
+            }
+            Self::Interest { names } => {
+                w.u8(4);
+                encode_names(w, names);
+            }
+            Self::Uninterest { names } => {
+                w.u8(5);
+                encode_names(w, names);
+            }
+            Self::Join { signed } => {
+                w.u8(6);
+                signed.encode(w);
+            }
+            Self::Leave { name, sink } => {
+                w.u8(7);
+                name.encode(w);
+                sink.encode(w);
+            }
+            Self::Answer { signed } => {
+                w.u8(8);
+                signed.encode(w);
+            }
+            Self::Reject { name, sink, reason } => {
+                w.u8(9);
+                name.encode(w);
+                sink.encode(w);
+                reason.encode(w);
+            }
+            Self::Goodbye => w.u8(10),
+        }
+    }
+}
+
+impl Decode for Control {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(match r.u8()? {
+            1 => Self::Hello(Hello { minor: r.u16()?, incarnation: r.u64()?, transit: r.bool("transit")? }),
+            2 => Self::Advert { hops: r.u8()?, signed: Signed::decode(r)? },
+            3 => Self::Unreach { names: decode_names(r)? },
+            4 => Self::Interest { names: decode_names(r)? },
+            5 => Self::Uninterest { names: decode_names(r)? },
+            6 => Self::Join { signed: Signed::decode(r)? },
+            7 => Self::Leave { name: Name::decode(r)?, sink: SinkId::decode(r)? },
+            8 => Self::Answer { signed: Signed::decode(r)? },
+            9 => Self::Reject {
+                name: Name::decode(r)?,
+                sink: SinkId::decode(r)?,
+                reason: RejectReason::decode(r)?,
+            },
+            10 => Self::Goodbye,
+            v => return Err(DecodeError::value("control frame", v.into())),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frames() -> Vec<Control> {
+        let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
+        let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
+        vec![
+            Control::Hello(Hello { minor: 3, incarnation: 9, transit: true }),
+            Control::Advert { hops: 2, signed: signed.clone() },
+            Control::Unreach { names: vec![name; 3] },
+            Control::Interest { names: vec![name] },
+            Control::Uninterest { names: vec![] },
+            Control::Join { signed: signed.clone() },
+            Control::Leave { name, sink },
+            Control::Answer { signed },
+            Control::Reject { name, sink, reason: RejectReason::RouteLost },
+            Control::Goodbye,
+        ]
+    }
+
+    #[test]
+    fn frames_round_trip_and_no_prefix_is_a_frame() {
+        for frame in frames() {
+            let bytes = frame.to_vec();
+            assert_eq!(Control::from_slice(&bytes).as_ref(), Ok(&frame));
+            for cut in 0..bytes.len() {
+                assert!(Control::from_slice(&bytes[..cut]).is_err(), "{frame:?} cut at {cut}");
+            }
+            let mut longer = bytes;
+            longer.push(0);
+            assert_eq!(Control::from_slice(&longer), Err(DecodeError::Trailing { extra: 1 }));
+        }
+    }
+
+    #[test]
+    fn bodies_round_trip() {
+        let chain = vec![Bytes::from_static(b"leaf"), Bytes::from_static(b"ca")];
+        let advert = AdvertBody {
+            chain: chain.clone(),
+            seq: 5,
+            issued_at: UnixMillis(77),
+            lease_ms: 60_000,
+            withdraw: false,
+            blinds: vec![Blind([4; 32]); 2],
+        };
+        assert_eq!(AdvertBody::from_slice(&advert.to_vec()), Ok(advert));
+        let join = JoinBody {
+            name: Name([1; 32]),
+            sink: SinkId([2; 16]),
+            role: Role::Publish,
+            issued_at: UnixMillis(78),
+            chain,
+            reply_key: Bytes::from_static(b"key"),
+        };
+        assert_eq!(JoinBody::from_slice(&join.to_vec()), Ok(join));
+        for answer in [
+            Answer::Grant { enc: Bytes::from_static(b"e"), sealed: Bytes::from_static(b"s") },
+            Answer::Refuse { reason: RefuseReason::NotPermitted },
+        ] {
+            let body = AnswerBody { name: Name([1; 32]), sink: SinkId([2; 16]), serial: 1, answer };
+            assert_eq!(AnswerBody::from_slice(&body.to_vec()), Ok(body));
+        }
+    }
+
+    #[test]
+    fn claims_beyond_the_bounds_are_refused_before_memory_is_taken() {
+        let mut w = Writer::default();
+        w.u8(4);
+        w.u32(u32::MAX);
+        let frame = w.into_vec();
+        assert!(matches!(Control::from_slice(&frame), Err(DecodeError::TooLong { field: "names", .. })));
+    }
+}

@@ -1,0 +1,192 @@
+//! Identifiers: each a type of its own, fixed in size, shown as lower-case hexadecimal.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+
+macro_rules! id {
+    ($(#[$doc:meta])* $name:ident, $bytes:literal, $field:literal) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub struct $name(pub [u8; $bytes]);
+
+        impl $name {
+            /// The raw bytes.
+            pub fn as_bytes(&self) -> &[u8; $bytes] {
+                &self.0
+            }
+
+            /// The first eight hexadecimal digits: enough to tell apart in a log, never an identity.
+            pub fn short(&self) -> String {
+                hex(&self.0[..4])
+            }
+        }
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&hex(&self.0))
+            }
+        }
+
+        impl fmt::Debug for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                write!(f, concat!(stringify!($name), "({})"), self.short())
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = ParseIdError;
+
+            fn from_str(s: &str) -> Result<Self, Self::Err> {
+                parse_hex(s).map(Self)
+            }
+        }
+
+        impl Encode for $name {
+            fn encode(&self, w: &mut Writer) {
+                w.raw(&self.0);
+            }
+        }
+
+        impl Decode for $name {
+            fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+                r.array($field).map(Self)
+            }
+        }
+    };
+}
+
+id!(
+    /// The 256-bit, location-independent name of an interface (`docs/spec/names.md`).
+    Name, 32, "name"
+);
+id!(
+    /// Who a node is, and so the owner of its names: `SHA-256(CA public key ‖ pseudonym)`. Survives key
+    /// rotation and moving.
+    NodeId, 32, "node id"
+);
+id!(
+    /// The half of a name that proves knowledge of its topic secret without telling it.
+    Blind, 32, "blind"
+);
+id!(
+    /// What a certificate says of its subject: `HMAC(fleet secret, node name)`.
+    Pseudonym, 32, "pseudonym"
+);
+id!(
+    /// What a certificate says of a group its subject belongs to: `HMAC(fleet secret, group name)`.
+    GroupTag, 32, "group tag"
+);
+id!(
+    /// One incarnation of one publisher on one name, random, so that no nonce repeats after a restart.
+    SourceId, 16, "source id"
+);
+id!(
+    /// One incarnation of one joiner of one name, random.
+    SinkId, 16, "sink id"
+);
+
+/// Text that is not an identifier.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{found:?} is not {expected} hexadecimal digits")]
+pub struct ParseIdError {
+    found: String,
+    expected: usize,
+}
+
+fn hex(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 16] = b"0123456789abcdef";
+    bytes
+        .iter()
+        .flat_map(|b| [DIGITS[usize::from(b >> 4)], DIGITS[usize::from(b & 15)]])
+        .map(char::from)
+        .collect()
+}
+
+fn parse_hex<const N: usize>(s: &str) -> Result<[u8; N], ParseIdError> {
+    let error = || ParseIdError { found: s.chars().take(80).collect(), expected: 2 * N };
+    if s.len() != 2 * N || !s.bytes().all(|b| b.is_ascii_hexdigit()) {
+        return Err(error());
+    }
+    let mut out = [0; N];
+    for (byte, pair) in out.iter_mut().zip(s.as_bytes().chunks_exact(2)) {
+        let digits = std::str::from_utf8(pair).map_err(|_| error())?;
+        *byte = u8::from_str_radix(digits, 16).map_err(|_| error())?;
+    }
+    Ok(out)
+}
+
+/// Wall-clock time: milliseconds since the Unix epoch, UTC. Certificates and signed objects speak it;
+/// timers use `std::time::Instant`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub struct UnixMillis(pub u64);
+
+impl UnixMillis {
+    /// Whole seconds.
+    pub fn secs(self) -> u64 {
+        self.0 / 1000
+    }
+}
+
+impl fmt::Display for UnixMillis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (y, mo, d) = civil_from_days((self.secs() / 86_400) as i64);
+        let s = self.secs() % 86_400;
+        write!(f, "{y:04}-{mo:02}-{d:02}T{:02}:{:02}:{:02}Z", s / 3600, s / 60 % 60, s % 60)
+    }
+}
+
+impl Encode for UnixMillis {
+    fn encode(&self, w: &mut Writer) {
+        w.u64(self.0);
+    }
+}
+
+impl Decode for UnixMillis {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        r.u64().map(Self)
+    }
+}
+
+/// Proleptic Gregorian date of a day counted from 1970-01-01, by eras of 400 years that start in March.
+fn civil_from_days(days: i64) -> (i64, u32, u32) {
+    let z = days + 719_468;
+    let era = z.div_euclid(146_097);
+    let day_of_era = z.rem_euclid(146_097);
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let month_from_march = (5 * day_of_year + 2) / 153;
+    let day = (day_of_year - (153 * month_from_march + 2) / 5 + 1) as u32;
+    let month = if month_from_march < 10 { month_from_march + 3 } else { month_from_march - 9 } as u32;
+    (year_of_era + era * 400 + i64::from(month <= 2), month, day)
+}
+
+/// The present, as the driver saw it when it called a machine: both clocks at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Now {
+    /// Monotonic; for timers.
+    pub instant: std::time::Instant,
+    /// Wall clock; for certificates and signed objects.
+    pub unix: UnixMillis,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn identifiers_round_trip_through_text() {
+        let id = SourceId(*b"0123456789abcdef");
+        assert_eq!(id.to_string().parse::<SourceId>(), Ok(id));
+        assert!("30".parse::<SourceId>().is_err());
+        assert!("+0313233343536373839616263646566".parse::<SourceId>().is_err());
+    }
+
+    #[test]
+    fn dates_are_civil() {
+        assert_eq!(UnixMillis(0).to_string(), "1970-01-01T00:00:00Z");
+        assert_eq!(UnixMillis(951_782_400_000).to_string(), "2000-02-29T00:00:00Z");
+        assert_eq!(UnixMillis(1_795_391_999_000).to_string(), "2026-11-22T23:59:59Z");
+    }
+}

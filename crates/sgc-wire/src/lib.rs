@@ -1,0 +1,32 @@
+//! Names, metadata, packets and the bounded codec of SGC.
+//!
+//! Everything that two nodes must agree on byte for byte is here, and nothing else: no cryptography (that is
+//! `sgc-trust`), no state (that is `sgc-router` and `sgc-endpoint`), no input or output. The normative
+//! text is `docs/spec/wire.md` and `docs/spec/names.md`.
+#![forbid(unsafe_code)]
+
+mod catalogue;
+mod codec;
+mod control;
+mod ids;
+mod metadata;
+mod packet;
+mod qos;
+
+pub use catalogue::{
+    CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, ENTRY_SOURCES_MAX, GrantContent,
+    TopicGrant,
+};
+pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
+pub use control::{
+    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX,
+    CONTROL_FRAME_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX,
+    RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
+};
+pub use ids::{Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SinkId, SourceId, UnixMillis};
+pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
+pub use packet::{
+    Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, MESSAGE_BYTES_MAX, PACKET_VERSION, PAYLOAD_BYTES_MAX,
+    Packet, PacketHeader, Payload,
+};
+pub use qos::{Durability, History, Liveliness, Qos, Reliability};

@@ -1,0 +1,316 @@
+//! Data packets: one sealed fragment of one message, under its name.
+//!
+//! The header is what routers read; they never see inside the payload. All of it but the hop limit and the
+//! addressee is authenticated by the seal (`sgc-trust`), so a router may only lower the one and choose the
+//! branch by the other. Layout: `docs/spec/wire.md`.
+
+use bytes::{BufMut, Bytes};
+use smallvec::SmallVec;
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::ids::{Name, SinkId, SourceId};
+
+/// Version of the data packet, in the high half of the first byte.
+pub const PACKET_VERSION: u8 = 1;
+/// Longest header, bytes.
+pub const HEADER_BYTES_MAX: usize = HEADER_BYTES + 16;
+/// Header without an addressee, bytes.
+pub const HEADER_BYTES: usize = 76;
+/// Longest payload of one packet, bytes: the largest fragment and what a suite adds.
+pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 512;
+/// Longest message, bytes of plaintext.
+pub const MESSAGE_BYTES_MAX: u32 = 64 * 1024 * 1024;
+/// Hops that a packet may take.
+pub const HOP_LIMIT: u8 = 32;
+
+/// Which traffic overtakes which (`docs/spec/wire.md`, classes).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Class {
+    /// Large or patient.
+    Bulk,
+    /// Anything else.
+    #[default]
+    Default,
+    /// Commands and state that are worthless when late.
+    Realtime,
+}
+
+/// The header of a data packet.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PacketHeader {
+    /// Lost packets are to be sent again, and a full queue pushes back; otherwise the newest wins.
+    pub reliable: bool,
+    /// Class.
+    pub class: Class,
+    /// Hops left; not authenticated.
+    pub hops: u8,
+    /// Cipher suite id, as `sgc-trust` numbers them.
+    pub suite: u8,
+    /// Epoch of the topic key.
+    pub epoch: u32,
+    /// The name it is published under.
+    pub name: Name,
+    /// Who publishes.
+    pub source: SourceId,
+    /// Number of the message at its source, from 1.
+    pub seq: u64,
+    /// Bytes of the whole message, unsealed.
+    pub total: u32,
+    /// Which fragment, from 0.
+    pub index: u16,
+    /// Bytes of every fragment but the last, unsealed.
+    pub grid: u16,
+    /// The only sink it is for; `None` for all. Not authenticated: it selects branches, nothing more.
+    pub to: Option<SinkId>,
+}
+
+const FLAG_RELIABLE: u8 = 0x01;
+const FLAG_TO: u8 = 0x02;
+const CLASS_SHIFT: u8 = 2;
+const FLAGS_KNOWN: u8 = 0x0f;
+
+impl PacketHeader {
+    /// Number of fragments of the message, at least one.
+    pub fn fragments(&self) -> u32 {
+        self.total.div_ceil(u32::from(self.grid)).max(1)
+    }
+
+    /// Bytes of this fragment, unsealed.
+    pub fn fragment_bytes(&self) -> usize {
+        let start = u32::from(self.index) * u32::from(self.grid);
+        (self.total - start).min(u32::from(self.grid)) as usize
+    }
+
+    /// True for the fragment that ends its message.
+    pub fn is_last(&self) -> bool {
+        u32::from(self.index) + 1 == self.fragments()
+    }
+
+    /// The bytes that the seal authenticates: the encoding with hop limit zero and no addressee.
+    pub fn associated_data(&self) -> [u8; HEADER_BYTES] {
+        let mut out = [0; HEADER_BYTES];
+        self.put(&mut &mut out[..], 0, None);
+        out
+    }
+
+    /// Appends the encoding.
+    pub fn put_into(&self, out: &mut impl BufMut) {
+        self.put(out, self.hops, self.to);
+    }
+
+    /// Length of the encoding, bytes.
+    pub fn encoded_bytes(&self) -> usize {
+        if self.to.is_some() { HEADER_BYTES_MAX } else { HEADER_BYTES }
+    }
+
+    fn put(&self, out: &mut impl BufMut, hops: u8, to: Option<SinkId>) {
+        let flags = (if self.reliable { FLAG_RELIABLE } else { 0 })
+            | (if to.is_some() { FLAG_TO } else { 0 })
+            | ((self.class as u8) << CLASS_SHIFT);
+        out.put_u8(PACKET_VERSION << 4);
+        out.put_u8(flags);
+        out.put_u8(hops);
+        out.put_u8(self.suite);
+        out.put_u32(self.epoch);
+        out.put_slice(&self.name.0);
+        out.put_slice(&self.source.0);
+        out.put_u64(self.seq);
+        out.put_u32(self.total);
+        out.put_u16(self.index);
+        out.put_u16(self.grid);
+        out.put_u32(0); // reserved: a label, once links agree on them
+        if let Some(to) = to {
+            out.put_slice(&to.0);
+        }
+    }
+}
+
+impl Encode for PacketHeader {
+    fn encode(&self, w: &mut Writer) {
+        let mut out = Vec::with_capacity(HEADER_BYTES_MAX);
+        self.put_into(&mut out);
+        w.raw(&out);
+    }
+}
+
+impl Decode for PacketHeader {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let first = r.u8()?;
+        if first != PACKET_VERSION << 4 {
+            return Err(DecodeError::Version {
+                what: "data packet",
+                found: first.into(),
+                known: (PACKET_VERSION << 4).into(),
+            });
+        }
+        let flags = r.u8()?;
+        if flags & !FLAGS_KNOWN != 0 {
+            return Err(DecodeError::value("packet flags", flags.into()));
+        }
+        let mut header = Self {
+            reliable: flags & FLAG_RELIABLE != 0,
+            class: match (flags >> CLASS_SHIFT) & 3 {
+                0 => Class::Bulk,
+                1 => Class::Default,
+                2 => Class::Realtime,
+                v => return Err(DecodeError::value("class", v.into())),
+            },
+            hops: r.u8()?,
+            suite: r.u8()?,
+            epoch: r.u32()?,
+            name: Name::decode(r)?,
+            source: SourceId::decode(r)?,
+            seq: r.u64()?,
+            total: r.u32()?,
+            index: r.u16()?,
+            grid: r.u16()?,
+            to: None,
+        };
+        let reserved = r.u32()?;
+        if reserved != 0 {
+            return Err(DecodeError::value("reserved", reserved.into()));
+        }
+        if flags & FLAG_TO != 0 {
+            header.to = Some(SinkId::decode(r)?);
+        }
+        if header.total > MESSAGE_BYTES_MAX {
+            return Err(DecodeError::TooLong {
+                field: "message",
+                value: header.total as usize,
+                max: MESSAGE_BYTES_MAX as usize,
+            });
+        }
+        if header.grid == 0 || usize::from(header.grid) > PAYLOAD_BYTES_MAX {
+            return Err(DecodeError::value("fragment grid", header.grid.into()));
+        }
+        if u32::from(header.index) >= header.fragments() {
+            return Err(DecodeError::value("fragment index", header.index.into()));
+        }
+        Ok(header)
+    }
+}
+
+/// The sealed payload of a packet as the transport received it: one piece, or a few where it straddled the
+/// transport's buffers. Cloning shares.
+#[derive(Clone, Debug, Default)]
+pub struct Payload(pub SmallVec<[Bytes; 2]>);
+
+impl Payload {
+    /// Length, bytes.
+    pub fn len(&self) -> usize {
+        self.0.iter().map(Bytes::len).sum()
+    }
+
+    /// True if there is nothing.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Appends all pieces to `out`.
+    pub fn copy_into(&self, out: &mut impl BufMut) {
+        for piece in &self.0 {
+            out.put_slice(piece);
+        }
+    }
+}
+
+impl From<Bytes> for Payload {
+    fn from(bytes: Bytes) -> Self {
+        Self(SmallVec::from_iter([bytes]))
+    }
+}
+
+/// A data packet.
+#[derive(Clone, Debug)]
+pub struct Packet {
+    /// What routers read.
+    pub header: PacketHeader,
+    /// Sealed fragment.
+    pub payload: Payload,
+}
+
+impl Packet {
+    /// Length of the encoding, bytes.
+    pub fn encoded_bytes(&self) -> usize {
+        self.header.encoded_bytes() + self.payload.len()
+    }
+
+    /// Reads a packet that came in one piece (a datagram); the payload shares `datagram`.
+    pub fn from_datagram(datagram: Bytes) -> Result<Self, DecodeError> {
+        let mut r = Reader::new(&datagram);
+        let header = PacketHeader::decode(&mut r)?;
+        let payload = datagram.slice(datagram.len() - r.remaining()..);
+        Self::new(header, payload.into())
+    }
+
+    /// Joins header and payload; the payload must be within its bound.
+    pub fn new(header: PacketHeader, payload: Payload) -> Result<Self, DecodeError> {
+        match payload.len() {
+            value if value > PAYLOAD_BYTES_MAX => {
+                Err(DecodeError::TooLong { field: "payload", value, max: PAYLOAD_BYTES_MAX })
+            }
+            _ => Ok(Self { header, payload }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header() -> PacketHeader {
+        PacketHeader {
+            reliable: true,
+            class: Class::Realtime,
+            hops: HOP_LIMIT,
+            suite: 1,
+            epoch: 7,
+            name: Name([0xaa; 32]),
+            source: SourceId([0xbb; 16]),
+            seq: 42,
+            total: 40_000,
+            index: 2,
+            grid: 16_384,
+            to: None,
+        }
+    }
+
+    #[test]
+    fn header_round_trips() {
+        for to in [None, Some(SinkId([3; 16]))] {
+            let h = PacketHeader { to, ..header() };
+            let bytes = h.to_vec();
+            assert_eq!(bytes.len(), h.encoded_bytes());
+            assert_eq!(PacketHeader::from_slice(&bytes), Ok(h));
+        }
+    }
+
+    #[test]
+    fn hops_and_addressee_are_outside_the_seal() {
+        let a = header();
+        let b = PacketHeader { hops: 3, to: Some(SinkId([9; 16])), ..header() };
+        assert_eq!(a.associated_data(), b.associated_data());
+        let c = PacketHeader { seq: 43, ..header() };
+        assert_ne!(a.associated_data(), c.associated_data());
+    }
+
+    #[test]
+    fn fragments_cover_the_message() {
+        assert_eq!(header().fragments(), 3);
+        assert_eq!(header().fragment_bytes(), 40_000 - 2 * 16_384);
+        assert!(header().is_last());
+        assert!(PacketHeader { total: 0, index: 0, ..header() }.is_last());
+    }
+
+    #[test]
+    fn impossible_headers_are_refused() {
+        let refused = |h: PacketHeader| PacketHeader::from_slice(&h.to_vec()).unwrap_err();
+        assert!(matches!(refused(PacketHeader { index: 3, ..header() }), DecodeError::Value { .. }));
+        assert!(matches!(refused(PacketHeader { grid: 0, index: 0, ..header() }), DecodeError::Value { .. }));
+        let oversized = PacketHeader { total: MESSAGE_BYTES_MAX + 1, ..header() };
+        assert!(matches!(refused(oversized), DecodeError::TooLong { .. }));
+        let mut unknown = header().to_vec();
+        unknown[0] = 0x20;
+        assert!(matches!(PacketHeader::from_slice(&unknown), Err(DecodeError::Version { .. })));
+    }
+}

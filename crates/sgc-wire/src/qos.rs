@@ -1,0 +1,154 @@
+//! DDS quality of service as it travels between nodes: the policies a far writer must mirror.
+//!
+//! Only the shape lives here. What a ROS 2 endpoint offers and what a reader may request of it is
+//! decided in `sgc-ros`; how a DDS implementation spells it, in `sgc-dds`.
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+
+/// Reliability of a DDS endpoint (DDS 1.4, 2.2.3.14).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Reliability {
+    /// Samples may be lost.
+    BestEffort,
+    /// Samples are acknowledged and sent again.
+    Reliable,
+}
+
+/// Durability of a DDS endpoint (DDS 1.4, 2.2.3.4). ROS 2 uses the first two.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Durability {
+    /// Nothing is kept for late joiners.
+    Volatile,
+    /// The writer keeps its history for late joiners.
+    TransientLocal,
+    /// A durability service keeps samples; carried, not provided.
+    Transient,
+    /// Samples survive the system; carried, not provided.
+    Persistent,
+}
+
+/// History of a DDS endpoint (DDS 1.4, 2.2.3.18).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum History {
+    /// The newest `n` samples per instance, `n` ≥ 1.
+    KeepLast(u32),
+    /// All samples, within resource limits.
+    KeepAll,
+}
+
+/// Liveliness kind (DDS 1.4, 2.2.3.11).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Liveliness {
+    /// The middleware asserts it.
+    Automatic,
+    /// Any writer of the participant asserts it for all.
+    ManualByParticipant,
+    /// Each writer asserts its own.
+    ManualByTopic,
+}
+
+/// Quality of service of one endpoint. Durations are nanoseconds; `None` is infinite.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct Qos {
+    /// Reliability.
+    pub reliability: Reliability,
+    /// Durability.
+    pub durability: Durability,
+    /// History and depth.
+    pub history: History,
+    /// Deadline period in nanoseconds.
+    pub deadline_ns: Option<u64>,
+    /// Lifespan in nanoseconds.
+    pub lifespan_ns: Option<u64>,
+    /// Liveliness kind.
+    pub liveliness: Liveliness,
+    /// Liveliness lease duration in nanoseconds.
+    pub lease_ns: Option<u64>,
+    /// DDS partitions; empty is the default partition. At most [`Qos::PARTITIONS_MAX`].
+    pub partitions: Vec<String>,
+}
+
+impl Qos {
+    /// Bound on partitions carried for one endpoint.
+    pub const PARTITIONS_MAX: usize = 16;
+    /// Bound on the length of one partition's name, bytes.
+    pub const PARTITION_BYTES_MAX: usize = 256;
+
+    /// True if late joiners receive history.
+    pub fn is_transient_local(&self) -> bool {
+        self.durability >= Durability::TransientLocal
+    }
+
+    /// True if samples are acknowledged.
+    pub fn is_reliable(&self) -> bool {
+        self.reliability == Reliability::Reliable
+    }
+}
+
+/// The defaults of `rclcpp::QoS(10)`: reliable, volatile, keep last 10.
+impl Default for Qos {
+    fn default() -> Self {
+        Self {
+            reliability: Reliability::Reliable,
+            durability: Durability::Volatile,
+            history: History::KeepLast(10),
+            deadline_ns: None,
+            lifespan_ns: None,
+            liveliness: Liveliness::Automatic,
+            lease_ns: None,
+            partitions: Vec::new(),
+        }
+    }
+}
+
+impl Encode for Qos {
+    fn encode(&self, w: &mut Writer) {
+        w.u8(self.reliability as u8);
+        w.u8(self.durability as u8);
+        w.u32(match self.history {
+            History::KeepAll => 0,
+            History::KeepLast(n) => n.max(1),
+        });
+        w.u64(self.deadline_ns.unwrap_or(u64::MAX));
+        w.u64(self.lifespan_ns.unwrap_or(u64::MAX));
+        w.u8(self.liveliness as u8);
+        w.u64(self.lease_ns.unwrap_or(u64::MAX));
+        w.list(&self.partitions, |w, p| w.str(p));
+    }
+}
+
+impl Decode for Qos {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let finite = |v: u64| (v != u64::MAX).then_some(v);
+        Ok(Self {
+            reliability: match r.u8()? {
+                0 => Reliability::BestEffort,
+                1 => Reliability::Reliable,
+                v => return Err(DecodeError::value("reliability", v.into())),
+            },
+            durability: match r.u8()? {
+                0 => Durability::Volatile,
+                1 => Durability::TransientLocal,
+                2 => Durability::Transient,
+                3 => Durability::Persistent,
+                v => return Err(DecodeError::value("durability", v.into())),
+            },
+            history: match r.u32()? {
+                0 => History::KeepAll,
+                n => History::KeepLast(n),
+            },
+            deadline_ns: finite(r.u64()?),
+            lifespan_ns: finite(r.u64()?),
+            liveliness: match r.u8()? {
+                0 => Liveliness::Automatic,
+                1 => Liveliness::ManualByParticipant,
+                2 => Liveliness::ManualByTopic,
+                v => return Err(DecodeError::value("liveliness", v.into())),
+            },
+            lease_ns: finite(r.u64()?),
+            partitions: r.list("partitions", Self::PARTITIONS_MAX, |r| {
+                r.str("partition", Self::PARTITION_BYTES_MAX)
+            })?,
+        })
+    }
+}
