@@ -7,7 +7,7 @@
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::{Blind, Name, SinkId, UnixMillis};
+use crate::ids::{Blind, Name, SinkId, SourceId, UnixMillis};
 
 /// Longest control frame, bytes.
 pub const CONTROL_FRAME_BYTES_MAX: usize = 1024 * 1024;
@@ -79,6 +79,8 @@ pub enum Control {
         /// Why.
         reason: RejectReason,
     },
+    /// A sink asks a source of its name for messages it did not get; travels towards the owner.
+    Recover(Recover),
     /// The sender closes in good order: all it advertised is withdrawn.
     Goodbye,
 }
@@ -92,6 +94,21 @@ pub struct Hello {
     pub incarnation: u64,
     /// True for a router, which carries others' names; false for a node that only serves itself.
     pub transit: bool,
+}
+
+/// What a sink asks to be sent again. What a source no longer has, it does not send.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Recover {
+    /// Name.
+    pub name: Name,
+    /// The sink that asks; the answer goes to it alone.
+    pub sink: SinkId,
+    /// The source that is asked.
+    pub source: SourceId,
+    /// First message asked for.
+    pub from: u64,
+    /// Last message asked for.
+    pub to: u64,
 }
 
 /// Why a router refuses a join.
@@ -427,7 +444,15 @@ impl Encode for Control {
                 sink.encode(w);
                 reason.encode(w);
             }
-            Self::Goodbye => w.u8(10),
+            Self::Recover(recover) => {
+                w.u8(10);
+                recover.name.encode(w);
+                recover.sink.encode(w);
+                recover.source.encode(w);
+                w.u64(recover.from);
+                w.u64(recover.to);
+            }
+            Self::Goodbye => w.u8(11),
         }
     }
 }
@@ -448,7 +473,14 @@ impl Decode for Control {
                 sink: SinkId::decode(r)?,
                 reason: RejectReason::decode(r)?,
             },
-            10 => Self::Goodbye,
+            10 => Self::Recover(Recover {
+                name: Name::decode(r)?,
+                sink: SinkId::decode(r)?,
+                source: SourceId::decode(r)?,
+                from: r.u64()?,
+                to: r.u64()?,
+            }),
+            11 => Self::Goodbye,
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -471,6 +503,7 @@ mod tests {
             Control::Leave { name, sink },
             Control::Answer { signed },
             Control::Reject { name, sink, reason: RejectReason::RouteLost },
+            Control::Recover(Recover { name, sink, source: SourceId([3; 16]), from: 1, to: 9 }),
             Control::Goodbye,
         ]
     }

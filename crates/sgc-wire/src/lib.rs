@@ -9,6 +9,7 @@ mod catalogue;
 mod codec;
 mod control;
 mod ids;
+mod message;
 mod metadata;
 mod packet;
 mod qos;
@@ -21,9 +22,10 @@ pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX,
     CONTROL_FRAME_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX,
-    RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
+    Recover, RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
 };
 pub use ids::{Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SinkId, SourceId, UnixMillis};
+pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use packet::{
     Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, MESSAGE_BYTES_MAX, PACKET_VERSION, PAYLOAD_BYTES_MAX,

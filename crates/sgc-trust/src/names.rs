@@ -1,0 +1,117 @@
+//! Names from metadata and secrets (`docs/spec/names.md`).
+//!
+//! Whoever holds the topic secret derives the name; nobody reverses it; and a router that knows the owner's
+//! certificate checks a claim to a name from its blind alone.
+
+use aws_lc_rs::{digest, hkdf, hmac};
+use sgc_wire::{Blind, Encode, Metadata, Name, NodeId};
+use zeroize::Zeroize;
+
+use crate::FleetSecret;
+
+/// The secret of one interface: enough to derive its name, and no other name.
+#[derive(Clone, Zeroize)]
+#[zeroize(drop)]
+pub struct TopicSecret([u8; 32]);
+
+impl TopicSecret {
+    /// `HKDF-SHA-256(fleet secret, metadata)`: salt `sgc topic secret v1`, info the canonical encoding.
+    pub fn derive(fleet: &FleetSecret, metadata: &Metadata) -> Self {
+        let salt = hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc topic secret v1");
+        let info = metadata.to_vec();
+        let mut out = [0; 32];
+        salt.extract(fleet.expose())
+            .expand(&[&info], hkdf::HKDF_SHA256)
+            .and_then(|okm| okm.fill(&mut out))
+            .expect("HKDF-SHA-256 always yields 32 bytes");
+        Self(out)
+    }
+
+    /// `HMAC-SHA-256(topic secret, "sgc name")`.
+    pub fn blind(&self) -> Blind {
+        let key = hmac::Key::new(hmac::HMAC_SHA256, &self.0);
+        let mut out = [0; 32];
+        out.copy_from_slice(hmac::sign(&key, b"sgc name").as_ref());
+        Blind(out)
+    }
+}
+
+impl std::fmt::Debug for TopicSecret {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("TopicSecret(..)")
+    }
+}
+
+/// `SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
+pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc name v1");
+    context.update(&owner.0);
+    context.update(&blind.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Name(out)
+}
+
+/// The name of an interface, by one who holds the fleet secret.
+pub fn derive_name(fleet: &FleetSecret, owner: &NodeId, metadata: &Metadata) -> Name {
+    name_of(owner, &TopicSecret::derive(fleet, metadata).blind())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Computed with Python's `hmac` and `hashlib`: `scripts/name-vectors.py` prints these.
+    #[test]
+    fn golden_vectors() {
+        let fleet = FleetSecret::from_bytes([0x11; 32]);
+        let owner = NodeId([0x22; 32]);
+        let plain = Metadata::topic("arm-1", "/camera/image", "sensor_msgs/msg/Image");
+        let full = Metadata {
+            node: "/camera".into(),
+            author: "Ada".into(),
+            maintainer: "ops@example.org".into(),
+            interface: "v4l2".into(),
+            description: "wrist camera".into(),
+            unique: "left".into(),
+            ..plain.clone()
+        };
+        for (metadata, name) in [
+            (&plain, "601073d3847e79d3db60fcd14aa8569a002053404728fbf3da75e6b9a5c07364"),
+            (&full, "e7f411adc7d43de473d8706a951c9047a69faafcf6f8ee06061e42b7bfab2dc7"),
+            (&Metadata::catalogue("arm-1"), "a59aa68b61aa409eea546027b1f84203de8f853115e5bd5ad215b7107dd3a89b"),
+        ] {
+            assert_eq!(derive_name(&fleet, &owner, metadata).to_string(), name);
+        }
+    }
+
+    #[test]
+    fn every_field_changes_the_name() {
+        let fleet = FleetSecret::from_bytes([1; 32]);
+        let owner = NodeId([2; 32]);
+        let base = Metadata::topic("o", "/t", "p/msg/T");
+        let mut all = vec![base.clone(), Metadata { kind: sgc_wire::Kind::Service, ..base.clone() }];
+        for change in [
+            |m: &mut Metadata| m.owner.push('x'),
+            |m: &mut Metadata| m.ros_name.push('x'),
+            |m: &mut Metadata| m.type_name.push('x'),
+            |m: &mut Metadata| m.node.push('x'),
+            |m: &mut Metadata| m.author.push('x'),
+            |m: &mut Metadata| m.maintainer.push('x'),
+            |m: &mut Metadata| m.interface.push('x'),
+            |m: &mut Metadata| m.description.push('x'),
+            |m: &mut Metadata| m.unique.push('x'),
+        ] {
+            let mut changed = base.clone();
+            change(&mut changed);
+            all.push(changed);
+        }
+        let names: std::collections::BTreeSet<_> =
+            all.iter().map(|m| derive_name(&fleet, &owner, m)).collect();
+        assert_eq!(names.len(), all.len());
+        let other_owner = derive_name(&fleet, &NodeId([3; 32]), &base);
+        let other_fleet = derive_name(&FleetSecret::from_bytes([4; 32]), &owner, &base);
+        assert!(!names.contains(&other_owner) && !names.contains(&other_fleet));
+    }
+}

@@ -1,0 +1,137 @@
+//! Signed bodies of the control protocol: made by their signer, believed only after verification.
+//!
+//! Each body has a signing context of its own, so that none can pass for another. Bodies that carry a
+//! certificate chain also carry the time of signing, which must be near the verifier's: minutes of skew
+//! work, days do not.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use rustls_pki_types::CertificateDer;
+use sgc_wire::{
+    AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, Signed, UnixMillis,
+};
+
+use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
+
+/// How far a signer's clock may be from the verifier's.
+pub const CLOCK_SKEW_MAX: Duration = Duration::from_secs(10 * 60);
+
+const ADVERT: &str = "sgc advert v1";
+const JOIN: &str = "sgc join v1";
+const ANSWER: &str = "sgc answer v1";
+
+/// Why a signed body is not believed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SignedError {
+    /// The body is malformed.
+    #[error("malformed: {0}")]
+    Decode(#[from] DecodeError),
+    /// The signer's certificate does not verify.
+    #[error("signer not verified: {0}")]
+    Cert(#[from] CertError),
+    /// The signature does not verify.
+    #[error("{0}")]
+    Signature(#[from] SignatureError),
+    /// Signer and verifier disagree on the time by more than [`CLOCK_SKEW_MAX`].
+    #[error("signed at {signed}, which is not near {now}: one of the two clocks is wrong, or it is a replay")]
+    Clock {
+        /// Time in the body.
+        signed: UnixMillis,
+        /// The verifier's time.
+        now: UnixMillis,
+    },
+}
+
+/// An advertisement whose owner and names are proven.
+#[derive(Clone, Debug)]
+pub struct VerifiedAdvert {
+    /// The owner.
+    pub owner: VerifiedPeer,
+    /// What it says.
+    pub body: AdvertBody,
+    /// The names of `body.blinds`, in their order.
+    pub names: Vec<Name>,
+}
+
+/// A join whose requester is proven.
+#[derive(Clone, Debug)]
+pub struct VerifiedJoin {
+    /// The requester.
+    pub peer: VerifiedPeer,
+    /// What it asks for.
+    pub body: JoinBody,
+}
+
+impl Identity {
+    /// The certificate chain as signed bodies carry it.
+    pub fn chain_bytes(&self) -> Vec<Bytes> {
+        self.chain().iter().map(|c| Bytes::copy_from_slice(c)).collect()
+    }
+
+    /// Signs an advertisement of this node.
+    pub fn sign_advert(&self, body: &AdvertBody) -> Signed {
+        self.signed(ADVERT, body)
+    }
+
+    /// Signs a join of this node.
+    pub fn sign_join(&self, body: &JoinBody) -> Signed {
+        self.signed(JOIN, body)
+    }
+
+    /// Signs an answer of this node, the owner of the name.
+    pub fn sign_answer(&self, body: &AnswerBody) -> Signed {
+        self.signed(ANSWER, body)
+    }
+
+    fn signed(&self, context: &str, body: &impl Encode) -> Signed {
+        let body = body.to_bytes();
+        let signature = self.sign(context, &body).into();
+        Signed { body, signature }
+    }
+}
+
+/// Verifies an advertisement: chain, time, signature; and derives the names it may claim.
+pub fn verify_advert(
+    anchors: &TrustAnchors,
+    signed: &Signed,
+    now: UnixMillis,
+) -> Result<VerifiedAdvert, SignedError> {
+    let body = AdvertBody::from_slice(&signed.body)?;
+    let owner = verify_chain(anchors, &body.chain, body.issued_at, now)?;
+    owner.verify_signature(ADVERT, &signed.body, &signed.signature)?;
+    let names = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
+    Ok(VerifiedAdvert { owner, body, names })
+}
+
+/// Verifies a join: chain, time, signature.
+pub fn verify_join(
+    anchors: &TrustAnchors,
+    signed: &Signed,
+    now: UnixMillis,
+) -> Result<VerifiedJoin, SignedError> {
+    let body = JoinBody::from_slice(&signed.body)?;
+    let peer = verify_chain(anchors, &body.chain, body.issued_at, now)?;
+    peer.verify_signature(JOIN, &signed.body, &signed.signature)?;
+    Ok(VerifiedJoin { peer, body })
+}
+
+/// Verifies an answer by the owner of the name.
+pub fn verify_answer(owner: &VerifiedPeer, signed: &Signed) -> Result<AnswerBody, SignedError> {
+    let body = AnswerBody::from_slice(&signed.body)?;
+    owner.verify_signature(ANSWER, &signed.body, &signed.signature)?;
+    Ok(body)
+}
+
+fn verify_chain(
+    anchors: &TrustAnchors,
+    chain: &[Bytes],
+    signed: UnixMillis,
+    now: UnixMillis,
+) -> Result<VerifiedPeer, SignedError> {
+    if signed.0.abs_diff(now.0) > CLOCK_SKEW_MAX.as_millis() as u64 {
+        return Err(SignedError::Clock { signed, now });
+    }
+    let chain: Vec<_> = chain.iter().map(|c| CertificateDer::from_slice(c)).collect();
+    Ok(anchors.verify(&chain, now)?)
+}

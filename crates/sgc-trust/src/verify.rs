@@ -1,0 +1,403 @@
+//! From a certificate chain to a verified peer: who it is, which groups it is in, what it signs.
+//!
+//! The only way to a [`VerifiedPeer`] is [`TrustAnchors::verify`], so whoever holds one holds the result of a
+//! full path validation. It does not decide what a peer may do (that is the policy) and it reads no clock. Host
+//! names are not looked at anywhere: a peer is who its certificate says, wherever it is reached.
+
+use std::fmt;
+use std::sync::Arc;
+
+use aws_lc_rs::digest;
+use rustls_pki_types::{CertificateDer, SignatureVerificationAlgorithm, TrustAnchor, UnixTime};
+use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, GroupTag, NodeId, Pseudonym, UnixMillis};
+use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, aws_lc_rs as algs};
+
+use crate::x509::{Validity, split_spki};
+
+/// Most groups of one node: that many fit into [`CERT_BYTES_MAX`].
+pub const GROUPS_MAX: usize = 32;
+/// Most CAs that one node trusts.
+pub const ANCHORS_MAX: usize = 64;
+
+pub(crate) const NODE_URI: &str = "sgc:node:";
+pub(crate) const GROUP_URI: &str = "sgc:group:";
+
+/// What certificates may be signed with.
+const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
+    algs::ECDSA_P256_SHA256,
+    algs::ECDSA_P256_SHA384,
+    algs::ECDSA_P384_SHA256,
+    algs::ECDSA_P384_SHA384,
+    algs::ED25519,
+    algs::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
+    algs::RSA_PSS_2048_8192_SHA384_LEGACY_KEY,
+    algs::RSA_PSS_2048_8192_SHA512_LEGACY_KEY,
+    algs::RSA_PKCS1_2048_8192_SHA256,
+    algs::RSA_PKCS1_2048_8192_SHA384,
+    algs::RSA_PKCS1_2048_8192_SHA512,
+];
+
+/// What nodes sign objects with: one algorithm for each kind of key, so that a signature needs no algorithm
+/// field that could be argued about.
+const OBJECT_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
+    algs::ECDSA_P256_SHA256,
+    algs::ECDSA_P384_SHA384,
+    algs::ED25519,
+    algs::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
+];
+
+/// The CAs whose nodes are believed.
+#[derive(Clone)]
+pub struct TrustAnchors {
+    anchors: Arc<[Anchor]>,
+    /// The same once more, in the form that path building wants.
+    paths: Arc<[TrustAnchor<'static>]>,
+}
+
+struct Anchor {
+    der: CertificateDer<'static>,
+    spki: Box<[u8]>,
+    fingerprint: CaFingerprint,
+    validity: Validity,
+}
+
+impl TrustAnchors {
+    /// Trusts the holders of these CA certificates; at least one, at most [`ANCHORS_MAX`].
+    pub fn new(certificates: impl IntoIterator<Item = CertificateDer<'static>>) -> Result<Self, AnchorError> {
+        let mut anchors = Vec::new();
+        let mut paths = Vec::new();
+        for (index, der) in certificates.into_iter().enumerate() {
+            if index == ANCHORS_MAX {
+                return Err(AnchorError::TooMany);
+            }
+            let (anchor, path) = Anchor::parse(der).map_err(|reason| AnchorError::Malformed { index, reason })?;
+            anchors.push(anchor);
+            paths.push(path);
+        }
+        if anchors.is_empty() {
+            return Err(AnchorError::None);
+        }
+        Ok(Self { anchors: anchors.into(), paths: paths.into() })
+    }
+
+    /// Verifies a chain, leaf first, at the time `now`: path to one of the CAs, signatures, validity, key usage,
+    /// and that the leaf names a node of SGC.
+    pub fn verify(
+        &self,
+        chain: &[CertificateDer<'_>],
+        now: UnixMillis,
+    ) -> Result<VerifiedPeer, CertError> {
+        let (leaf_der, intermediates) = chain.split_first().ok_or(CertError::NoCertificate)?;
+        if chain.len() > CHAIN_CERTS_MAX {
+            return Err(CertError::ChainTooLong { certificates: chain.len() });
+        }
+        if let Some(long) = chain.iter().find(|c| c.len() > CERT_BYTES_MAX) {
+            return Err(CertError::CertificateTooLong { bytes: long.len() });
+        }
+        let leaf = EndEntityCert::try_from(leaf_der).map_err(CertError::from_webpki)?;
+        let time = UnixTime::since_unix_epoch(std::time::Duration::from_secs(now.secs()));
+        let path = leaf
+            .verify_for_usage(CHAIN_ALGORITHMS, &self.paths, intermediates, time, PeerUsage, None, None)
+            .map_err(CertError::from_webpki)?;
+        let ca = self
+            .paths
+            .iter()
+            .position(|a| std::ptr::eq(a, path.anchor()))
+            .and_then(|index| self.anchors.get(index))
+            .ok_or(CertError::UnknownIssuer)?;
+        ca.check_validity(now)?;
+        VerifiedPeer::of_leaf(&leaf, leaf_der, ca)
+    }
+
+    /// The CA certificates, DER.
+    pub fn certificates(&self) -> impl Iterator<Item = &CertificateDer<'static>> {
+        self.anchors.iter().map(|a| &a.der)
+    }
+
+    /// The public key (SubjectPublicKeyInfo, DER) of a CA that is trusted here.
+    pub fn ca_spki(&self, ca: &CaFingerprint) -> Option<&[u8]> {
+        self.anchors.iter().find(|a| a.fingerprint == *ca).map(|a| &*a.spki)
+    }
+}
+
+impl fmt::Debug for TrustAnchors {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_list().entries(self.anchors.iter().map(|a| a.fingerprint)).finish()
+    }
+}
+
+impl Anchor {
+    fn parse(der: CertificateDer<'static>) -> Result<(Self, TrustAnchor<'static>), String> {
+        if der.len() > CERT_BYTES_MAX {
+            return Err(format!("{} bytes, at most {CERT_BYTES_MAX} are read", der.len()));
+        }
+        let reason = |e: webpki::Error| e.to_string();
+        let path = webpki::anchor_from_trusted_cert(&der).map_err(reason)?.to_owned();
+        let spki: Box<[u8]> =
+            EndEntityCert::try_from(&der).map_err(reason)?.subject_public_key_info().as_ref().into();
+        let validity = Validity::of(&der).ok_or("its validity cannot be read")?;
+        let fingerprint = CaFingerprint(sha256(&[&spki]));
+        Ok((Self { der, spki, fingerprint, validity }, path))
+    }
+
+    /// Path validation takes a trusted CA as it is; an expired one is not trusted here.
+    fn check_validity(&self, now: UnixMillis) -> Result<(), CertError> {
+        let Validity { not_before, not_after } = self.validity;
+        if now.secs() > not_after.secs() {
+            Err(CertError::CaExpired { not_after, now })
+        } else if now < not_before {
+            Err(CertError::NotYetValid { not_before, now })
+        } else {
+            Ok(())
+        }
+    }
+}
+
+/// A CA, by the SHA-256 of its public key (SubjectPublicKeyInfo, DER): renewing its certificate changes nothing.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct CaFingerprint(pub [u8; 32]);
+
+impl fmt::Display for CaFingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for CaFingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("CaFingerprint(")?;
+        self.0.iter().take(4).try_for_each(|byte| write!(f, "{byte:02x}"))?;
+        f.write_str(")")
+    }
+}
+
+/// Who a verified certificate chain speaks for. Cloning shares.
+#[derive(Clone, Debug)]
+pub struct VerifiedPeer {
+    /// Who it is, also as owner of names.
+    pub node_id: NodeId,
+    /// What its certificate calls it.
+    pub pseudonym: Pseudonym,
+    /// Its groups, sorted, each once.
+    pub groups: Arc<[GroupTag]>,
+    /// When its certificate begins to hold.
+    pub not_before: UnixMillis,
+    /// Last moment at which its certificate holds.
+    pub not_after: UnixMillis,
+    /// The CA that vouches for it.
+    pub ca: CaFingerprint,
+    key: Arc<[u8]>,
+    algorithm: &'static dyn SignatureVerificationAlgorithm,
+}
+
+impl VerifiedPeer {
+    /// Checks a signature that this peer made with [`crate::Identity::sign`] in the same context.
+    pub fn verify_signature(
+        &self,
+        context: &str,
+        message: &[u8],
+        signature: &[u8],
+    ) -> Result<(), SignatureError> {
+        self.algorithm
+            .verify_signature(&self.key, &signature_input(context, message), signature)
+            .map_err(|_| SignatureError { signer: self.node_id })
+    }
+
+    /// True if its certificate puts it into this group.
+    pub fn is_in(&self, group: &GroupTag) -> bool {
+        self.groups.binary_search(group).is_ok()
+    }
+
+    fn of_leaf(leaf: &EndEntityCert<'_>, der: &[u8], ca: &Anchor) -> Result<Self, CertError> {
+        let mut pseudonym = None;
+        let mut groups = Vec::new();
+        // URIs that are unknown here are for later versions.
+        for uri in leaf.valid_uri_names() {
+            if let Some(hex) = uri.strip_prefix(NODE_URI) {
+                let id = hex.parse::<Pseudonym>().map_err(|_| CertError::NoPseudonym)?;
+                if pseudonym.replace(id).is_some() {
+                    return Err(CertError::Malformed("it names two nodes".into()));
+                }
+            } else if let Some(hex) = uri.strip_prefix(GROUP_URI) {
+                if groups.len() == GROUPS_MAX {
+                    return Err(CertError::TooManyGroups);
+                }
+                let tag = hex.parse::<GroupTag>();
+                groups.push(tag.map_err(|_| CertError::Malformed("a group tag is no hash".into()))?);
+            }
+        }
+        groups.sort_unstable();
+        groups.dedup();
+        let pseudonym = pseudonym.ok_or(CertError::NoPseudonym)?;
+        let Validity { not_before, not_after } =
+            Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
+        let spki = leaf.subject_public_key_info();
+        let (algorithm_id, key) = split_spki(&spki).ok_or(CertError::KeyUnsupported)?;
+        let algorithm = *OBJECT_ALGORITHMS
+            .iter()
+            .find(|a| a.public_key_alg_id().as_ref() == algorithm_id)
+            .ok_or(CertError::KeyUnsupported)?;
+        Ok(Self {
+            node_id: node_id(&ca.spki, &pseudonym),
+            pseudonym,
+            groups: groups.into(),
+            not_before,
+            not_after,
+            ca: ca.fingerprint,
+            key: key.into(),
+            algorithm,
+        })
+    }
+}
+
+/// `SHA-256(CA public key ‖ pseudonym)`, the CA's key as DER SubjectPublicKeyInfo (`docs/spec/names.md`).
+pub fn node_id(ca_spki: &[u8], pseudonym: &Pseudonym) -> NodeId {
+    NodeId(sha256(&[ca_spki, pseudonym.as_bytes()]))
+}
+
+/// What is signed: the context keeps a signature for one purpose from passing for another.
+pub(crate) fn signature_input(context: &str, message: &[u8]) -> Vec<u8> {
+    let mut input = Vec::with_capacity(context.len() + 1 + message.len());
+    input.extend_from_slice(context.as_bytes());
+    input.push(0);
+    input.extend_from_slice(message);
+    input
+}
+
+fn sha256(parts: &[&[u8]]) -> [u8; 32] {
+    let mut context = digest::Context::new(&digest::SHA256);
+    parts.iter().for_each(|part| context.update(part));
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    out
+}
+
+/// Nodes dial and are dialled with one certificate, so either usage will do; a certificate for other purposes,
+/// such as signing mail, will not.
+struct PeerUsage;
+
+impl ExtendedKeyUsageValidator for PeerUsage {
+    fn validate(&self, purposes: KeyPurposeIdIter<'_, '_>) -> Result<(), webpki::Error> {
+        let mut names_any = false;
+        for purpose in purposes {
+            let oid = purpose?.to_decoded_oid();
+            if oid == webpki::KeyUsage::SERVER_AUTH_REPR || oid == webpki::KeyUsage::CLIENT_AUTH_REPR {
+                return Ok(());
+            }
+            names_any = true;
+        }
+        // Webpki calls this also where the extension is absent, which restricts nothing.
+        if names_any { Err(webpki::Error::EmptyEkuExtension) } else { Ok(()) }
+    }
+}
+
+/// A signature that its alleged signer did not make over this message in this context.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the signature is not one of node {} over this message", signer.short())]
+pub struct SignatureError {
+    /// Who was said to have signed.
+    pub signer: NodeId,
+}
+
+/// Why CA certificates cannot be trusted as given.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AnchorError {
+    /// None was given.
+    #[error("no CA certificate is given: at least one is needed")]
+    None,
+    /// Too many were given.
+    #[error("more than {ANCHORS_MAX} CA certificates are given")]
+    TooMany,
+    /// One cannot be read.
+    #[error("CA certificate {} cannot be read: {reason}", index + 1)]
+    Malformed {
+        /// Which, from 0.
+        index: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// Why a certificate chain is refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CertError {
+    /// No certificate came.
+    #[error("no certificate was presented: the peer needs an identity (`sgc fleet enroll`)")]
+    NoCertificate,
+    /// Too many certificates came.
+    #[error("the chain has {certificates} certificates, at most {CHAIN_CERTS_MAX} are read")]
+    ChainTooLong {
+        /// How many.
+        certificates: usize,
+    },
+    /// One is too long.
+    #[error("a certificate has {bytes} bytes, at most {CERT_BYTES_MAX} are read")]
+    CertificateTooLong {
+        /// Its length.
+        bytes: usize,
+    },
+    /// It is not the X.509 that we read.
+    #[error("the certificate cannot be used: {0}")]
+    Malformed(String),
+    /// The leaf does not say which node it is for.
+    #[error("the certificate names no SGC node: it was not made by `sgc fleet enroll`")]
+    NoPseudonym,
+    /// The leaf names too many groups.
+    #[error("the certificate names more than {GROUPS_MAX} groups")]
+    TooManyGroups,
+    /// Its key is of a kind that nodes do not sign with.
+    #[error("the certificate's key is not supported: P-256, P-384, Ed25519 and RSA are")]
+    KeyUnsupported,
+    /// It is meant for something else.
+    #[error("the certificate is for neither clients nor servers (extended key usage)")]
+    WrongUsage,
+    /// No CA that is trusted here made it.
+    #[error("the certificate is from a CA that is not trusted here: is the peer of another fleet?")]
+    UnknownIssuer,
+    /// It says that a trusted CA made it, and none did.
+    #[error("the certificate's signature is wrong: it was altered or forged")]
+    BadSignature,
+    /// It is over.
+    #[error("the certificate expired at {not_after} and the clock here says {now}: enroll again, or set the clock")]
+    Expired {
+        /// Its end.
+        not_after: UnixMillis,
+        /// The time of the check.
+        now: UnixMillis,
+    },
+    /// It has not begun.
+    #[error("the certificate begins at {not_before} and the clock here says {now}: which clock is wrong?")]
+    NotYetValid {
+        /// Its beginning.
+        not_before: UnixMillis,
+        /// The time of the check.
+        now: UnixMillis,
+    },
+    /// The CA's own certificate is over.
+    #[error("the fleet's CA expired at {not_after} and the clock here says {now}")]
+    CaExpired {
+        /// Its end.
+        not_after: UnixMillis,
+        /// The time of the check.
+        now: UnixMillis,
+    },
+}
+
+impl CertError {
+    fn from_webpki(error: webpki::Error) -> Self {
+        use webpki::Error as E;
+        let millis = |t: UnixTime| UnixMillis(t.as_secs().saturating_mul(1000));
+        match error {
+            E::CertExpired { time, not_after } => {
+                Self::Expired { not_after: millis(not_after), now: millis(time) }
+            }
+            E::CertNotValidYet { time, not_before } => {
+                Self::NotYetValid { not_before: millis(not_before), now: millis(time) }
+            }
+            E::UnknownIssuer => Self::UnknownIssuer,
+            E::InvalidSignatureForPublicKey => Self::BadSignature,
+            E::EmptyEkuExtension | E::RequiredEkuNotFoundContext(_) => Self::WrongUsage,
+            other => Self::Malformed(other.to_string()),
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! The few fields of a certificate that `webpki` checks but does not hand out: validity and the bare public key.
+//!
+//! It verifies nothing and is called only on certificates that `webpki` has parsed, or whose chain it is about
+//! to verify; anything unexpected is `None`.
+
+use sgc_wire::UnixMillis;
+
+const INTEGER: u8 = 0x02;
+const BIT_STRING: u8 = 0x03;
+const UTC_TIME: u8 = 0x17;
+const GENERALIZED_TIME: u8 = 0x18;
+const SEQUENCE: u8 = 0x30;
+const VERSION: u8 = 0xa0;
+
+/// From when until when a certificate holds, both inclusive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Validity {
+    pub(crate) not_before: UnixMillis,
+    pub(crate) not_after: UnixMillis,
+}
+
+impl Validity {
+    /// Of a DER certificate (RFC 5280, 4.1.2.5).
+    pub(crate) fn of(certificate: &[u8]) -> Option<Self> {
+        let mut certificate = Der(certificate).enter(SEQUENCE)?;
+        let mut tbs = certificate.enter(SEQUENCE)?;
+        if tbs.peek()? == VERSION {
+            tbs.enter(VERSION)?;
+        }
+        tbs.enter(INTEGER)?; // serial
+        tbs.enter(SEQUENCE)?; // signature algorithm
+        tbs.enter(SEQUENCE)?; // issuer
+        let mut validity = tbs.enter(SEQUENCE)?;
+        Some(Self { not_before: validity.time()?, not_after: validity.time()? })
+    }
+}
+
+/// Algorithm identifier (without its outer tag) and bare key of a DER SubjectPublicKeyInfo.
+pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
+    let mut spki = Der(spki).enter(SEQUENCE)?;
+    let algorithm = spki.enter(SEQUENCE)?.0;
+    match spki.enter(BIT_STRING)?.0.split_first()? {
+        (0, key) => Some((algorithm, key)),
+        _ => None,
+    }
+}
+
+struct Der<'a>(&'a [u8]);
+
+impl<'a> Der<'a> {
+    fn peek(&self) -> Option<u8> {
+        self.0.first().copied()
+    }
+
+    /// Steps over one element with this tag and returns its content.
+    fn enter(&mut self, tag: u8) -> Option<Der<'a>> {
+        let (found, rest) = self.0.split_first()?;
+        let (first, mut rest) = rest.split_first()?;
+        let mut length = usize::from(*first);
+        if length & 0x80 != 0 {
+            let digits;
+            (digits, rest) = rest.split_at_checked(length & 0x7f).filter(|(d, _)| (1..=3).contains(&d.len()))?;
+            length = digits.iter().fold(0, |n, digit| (n << 8) | usize::from(*digit));
+        }
+        let (content, rest) = rest.split_at_checked(length).filter(|_| *found == tag)?;
+        self.0 = rest;
+        Some(Der(content))
+    }
+
+    fn time(&mut self) -> Option<UnixMillis> {
+        let (text, century) = match self.peek()? {
+            UTC_TIME => {
+                let text = self.enter(UTC_TIME)?.0;
+                (text, Some(if number(text.get(..2)?)? >= 50 { 1900 } else { 2000 }))
+            }
+            _ => (self.enter(GENERALIZED_TIME)?.0, None),
+        };
+        let (year, rest) = text.split_at_checked(if century.is_some() { 2 } else { 4 })?;
+        let year = number(year)? + century.unwrap_or(0);
+        let rest = rest.strip_suffix(b"Z").filter(|r| r.len() == 10)?;
+        let mut parts = rest.chunks_exact(2).map(number);
+        let mut part = |low: u64, high: u64| parts.next()?.filter(|v| (low..=high).contains(v));
+        let (month, day) = (part(1, 12)?, part(1, 31)?);
+        let (hour, minute, second) = (part(0, 23)?, part(0, 59)?, part(0, 59)?);
+        let days = days_since_1970(year, month, day);
+        Some(UnixMillis(days.checked_mul(86_400)?.checked_add(hour * 3600 + minute * 60 + second)? * 1000))
+    }
+}
+
+fn number(digits: &[u8]) -> Option<u64> {
+    digits.iter().try_fold(0, |n, d| d.is_ascii_digit().then(|| n * 10 + u64::from(d - b'0')))
+}
+
+/// Days from 1970-01-01 to a Gregorian date; zero for dates before it, which hold for all our purposes.
+fn days_since_1970(year: u64, month: u64, day: u64) -> u64 {
+    const DAYS_BEFORE: [u64; 12] = [0, 31, 59, 90, 120, 151, 181, 212, 243, 273, 304, 334];
+    let is_leap = year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+    let before = year.saturating_sub(1);
+    let leap_days = before / 4 - before / 100 + before / 400;
+    let this_year = DAYS_BEFORE[(month as usize - 1) % 12] + day - 1 + u64::from(is_leap && month > 2);
+    (year * 365 + leap_days + this_year).saturating_sub(1970 * 365 + 477)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn time(tag: u8, text: &str) -> Option<String> {
+        let mut der = vec![tag, text.len() as u8];
+        der.extend_from_slice(text.as_bytes());
+        Der(&der).time().map(|t| t.to_string())
+    }
+
+    #[test]
+    fn times_are_read() {
+        for (tag, text, expected) in [
+            (UTC_TIME, "700101000000Z", "1970-01-01T00:00:00Z"),
+            (UTC_TIME, "000229235959Z", "2000-02-29T23:59:59Z"),
+            (UTC_TIME, "491231235959Z", "2049-12-31T23:59:59Z"),
+            (GENERALIZED_TIME, "20500301120000Z", "2050-03-01T12:00:00Z"),
+            (GENERALIZED_TIME, "21000301000000Z", "2100-03-01T00:00:00Z"),
+            (GENERALIZED_TIME, "99991231235959Z", "9999-12-31T23:59:59Z"),
+        ] {
+            assert_eq!(time(tag, text).as_deref(), Some(expected));
+        }
+        for text in ["20501301120000Z", "20500301120000", "2050030112000Z", "2050x301120000Z", ""] {
+            assert_eq!(time(GENERALIZED_TIME, text), None);
+        }
+    }
+
+    #[test]
+    fn broken_lengths_are_none() {
+        for der in [&[][..], &[SEQUENCE], &[SEQUENCE, 5, 1], &[SEQUENCE, 0x84, 1, 1, 1, 1], &[SEQUENCE, 0x80]] {
+            assert!(Der(der).enter(SEQUENCE).is_none());
+            assert!(Validity::of(der).is_none() && split_spki(der).is_none());
+        }
+    }
+}

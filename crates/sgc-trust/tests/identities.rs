@@ -1,0 +1,392 @@
+//! Who is believed to be whom: enrolment, files, chains.
+
+use std::time::Duration;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
+use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
+use rustls_pki_types::CertificateDer;
+use sgc_trust::*;
+use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, Pseudonym, UnixMillis};
+
+const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
+const MINUTE: u64 = 60_000;
+const DAY: u64 = 24 * 60 * MINUTE;
+
+fn rng(seed: u64) -> ChaCha20Rng {
+    ChaCha20Rng::seed_from_u64(seed)
+}
+
+fn fleet(seed: u64) -> Fleet {
+    Fleet::create("acme".parse().unwrap(), NOW, &mut rng(seed)).unwrap()
+}
+
+fn request(node: &str) -> EnrollRequest {
+    EnrollRequest::new(node.parse().unwrap(), NOW)
+}
+
+fn enroll(fleet: &Fleet, request: &EnrollRequest) -> Identity {
+    fleet.enroll(request, &mut rng(7)).unwrap()
+}
+
+fn at(offset: i64) -> UnixMillis {
+    UnixMillis(NOW.0.checked_add_signed(offset).unwrap())
+}
+
+fn contains(haystack: &[u8], needle: &[u8]) -> bool {
+    haystack.windows(needle.len()).any(|w| w == needle)
+}
+
+#[test]
+fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
+    // Computed with Python's hmac and hashlib.
+    let secret = FleetSecret::from_bytes(std::array::from_fn(|i| i as u8));
+    let pseudonym = secret.pseudonym("arm-1");
+    assert_eq!(
+        pseudonym.to_string(),
+        "35cfe4dbd58268ed66a35a9d31970b71c1924b1f868abc11bb0c3de8a6dad380"
+    );
+    assert_eq!(
+        secret.group_tag("operators").to_string(),
+        "fd07842555f47b1a744689f2cab99ce38dd9e62f916589055a6c679aea52306c"
+    );
+    let mut spki = vec![
+        0x30, 0x59, 0x30, 0x13, 0x06, 0x07, 0x2a, 0x86, 0x48, 0xce, 0x3d, 0x02, 0x01, 0x06, 0x08, 0x2a, 0x86,
+        0x48, 0xce, 0x3d, 0x03, 0x01, 0x07, 0x03, 0x42, 0x00, 0x04,
+    ];
+    spki.extend(0..64);
+    assert_eq!(
+        node_id(&spki, &pseudonym).to_string(),
+        "0ab23d5bda0052488b9dafdaf8a676fbeb840fe6043e5e4f91a41173c4d5ccdf"
+    );
+    assert_ne!(secret.pseudonym("operators").0, secret.group_tag("operators").0);
+}
+
+#[test]
+fn members_of_a_fleet_verify_and_name_each_other() {
+    let fleet = fleet(1);
+    let groups = vec!["operators".parse().unwrap(), "night".parse().unwrap(), "night".parse().unwrap()];
+    let arm = enroll(&fleet, &EnrollRequest { groups, ..request("arm-1") });
+    let desk = enroll(&fleet, &request("desk"));
+    let peer = desk.anchors().verify(arm.chain(), NOW).unwrap();
+    assert_eq!(peer.node_id, arm.node_id());
+    assert_eq!(Some(peer.node_id), desk.node_id_of("arm-1"));
+    assert_eq!(arm.node_id_of("arm-1"), Some(arm.node_id()));
+    assert_eq!(peer.pseudonym, fleet.secret().pseudonym("arm-1"));
+    assert_eq!(peer.groups.len(), 2);
+    assert!(peer.is_in(&fleet.secret().group_tag("operators")));
+    assert!(!peer.is_in(&fleet.secret().group_tag("arm-1")));
+    assert_eq!(arm.groups(), &*peer.groups);
+    assert!(desk.groups().is_empty());
+    assert_eq!(peer.not_after.secs(), at(90 * DAY as i64).secs());
+}
+
+#[test]
+fn certificates_tell_no_name() {
+    let fleet = fleet(1);
+    let groups = vec!["operators".parse().unwrap()];
+    let arm = enroll(&fleet, &EnrollRequest { groups, ..request("arm-1") });
+    for certificate in [&arm.chain()[0], fleet.ca_certificate()] {
+        for name in ["arm-1", "operators", "acme"] {
+            assert!(!contains(certificate, name.as_bytes()), "{name} is in a certificate");
+        }
+        assert!(!contains(certificate, fleet.secret().expose()));
+    }
+}
+
+#[test]
+fn a_certificate_with_all_groups_fits() {
+    let fleet = fleet(1);
+    let groups = |n: usize| (0..n).map(|i| format!("group-{i}").parse().unwrap()).collect();
+    let full = enroll(&fleet, &EnrollRequest { groups: groups(GROUPS_MAX), ..request("a") });
+    assert_eq!(full.groups().len(), GROUPS_MAX);
+    assert!(full.chain()[0].len() <= CERT_BYTES_MAX, "{}", full.chain()[0].len());
+    let over = EnrollRequest { groups: groups(GROUPS_MAX + 1), ..request("a") };
+    assert!(matches!(fleet.enroll(&over, &mut rng(1)), Err(FleetError::TooManyGroups { groups: 33 })));
+}
+
+#[test]
+fn a_fleet_follows_its_seed() {
+    let ids = |seed| {
+        let fleet = fleet(seed);
+        (fleet.secret().expose().to_vec(), enroll(&fleet, &request("a")).node_id())
+    };
+    assert_eq!(ids(1), ids(1));
+    assert_ne!(ids(1), ids(2));
+}
+
+#[test]
+fn clock_skew_of_minutes_works_and_of_days_is_named() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, &request("arm-1"));
+    let verify = |now| fleet.anchors().verify(arm.chain(), now);
+    assert!(verify(at(-9 * MINUTE as i64)).is_ok());
+    let early = verify(at(-(DAY as i64))).unwrap_err();
+    assert!(matches!(early, CertError::NotYetValid { now, .. } if now.secs() == at(-(DAY as i64)).secs()));
+    assert!(early.to_string().contains("clock"), "{early}");
+    assert!(verify(at(90 * DAY as i64)).is_ok());
+    let late = verify(at(91 * DAY as i64)).unwrap_err();
+    let CertError::Expired { not_after, now } = late else { panic!("{late}") };
+    assert_eq!((not_after, now), (arm.not_after(), at(91 * DAY as i64)));
+    assert!(late.to_string().contains("expired"), "{late}");
+}
+
+#[test]
+fn a_leaf_never_outlives_its_ca_and_an_expired_ca_is_not_believed() {
+    let fleet = fleet(1);
+    let valid = Duration::from_secs(20 * 365 * 86_400);
+    let arm = enroll(&fleet, &EnrollRequest { valid, ..request("arm-1") });
+    assert_eq!(arm.not_after(), fleet.not_after());
+    let after = UnixMillis(fleet.not_after().0 + 1000);
+    assert!(matches!(
+        fleet.enroll(&EnrollRequest { now: after, ..request("b") }, &mut rng(1)),
+        Err(FleetError::CaExpired { .. })
+    ));
+    assert!(matches!(
+        Fleet::create("x".parse().unwrap(), UnixMillis(u64::MAX), &mut rng(1)),
+        Err(FleetError::Time(_))
+    ));
+}
+
+#[test]
+fn another_fleet_is_refused() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    let stranger = enroll(&theirs, &request("arm-1"));
+    assert_eq!(ours.anchors().verify(stranger.chain(), NOW).unwrap_err(), CertError::UnknownIssuer);
+    let both = TrustAnchors::new([ours.ca_certificate().clone(), theirs.ca_certificate().clone()]).unwrap();
+    assert_eq!(both.verify(stranger.chain(), NOW).unwrap().node_id, stranger.node_id());
+    // The same name and even the same secret under another CA is another node.
+    assert_ne!(enroll(&ours, &request("arm-1")).node_id(), stranger.node_id());
+}
+
+#[test]
+fn no_flipped_bit_of_a_certificate_is_accepted() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, &request("arm-1"));
+    for index in 0..arm.chain()[0].len() {
+        let mut der = arm.chain()[0].to_vec();
+        der[index] ^= 1;
+        assert!(fleet.anchors().verify(&[CertificateDer::from(der)], NOW).is_err(), "byte {index}");
+    }
+    let mut der = arm.chain()[0].to_vec();
+    let pseudonym = arm.pseudonym().to_string();
+    let start = der.windows(64).rposition(|w| w == pseudonym.as_bytes()).unwrap();
+    der[start] = if der[start] == b'0' { b'1' } else { b'0' };
+    let forged = fleet.anchors().verify(&[CertificateDer::from(der)], NOW);
+    assert_eq!(forged.unwrap_err(), CertError::BadSignature);
+}
+
+#[test]
+fn chains_are_bounded() {
+    let fleet = fleet(1);
+    let leaf = enroll(&fleet, &request("arm-1")).chain()[0].clone();
+    let verify = |chain: &[CertificateDer<'_>]| fleet.anchors().verify(chain, NOW).unwrap_err();
+    assert_eq!(verify(&[]), CertError::NoCertificate);
+    let long = vec![leaf.clone(); CHAIN_CERTS_MAX + 1];
+    assert_eq!(verify(&long), CertError::ChainTooLong { certificates: CHAIN_CERTS_MAX + 1 });
+    let big = CertificateDer::from(vec![0; CERT_BYTES_MAX + 1]);
+    assert_eq!(verify(&[leaf, big]), CertError::CertificateTooLong { bytes: CERT_BYTES_MAX + 1 });
+    assert!(matches!(verify(&[CertificateDer::from(vec![0x30; 9])]), CertError::Malformed(_)));
+    // The CA is no node.
+    assert!(matches!(verify(&[fleet.ca_certificate().clone()]), CertError::Malformed(_)));
+    assert_eq!(TrustAnchors::new([]).unwrap_err(), AnchorError::None);
+    let many = vec![fleet.ca_certificate().clone(); ANCHORS_MAX + 1];
+    assert_eq!(TrustAnchors::new(many).unwrap_err(), AnchorError::TooMany);
+}
+
+/// A CA of the kind that a company has already, and what it issues.
+struct ForeignCa {
+    params: CertificateParams,
+    key: KeyPair,
+    anchors: TrustAnchors,
+}
+
+impl ForeignCa {
+    fn new() -> Self {
+        let mut params = CertificateParams::default();
+        params.is_ca = IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        params.distinguished_name.push(DnType::CommonName, "Company CA");
+        let key = KeyPair::generate_for(&rcgen::PKCS_ECDSA_P384_SHA384).unwrap();
+        let certificate = params.self_signed(&key).unwrap();
+        Self { params, key, anchors: TrustAnchors::new([certificate.into()]).unwrap() }
+    }
+
+    fn issue(
+        &self,
+        uris: &[String],
+        usage: Option<ExtendedKeyUsagePurpose>,
+        algorithm: &'static rcgen::SignatureAlgorithm,
+    ) -> Result<VerifiedPeer, CertError> {
+        let mut params = CertificateParams::default();
+        params.subject_alt_names =
+            uris.iter().map(|u| SanType::URI(u.as_str().try_into().unwrap())).collect();
+        params.extended_key_usages = usage.into_iter().collect();
+        let key = KeyPair::generate_for(algorithm).unwrap();
+        let leaf = params.signed_by(&key, &Issuer::from_params(&self.params, &self.key)).unwrap();
+        self.anchors.verify(&[leaf.into()], NOW)
+    }
+}
+
+#[test]
+fn leaves_of_an_existing_pki_are_judged_by_what_they_say() {
+    let ca = ForeignCa::new();
+    let node = format!("sgc:node:{}", Pseudonym([0xab; 32]));
+    let group = |i: u8| format!("sgc:group:{}", Pseudonym([i; 32]));
+    let p256 = &rcgen::PKCS_ECDSA_P256_SHA256;
+    let judge = |uris: &[String]| ca.issue(uris, None, p256);
+    let uris = [node.clone(), "https://example.com/x".into(), "sgc:later:1".into(), group(2), group(1)];
+    let peer = judge(&uris).unwrap();
+    assert_eq!(peer.pseudonym, Pseudonym([0xab; 32]));
+    assert_eq!(peer.groups.iter().map(|g| g.0[0]).collect::<Vec<_>>(), [1, 2]);
+    assert_eq!(judge(&[]).unwrap_err(), CertError::NoPseudonym);
+    assert_eq!(judge(&["sgc:node:arm-1".into()]).unwrap_err(), CertError::NoPseudonym);
+    assert!(matches!(judge(&[node.clone(), node.clone()]), Err(CertError::Malformed(_))));
+    assert!(matches!(judge(&[node.clone(), "sgc:group:x".into()]), Err(CertError::Malformed(_))));
+    let many: Vec<_> = std::iter::once(node.clone()).chain((0..33).map(group)).collect();
+    assert_eq!(judge(&many).unwrap_err(), CertError::TooManyGroups);
+
+    let mail = Some(ExtendedKeyUsagePurpose::EmailProtection);
+    assert_eq!(ca.issue(&[node.clone()], mail, p256).unwrap_err(), CertError::WrongUsage);
+    for usage in [ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth] {
+        assert!(ca.issue(&[node.clone()], Some(usage), p256).is_ok());
+    }
+    for algorithm in [&rcgen::PKCS_ECDSA_P384_SHA384, &rcgen::PKCS_ED25519] {
+        assert!(ca.issue(&[node.clone()], None, algorithm).is_ok());
+    }
+    let p521 = &rcgen::PKCS_ECDSA_P521_SHA512;
+    assert_eq!(ca.issue(&[node], None, p521).unwrap_err(), CertError::KeyUnsupported);
+}
+
+#[test]
+fn signatures_hold_for_their_signer_message_and_context_only() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, &request("arm-1"));
+    let desk = fleet.enroll(&request("desk"), &mut rng(8)).unwrap();
+    let peer = fleet.anchors().verify(arm.chain(), NOW).unwrap();
+    let signature = arm.sign("test v1", b"message");
+    assert_eq!(peer.verify_signature("test v1", b"message", &signature), Ok(()));
+    let error = Err(SignatureError { signer: arm.node_id() });
+    assert_eq!(peer.verify_signature("test v2", b"message", &signature), error);
+    assert_eq!(peer.verify_signature("test v1", b"massage", &signature), error);
+    assert_eq!(peer.verify_signature("test v1", b"message", &desk.sign("test v1", b"message")), error);
+    assert_eq!(peer.verify_signature("test v1", b"message", b""), error);
+}
+
+#[test]
+fn identities_and_fleets_survive_their_files() {
+    let fleet = fleet(1);
+    let read = Fleet::parse(&fleet.to_text()).unwrap();
+    assert_eq!(read.name(), fleet.name());
+    assert_eq!(read.secret().expose(), fleet.secret().expose());
+    assert_eq!(read.to_text(), fleet.to_text());
+    let arm = enroll(&read, &request("arm-1"));
+    let text = arm.to_text();
+    for line in ["# node:    arm-1\n", "# fleet:   acme\n", "# expires: 2027-", "KEEP IT SECRET"] {
+        assert!(text.contains(line), "{line} is not in {}", &text[..300]);
+    }
+    let back = Identity::parse(&text).unwrap();
+    assert_eq!(back.to_text(), text);
+    assert_eq!((back.node_id(), back.node_name()), (arm.node_id(), arm.node_name()));
+    assert_eq!(back.fleet_secret().unwrap().expose(), fleet.secret().expose());
+    assert_eq!(back.reset_key(), arm.reset_key());
+    let peer = fleet.anchors().verify(back.chain(), NOW).unwrap();
+    assert_eq!(peer.verify_signature("x", b"y", &back.sign("x", b"y")), Ok(()));
+}
+
+#[test]
+fn a_router_has_no_secret() {
+    let fleet = fleet(1);
+    let router = enroll(&fleet, &EnrollRequest { router: true, ..request("router") });
+    assert!(router.fleet_secret().is_none());
+    assert_eq!(router.node_id_of("arm-1"), None);
+    let text = router.to_text();
+    let secret = base64::Engine::encode(
+        &base64::engine::general_purpose::STANDARD,
+        fleet.secret().expose(),
+    );
+    assert!(fleet.to_text().contains(&secret[..40]));
+    assert!(!text.contains(&secret[..40]) && !text.contains("FLEET SECRET"));
+    let back = Identity::parse(&text).unwrap();
+    assert!(back.fleet_secret().is_none());
+    assert_eq!(back.node_id(), router.node_id());
+    let arm = enroll(&fleet, &request("arm-1"));
+    assert_eq!(back.anchors().verify(arm.chain(), NOW).unwrap().node_id, arm.node_id());
+}
+
+#[test]
+fn debug_output_tells_no_secret() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, &request("arm-1"));
+    let text = arm.to_text();
+    let shown = format!("{fleet:?} {fleet:#?} {arm:?} {arm:#?} {:?} {:?}", fleet.secret(), arm.as_peer());
+    let list = |bytes: &[u8]| format!("{:?}", &bytes[..4]).trim_matches(['[', ']']).to_owned();
+    let hex = |bytes: &[u8]| bytes[..4].iter().map(|b| format!("{b:02x}")).collect::<String>();
+    for secret in [&fleet.secret().expose()[..], arm.reset_key().unwrap()] {
+        assert!(!shown.contains(&list(secret)) && !shown.contains(&hex(secret)));
+    }
+    for line in text.lines().filter(|l| l.len() == 64) {
+        assert!(!shown.contains(line));
+    }
+    // Errors of broken files tell none either.
+    let broken = text.replace("SGC FLEET SECRET", "SGC NOBODY KNOWS");
+    let error = format!("{:?}", Identity::parse(&broken).unwrap_err());
+    assert_eq!(error, "UnknownBlock(\"SGC NOBODY KNOWS\")");
+}
+
+/// The file without its first block of that label.
+fn without(text: &str, label: &str) -> String {
+    let (begin, end) = (format!("-----BEGIN {label}-----"), format!("-----END {label}-----\n"));
+    let (start, stop) = (text.find(&begin).unwrap(), text.find(&end).unwrap() + end.len());
+    format!("{}{}", &text[..start], &text[stop..])
+}
+
+/// The first block of that label.
+fn block<'a>(text: &'a str, label: &str) -> &'a str {
+    let (begin, end) = (format!("-----BEGIN {label}-----"), format!("-----END {label}-----\n"));
+    &text[text.find(&begin).unwrap()..text.find(&end).unwrap() + end.len()]
+}
+
+#[test]
+fn broken_identity_files_name_the_block() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    let text = enroll(&ours, &request("arm-1")).to_text();
+    let foreign = theirs.enroll(&request("arm-1"), &mut rng(9)).unwrap().to_text();
+    let refused = |text: &str| Identity::parse(text).unwrap_err();
+    for label in ["SGC IDENTITY", "CERTIFICATE", "PRIVATE KEY", "SGC CA CERTIFICATE"] {
+        let error = refused(&without(&text, label));
+        assert!(matches!(error, IdentityError::Missing(l) if l == label), "{error}");
+        assert!(error.to_string().contains(label));
+    }
+    let swap = |label| text.replace(block(&text, label), block(&foreign, label));
+    assert_eq!(refused(&swap("CERTIFICATE")), IdentityError::Chain(CertError::UnknownIssuer));
+    assert_eq!(refused(&swap("SGC CA CERTIFICATE")), IdentityError::Chain(CertError::UnknownIssuer));
+    assert_eq!(refused(&swap("PRIVATE KEY")), IdentityError::KeyMismatch);
+    assert!(matches!(refused(&swap("SGC FLEET SECRET")), IdentityError::NameMismatch { .. }));
+    let desk = ours.enroll(&request("desk"), &mut rng(9)).unwrap().to_text();
+    let renamed = text.replace(block(&text, "SGC IDENTITY"), block(&desk, "SGC IDENTITY"));
+    assert!(matches!(refused(&renamed), IdentityError::NameMismatch { node } if node.as_str() == "desk"));
+    let twice = format!("{}{}", text.as_str(), block(&text, "PRIVATE KEY"));
+    assert_eq!(refused(&twice), IdentityError::Repeated("PRIVATE KEY"));
+    assert_eq!(refused(""), IdentityError::Missing("SGC IDENTITY"));
+    let garbage = "-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n";
+    assert_eq!(refused(&text.replace(block(&text, "PRIVATE KEY"), garbage)), IdentityError::Key);
+    let about = |base64| format!("-----BEGIN SGC IDENTITY-----\n{base64}\n-----END SGC IDENTITY-----\n");
+    let with_about = |base64| refused(&text.replace(block(&text, "SGC IDENTITY"), &about(base64)));
+    assert!(matches!(with_about("CQ=="), IdentityError::About(sgc_wire::DecodeError::Version { found: 9, .. })));
+    assert!(matches!(with_about("AQ=="), IdentityError::About(sgc_wire::DecodeError::Truncated { .. })));
+    assert!(matches!(refused("-----BEGIN X-----"), IdentityError::File(PemError::Unterminated { .. })));
+}
+
+#[test]
+fn broken_fleet_files_name_the_block() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    let (text, foreign) = (ours.to_text(), theirs.to_text());
+    for label in ["SGC FLEET", "CERTIFICATE", "PRIVATE KEY", "SGC FLEET SECRET"] {
+        let error = Fleet::parse(&without(&text, label)).unwrap_err();
+        assert!(matches!(error, FleetError::Missing(l) if l == label), "{error}");
+    }
+    let swapped = text.replace(block(&text, "PRIVATE KEY"), block(&foreign, "PRIVATE KEY"));
+    assert!(matches!(Fleet::parse(&swapped), Err(FleetError::KeyMismatch)));
+    let identity = enroll(&ours, &request("a")).to_text();
+    assert!(matches!(Fleet::parse(&identity), Err(FleetError::UnknownBlock(l)) if l == "SGC IDENTITY"));
+}
