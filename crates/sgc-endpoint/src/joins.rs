@@ -1,0 +1,143 @@
+//! What this node asks of others: one state per joined name, from waiting to granted and back.
+
+use std::time::{Duration, Instant};
+
+use rand_core::RngCore;
+use sgc_trust::{ReplyKey, VerifiedPeer};
+use sgc_wire::{NodeId, RefuseReason, RejectReason, SinkId};
+
+/// Shortest wait before asking again.
+const RETRY_MIN: Duration = Duration::from_millis(200);
+/// Longest wait before asking again.
+const RETRY_MAX: Duration = Duration::from_secs(10);
+/// Wait before asking an owner again that refused.
+const REFUSED_RETRY: Duration = Duration::from_secs(30);
+/// How long an answer is waited for; routers give up earlier and say so.
+const ANSWER_WAIT: Duration = Duration::from_secs(15);
+
+/// Who refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RefusedBy {
+    /// The owner, signed.
+    Owner(RefuseReason),
+    /// A router on the way.
+    Router(RejectReason),
+}
+
+impl std::fmt::Display for RefusedBy {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Owner(reason) => reason.fmt(f),
+            Self::Router(reason) => reason.fmt(f),
+        }
+    }
+}
+
+/// Why a grant no longer carries data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LostReason {
+    /// The owner withdrew the name.
+    Withdrawn,
+    /// No router in reach knows a way to the owner.
+    Unreachable,
+    /// A router cut the branch; asking again.
+    Cut(RejectReason),
+    /// The owner took the grant back.
+    Refused(RefuseReason),
+}
+
+/// Where a join stands, for status.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JoinStatus {
+    /// Nobody in reach advertises the name.
+    Waiting,
+    /// Asked, not answered yet.
+    Asked,
+    /// Refused; asking again later.
+    Refused(RefusedBy),
+    /// Granted.
+    Granted,
+}
+
+/// What a join waits for.
+#[derive(Debug)]
+pub(crate) enum JoinState {
+    /// An advertisement.
+    ExpectAdvert,
+    /// The owner's answer.
+    ExpectAnswer { sink: SinkId, reply_key: ReplyKey, deadline: Instant },
+    /// The time to ask again.
+    ExpectRetry { at: Instant, refused: Option<RefusedBy> },
+    /// Nothing: granted. The reply key opens later answers too.
+    Granted { sink: SinkId, reply_key: ReplyKey, serial: u64 },
+}
+
+/// A joined name.
+#[derive(Debug)]
+pub(crate) struct Join {
+    /// Whose it must be.
+    pub(crate) owner: NodeId,
+    /// The owner as its last advertisement proved it; `None` while there is none.
+    pub(crate) reachable: Option<VerifiedPeer>,
+    pub(crate) state: JoinState,
+    attempts: u32,
+}
+
+impl Join {
+    pub(crate) fn new(owner: NodeId) -> Self {
+        Self { owner, reachable: None, state: JoinState::ExpectAdvert, attempts: 0 }
+    }
+
+    pub(crate) fn status(&self) -> JoinStatus {
+        match &self.state {
+            JoinState::ExpectAdvert => JoinStatus::Waiting,
+            JoinState::ExpectAnswer { .. } => JoinStatus::Asked,
+            JoinState::ExpectRetry { refused: Some(by), .. } => JoinStatus::Refused(*by),
+            JoinState::ExpectRetry { refused: None, .. } => JoinStatus::Waiting,
+            JoinState::Granted { .. } => JoinStatus::Granted,
+        }
+    }
+
+    /// The sink that asked or was granted.
+    pub(crate) fn sink(&self) -> Option<SinkId> {
+        match &self.state {
+            JoinState::ExpectAnswer { sink, .. } | JoinState::Granted { sink, .. } => Some(*sink),
+            _ => None,
+        }
+    }
+
+    /// When to act if nothing happens.
+    pub(crate) fn deadline(&self) -> Option<Instant> {
+        match &self.state {
+            JoinState::ExpectAnswer { deadline, .. } => Some(*deadline),
+            JoinState::ExpectRetry { at, .. } => Some(*at),
+            _ => None,
+        }
+    }
+
+    /// Asks now: a fresh sink id and reply key.
+    pub(crate) fn ask(&mut self, now: Instant, rng: &mut impl RngCore) -> (SinkId, bytes::Bytes) {
+        let mut id = [0; 16];
+        rng.fill_bytes(&mut id);
+        let (sink, reply_key) = (SinkId(id), ReplyKey::generate());
+        let public = reply_key.public().clone();
+        self.attempts = self.attempts.saturating_add(1);
+        self.state = JoinState::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };
+        (sink, public)
+    }
+
+    /// Asks again later: soon and then ever more patiently, with jitter so that many do not ask at once.
+    pub(crate) fn retry(&mut self, now: Instant, refused: Option<RefusedBy>, rng: &mut impl RngCore) {
+        let wait = match refused {
+            Some(RefusedBy::Owner(_)) => REFUSED_RETRY,
+            _ => (RETRY_MIN * 2u32.saturating_pow(self.attempts.saturating_sub(1).min(16))).min(RETRY_MAX),
+        };
+        let jitter = wait.mul_f64(f64::from(rng.next_u32() % 1000) / 2000.0);
+        self.state = JoinState::ExpectRetry { at: now + wait / 2 + jitter, refused };
+    }
+
+    /// Starts patience afresh.
+    pub(crate) fn succeeded(&mut self) {
+        self.attempts = 0;
+    }
+}
