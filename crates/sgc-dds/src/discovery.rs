@@ -1,0 +1,204 @@
+//! Which endpoints are there: a thread that reads DCPSPublication and DCPSSubscription.
+//!
+//! Reports each endpoint once when it appears, once when it is gone, and as gone and new when what it
+//! offers changes. Endpoints of this participant are never reported, those of other SGC nodes only to a
+//! network without a tag. Decides nothing else.
+
+use std::collections::HashMap;
+use std::ffi::{CStr, c_char, c_void};
+use std::mem::MaybeUninit;
+use std::sync::Arc;
+use std::thread;
+
+use cyclors::{
+    DDS_BUILTIN_TOPIC_DCPSPUBLICATION, DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION, dds_builtintopic_endpoint_t,
+    dds_create_reader, dds_instance_state_DDS_IST_ALIVE, dds_return_loan, dds_sample_info_t, dds_take,
+};
+use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, Guid};
+
+use crate::entity::{Entity, check};
+use crate::network::Participant;
+use crate::wait::{Stop, WaitSet};
+use crate::{qos, user_data};
+
+/// Samples taken at once.
+const BATCH: usize = 32;
+
+/// Bound on endpoints reported and not yet gone; more are ignored.
+const ENDPOINTS_MAX: usize = 65_536;
+
+/// Bound on a topic or type name, bytes (ROS 2 and DDS stop at 256).
+const NAME_BYTES_MAX: usize = 512;
+
+/// Starts the thread; what is there already is reported first.
+pub(crate) fn start(
+    participant: Arc<Participant>,
+    handler: DiscoveryHandler,
+) -> Result<(Arc<Stop>, thread::JoinHandle<()>), String> {
+    let stop = Stop::new(&participant)?;
+    let readers = [
+        BuiltinReader::new(&participant, EndpointKind::Writer)?,
+        BuiltinReader::new(&participant, EndpointKind::Reader)?,
+    ];
+    let conditions: Vec<&Entity> = readers.iter().map(|r| &r.condition).collect();
+    let wait_set = WaitSet::new(&participant, Arc::clone(&stop), &conditions)?;
+    let mut discovery = Discovery { wait_set, readers, known: HashMap::new(), handler, participant };
+    let thread = thread::Builder::new()
+        .name("sgc-dds-disc".into())
+        .spawn(move || discovery.run())
+        .map_err(|e| e.to_string())?;
+    Ok((stop, thread))
+}
+
+/// What the thread owns. Fields drop in this order: children first.
+struct Discovery {
+    wait_set: WaitSet,
+    readers: [BuiltinReader; 2],
+    known: HashMap<Guid, DiscoveredEndpoint>,
+    handler: DiscoveryHandler,
+    participant: Arc<Participant>,
+}
+
+struct BuiltinReader {
+    condition: Entity,
+    reader: Entity,
+    /// What its samples describe.
+    kind: EndpointKind,
+}
+
+impl BuiltinReader {
+    fn new(participant: &Participant, kind: EndpointKind) -> Result<Self, String> {
+        let topic = match kind {
+            EndpointKind::Reader => DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
+            EndpointKind::Writer => DDS_BUILTIN_TOPIC_DCPSPUBLICATION,
+        };
+        // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
+        let reader = Entity::new(unsafe {
+            dds_create_reader(participant.entity().handle(), topic, std::ptr::null(), std::ptr::null())
+        })?;
+        Ok(Self { condition: reader.read_condition()?, reader, kind })
+    }
+
+    /// Takes what there is, up to a batch; `None` for an endpoint that is not alive or cannot be bridged.
+    fn take(&self, changes: &mut Vec<(Guid, Option<Announcement>)>) -> Result<usize, String> {
+        let mut samples: [*mut c_void; BATCH] = [std::ptr::null_mut(); BATCH];
+        let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
+        // SAFETY: both arrays have room for a batch; null pointers ask for loans, given back below.
+        let taken = unsafe {
+            dds_take(
+                self.reader.handle(),
+                samples.as_mut_ptr(),
+                infos.as_mut_ptr().cast(),
+                BATCH,
+                BATCH as u32,
+            )
+        };
+        check(taken)?;
+        for (sample, info) in samples.iter().zip(&infos).take(taken as usize) {
+            // SAFETY: Cyclone filled the first `taken` of both arrays, and samples of these two topics are
+            // of this type.
+            let (endpoint, info) =
+                unsafe { (&*sample.cast::<dds_builtintopic_endpoint_t>(), info.assume_init_ref()) };
+            let alive = info.instance_state == dds_instance_state_DDS_IST_ALIVE;
+            // A sample that only tells a change of state has a key and nothing else.
+            if alive && !info.valid_data {
+                continue;
+            }
+            // SAFETY: valid data has valid names and QoS while the loan lasts.
+            let announcement = if alive { unsafe { Announcement::read(self.kind, endpoint) } } else { None };
+            changes.push((Guid(endpoint.key.v), announcement));
+        }
+        if taken > 0 {
+            // SAFETY: gives back the loans of the take above, once.
+            check(unsafe { dds_return_loan(self.reader.handle(), samples.as_mut_ptr(), taken) })?;
+        }
+        Ok(taken as usize)
+    }
+}
+
+struct Announcement {
+    endpoint: DiscoveredEndpoint,
+    tagged: bool,
+}
+
+impl Announcement {
+    /// # Safety
+    /// Names and QoS of the sample must be valid.
+    unsafe fn read(kind: EndpointKind, sample: &dds_builtintopic_endpoint_t) -> Option<Self> {
+        if sample.qos.is_null() {
+            return None;
+        }
+        let guid = Guid(sample.key.v);
+        // SAFETY: valid by contract.
+        let (topic, type_name) = unsafe { (name(sample.topic_name)?, name(sample.type_name)?) };
+        // SAFETY: not null, valid by contract.
+        let (qos, data) = unsafe { (qos::discovered(kind, sample.qos), qos::user_data(sample.qos)) };
+        let endpoint = DiscoveredEndpoint {
+            kind,
+            guid,
+            topic,
+            type_name,
+            keyless: guid.is_keyless(),
+            type_hash: user_data::type_hash(&data),
+            qos: qos?,
+        };
+        Some(Self { endpoint, tagged: user_data::is_tagged(&data) })
+    }
+}
+
+/// # Safety
+/// Null, or a NUL-terminated string.
+unsafe fn name(text: *const c_char) -> Option<String> {
+    if text.is_null() {
+        return None;
+    }
+    // SAFETY: valid by contract.
+    let text = unsafe { CStr::from_ptr(text) }.to_str().ok()?;
+    (text.len() <= NAME_BYTES_MAX).then(|| text.to_owned())
+}
+
+impl Discovery {
+    fn run(&mut self) {
+        let mut changes = Vec::with_capacity(BATCH);
+        loop {
+            for i in 0..self.readers.len() {
+                loop {
+                    let taken = self.readers[i].take(&mut changes).unwrap_or_else(|reason| {
+                        tracing::error!(reason, "reading DDS discovery failed");
+                        0
+                    });
+                    for (guid, announcement) in changes.drain(..) {
+                        self.apply(guid, announcement);
+                    }
+                    if taken < BATCH {
+                        break;
+                    }
+                }
+            }
+            if !self.wait_set.wait() {
+                return;
+            }
+        }
+    }
+
+    fn apply(&mut self, guid: Guid, announcement: Option<Announcement>) {
+        if self.participant.owns(&guid) {
+            return;
+        }
+        let endpoint =
+            announcement.filter(|a| !(a.tagged && self.participant.ignores_tagged())).map(|a| a.endpoint);
+        if endpoint.is_some() && self.known.get(&guid) == endpoint.as_ref() {
+            return;
+        }
+        if self.known.remove(&guid).is_some() {
+            (self.handler)(DiscoveryEvent::Vanished { guid });
+        }
+        let Some(endpoint) = endpoint else { return };
+        if self.known.len() >= ENDPOINTS_MAX {
+            tracing::debug!(?guid, "too many endpoints on the network: one is ignored");
+            return;
+        }
+        self.known.insert(guid, endpoint.clone());
+        (self.handler)(DiscoveryEvent::Appeared(endpoint));
+    }
+}

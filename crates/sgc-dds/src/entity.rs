@@ -1,0 +1,72 @@
+//! Ownership of DDS entities: [`Entity`] deletes on drop.
+//!
+//! Knows no topic and no sample. Owners declare their fields so that children drop before parents:
+//! Cyclone deletes the children of a deleted entity, and a handle must not be deleted twice.
+
+use std::ffi::{CStr, CString};
+
+use cyclors::{
+    dds_create_readcondition, dds_delete, dds_entity_t, dds_get_guid, dds_guid_t, dds_return_t,
+    dds_strretcode,
+};
+use sgc_ros::Guid;
+
+/// Cyclone's infinite duration.
+pub(crate) const INFINITE: i64 = i64::MAX;
+
+/// A DDS entity that is deleted when dropped.
+#[derive(Debug)]
+pub(crate) struct Entity(dds_entity_t);
+
+impl Entity {
+    /// Takes the handle that a create function returned, or says why it returned none.
+    pub(crate) fn new(handle: dds_entity_t) -> Result<Self, String> {
+        if handle > 0 { Ok(Self(handle)) } else { Err(reason(handle)) }
+    }
+
+    /// The handle, for calls into Cyclone while `self` lives.
+    pub(crate) fn handle(&self) -> dds_entity_t {
+        self.0
+    }
+
+    /// The GUID of a participant, reader or writer.
+    pub(crate) fn guid(&self) -> Result<Guid, String> {
+        let mut guid = dds_guid_t { v: [0; 16] };
+        // SAFETY: the handle is checked by Cyclone, and `guid` is a valid place for the result.
+        check(unsafe { dds_get_guid(self.0, &mut guid) })?;
+        Ok(Guid(guid.v))
+    }
+
+    /// A condition that is true while the reader `self` holds samples of any state.
+    pub(crate) fn read_condition(&self) -> Result<Self, String> {
+        // SAFETY: takes two numbers; the handle is checked by Cyclone.
+        Self::new(unsafe { dds_create_readcondition(self.0, cyclors::DDS_ANY_STATE) })
+    }
+}
+
+impl Drop for Entity {
+    fn drop(&mut self) {
+        // SAFETY: takes a number, checked by Cyclone; nothing refers to the entity any more.
+        let ret = unsafe { dds_delete(self.0) };
+        if ret < 0 {
+            tracing::debug!(reason = reason(ret), "deleting a DDS entity failed");
+        }
+    }
+}
+
+/// `Err` with the reason if a return code is negative.
+pub(crate) fn check(ret: dds_return_t) -> Result<(), String> {
+    if ret < 0 { Err(reason(ret)) } else { Ok(()) }
+}
+
+/// What Cyclone calls a return code.
+pub(crate) fn reason(ret: dds_return_t) -> String {
+    // SAFETY: returns a pointer to a string constant for every argument, never null.
+    let text = unsafe { CStr::from_ptr(dds_strretcode(ret)) };
+    text.to_string_lossy().into_owned()
+}
+
+/// A C string, or what is wrong with the text.
+pub(crate) fn c_string(text: &str) -> Result<CString, String> {
+    CString::new(text).map_err(|_| format!("{text:?} contains a NUL"))
+}

@@ -1,0 +1,39 @@
+//! The Cyclone DDS backend of SGC: [`CycloneNetwork`] implements [`sgc_ros::RosNetwork`] on `cyclors`.
+//!
+//! It joins one DDS domain, tells which endpoints are there, and moves serialised samples in and out
+//! for types that are unknown at compile time. It decides nothing about what is shared with whom, knows
+//! no ROS name mangling, never looks inside a payload beyond its encapsulation header, and uses no
+//! tokio: every thread here is a plain thread that blocks in a DDS waitset.
+//!
+//! This is the only crate with `unsafe`: everything that Cyclone hands out is owned by a type of
+//! `entity` or `serdata`, whose `Drop` gives it back, and no raw pointer leaves the crate.
+//!
+//! # Keyed topics
+//! The sertype of `cyclors` knows no keys: all samples of a keyed topic are one instance to Cyclone.
+//! Data of keyed topics flows both ways, and a writer can dispose and unregister; what is *not* there:
+//! disposals and unregistrations by remote writers are not reported (Cyclone keeps no key payload for
+//! them), and history is kept per topic rather than per instance, so it is made
+//! [`qos::KEYED_INSTANCES_KEPT`] times as deep to make up for it.
+
+#![allow(unsafe_code)]
+#![warn(clippy::undocumented_unsafe_blocks)]
+
+pub mod config;
+mod discovery;
+mod entity;
+pub mod env;
+mod log;
+mod network;
+pub mod payload;
+pub mod qos;
+mod reader;
+mod serdata;
+pub mod user_data;
+mod wait;
+mod writer;
+
+pub use config::{DdsConfig, DiscoveryRange};
+pub use env::{EnvError, RosEnv, from_env_vars};
+pub use network::CycloneNetwork;
+pub use reader::CycloneReader;
+pub use writer::CycloneWriter;

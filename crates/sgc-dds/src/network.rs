@@ -1,0 +1,238 @@
+//! [`CycloneNetwork`]: one participant in one DDS domain.
+//!
+//! Creates the domain and the participant, and hands them to readers, writers and discovery, which keep
+//! them alive as long as they need them. Moves no sample itself.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+
+use cyclors::{
+    DDS_RETCODE_PRECONDITION_NOT_MET, cdds_create_blob_topic, dds_create_domain, dds_create_participant,
+    dds_create_publisher, dds_create_subscriber, dds_domain_set_deafmute, dds_get_children,
+};
+use sgc_ros::{DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError, RosNetwork, SampleHandler};
+
+use crate::config::{DdsConfig, Instance, chooses_interfaces, cyclone_config, local_addresses};
+use crate::discovery;
+use crate::entity::{Entity, c_string, reason};
+use crate::log;
+use crate::qos::NativeQos;
+use crate::reader::CycloneReader;
+use crate::user_data;
+use crate::wait::{Stop, join};
+use crate::writer::CycloneWriter;
+
+/// First of Cyclone's domain ids for networks that share a ROS domain with another of this process; far
+/// above every ROS domain id.
+const ALIAS_FIRST: u32 = 0x5347_0000;
+
+/// Bound on what is read of a file, bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// A local ROS 2 network, joined with Cyclone DDS.
+///
+/// Each network is a participant of its own, in a Cyclone domain of its own: several domains in one
+/// process work, and so do several networks on one domain, which then talk over the loopback interface like
+/// strangers. Readers, writers and discovery keep the participant alive; dropping the network ends
+/// discovery only.
+#[derive(Debug)]
+pub struct CycloneNetwork {
+    discovery: Mutex<Option<(Arc<Stop>, thread::JoinHandle<()>)>>,
+    participant: Arc<Participant>,
+}
+
+/// The participant and the domain it is in. Fields drop in this order.
+#[derive(Debug)]
+pub(crate) struct Participant {
+    entity: Entity,
+    domain: Entity,
+    guid: Guid,
+    domain_id: u32,
+    tag: Option<String>,
+}
+
+impl CycloneNetwork {
+    /// Joins the domain.
+    ///
+    /// # Errors
+    /// [`RosError::Domain`] if the configuration is invalid or Cyclone refuses it; the reason is what Cyclone
+    /// logged: an interface that is not there, no free participant index, a peer that is not a host name.
+    pub fn open(config: &DdsConfig) -> Result<Self, RosError> {
+        log::install();
+        let refused = |reason| RosError::Domain { domain: config.domain, reason };
+        let domain = create_domain(config)?;
+        let qos = NativeQos::new().map_err(refused)?;
+        qos.set_user_data(&user_data::build(config.tag.as_deref(), None));
+        // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
+        let entity =
+            Entity::new(unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) })
+                .map_err(refused)?;
+        let guid = entity.guid().map_err(refused)?;
+        let participant = Participant {
+            entity,
+            domain: domain.entity,
+            guid,
+            domain_id: config.domain,
+            tag: config.tag.clone(),
+        };
+        Ok(Self { discovery: Mutex::new(None), participant: Arc::new(participant) })
+    }
+
+    /// GUID of the participant; readers and writers made here share its first 12 bytes.
+    pub fn guid(&self) -> Guid {
+        self.participant.guid
+    }
+
+    /// Makes the network neither hear nor speak for a while, as when its cable is pulled. For tests.
+    #[doc(hidden)]
+    pub fn set_deaf_mute(&self, duration: std::time::Duration) {
+        let ns = i64::try_from(duration.as_nanos()).unwrap_or(crate::entity::INFINITE);
+        // SAFETY: takes numbers only; the handle is checked by Cyclone.
+        unsafe { dds_domain_set_deafmute(self.participant.domain.handle(), true, true, ns) };
+    }
+
+    /// How many DDS entities hang directly below the participant: topics, publishers, subscribers,
+    /// conditions. For tests and metrics; constant when nothing leaks.
+    pub fn entity_count(&self) -> usize {
+        // SAFETY: with no room for handles the call only counts.
+        let count = unsafe { dds_get_children(self.participant.entity.handle(), std::ptr::null_mut(), 0) };
+        usize::try_from(count).unwrap_or(0)
+    }
+}
+
+impl RosNetwork for CycloneNetwork {
+    type Reader = CycloneReader;
+    type Writer = CycloneWriter;
+
+    fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError> {
+        let refused = |reason| RosError::Domain { domain: self.participant.domain_id, reason };
+        let mut running = self.discovery.lock().unwrap_or_else(PoisonError::into_inner);
+        if running.is_some() {
+            return Err(refused("discovery has been started already".into()));
+        }
+        *running = Some(discovery::start(Arc::clone(&self.participant), handler).map_err(refused)?);
+        Ok(())
+    }
+
+    fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<CycloneReader, RosError> {
+        CycloneReader::new(&self.participant, spec, handler)
+            .map_err(|reason| refuse_endpoint("reader", spec, reason))
+    }
+
+    fn create_writer(&self, spec: &EndpointSpec) -> Result<CycloneWriter, RosError> {
+        CycloneWriter::new(&self.participant, spec).map_err(|reason| refuse_endpoint("writer", spec, reason))
+    }
+}
+
+impl Drop for CycloneNetwork {
+    fn drop(&mut self) {
+        let running = self.discovery.get_mut().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some((stop, thread)) = running {
+            stop.request();
+            join(thread);
+        }
+    }
+}
+
+impl Participant {
+    pub(crate) fn entity(&self) -> &Entity {
+        &self.entity
+    }
+
+    /// True if the endpoint belongs to this participant.
+    pub(crate) fn owns(&self, endpoint: &Guid) -> bool {
+        self.guid.0[..12] == endpoint.0[..12]
+    }
+
+    /// True if endpoints made by SGC are to be ignored.
+    pub(crate) fn ignores_tagged(&self) -> bool {
+        self.tag.is_some()
+    }
+
+    /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.
+    pub(crate) fn topic(&self, spec: &EndpointSpec) -> Result<Entity, String> {
+        let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
+        // SAFETY: both strings are copied and, despite their type, not written to.
+        Entity::new(unsafe {
+            cdds_create_blob_topic(
+                self.entity.handle(),
+                name.as_ptr().cast_mut(),
+                type_name.as_ptr().cast_mut(),
+                spec.keyless,
+            )
+        })
+    }
+
+    /// The publisher or subscriber for a spec, if its partitions need one of their own.
+    pub(crate) fn group(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<Option<Entity>, String> {
+        if spec.qos.partitions.is_empty() {
+            return Ok(None);
+        }
+        let qos = NativeQos::group(&spec.qos.partitions)?;
+        let (parent, listener) = (self.entity.handle(), std::ptr::null());
+        // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
+        Entity::new(unsafe {
+            match kind {
+                EndpointKind::Reader => dds_create_subscriber(parent, qos.as_ptr(), listener),
+                EndpointKind::Writer => dds_create_publisher(parent, qos.as_ptr(), listener),
+            }
+        })
+        .map(Some)
+    }
+
+    /// The QoS of an endpoint, USER_DATA included.
+    pub(crate) fn endpoint_qos(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<NativeQos, String> {
+        if let Some(hash) = spec.type_hash.as_deref().filter(|h| !user_data::is_value(h)) {
+            return Err(format!("type hash {hash:?} cannot stand in USER_DATA"));
+        }
+        let data = user_data::build(self.tag.as_deref(), spec.type_hash.as_deref());
+        NativeQos::endpoint(kind, &spec.qos, spec.keyless, &data)
+    }
+}
+
+fn refuse_endpoint(kind: &'static str, spec: &EndpointSpec, reason: String) -> RosError {
+    RosError::Create { kind, topic: spec.topic.clone(), type_name: spec.type_name.clone(), reason }
+}
+
+struct Domain {
+    entity: Entity,
+    /// The id that Cyclone knows it by.
+    id: u32,
+}
+
+/// Creates the Cyclone domain: under the ROS domain's own id, so that `<Domain Id="…">` in the user's
+/// configuration finds it, or under another if this process has that one already.
+fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
+    static NUMBER: AtomicU32 = AtomicU32::new(0);
+    let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+    let interfaces_chosen =
+        config.cyclonedds_uri.as_deref().is_some_and(|uri| chooses_interfaces(uri, read_file));
+    let host_addresses = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default());
+    let process = std::process::id();
+    let mut instance = Instance { process, number, aliased: false, interfaces_chosen, host_addresses };
+    let refused = |reason| RosError::Domain { domain: config.domain, reason };
+
+    for (id, aliased) in [(config.domain, false), (ALIAS_FIRST.wrapping_add(number & 0x00ff_ffff), true)] {
+        instance.aliased = aliased;
+        let xml = c_string(&cyclone_config(config, &instance)?).map_err(refused)?;
+        // SAFETY: the configuration is a NUL-terminated string, copied by the call.
+        let (handle, errors) = log::listen(|| unsafe { dds_create_domain(id, xml.as_ptr()) });
+        if handle == DDS_RETCODE_PRECONDITION_NOT_MET && !aliased {
+            continue;
+        }
+        if handle < 0 && !errors.is_empty() {
+            return Err(refused(format!("{}: {errors}", reason(handle))));
+        }
+        return Ok(Domain { entity: Entity::new(handle).map_err(refused)?, id });
+    }
+    Err(refused("the domain could not be created".into()))
+}
+
+fn read_file(name: &str) -> Option<String> {
+    use std::io::Read as _;
+    let mut text = String::new();
+    let file = std::fs::File::open(name).ok()?;
+    file.take(FILE_BYTES_MAX).read_to_string(&mut text).ok()?;
+    Some(text)
+}

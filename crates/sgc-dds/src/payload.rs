@@ -1,0 +1,93 @@
+//! Serialised samples as they go to Cyclone: checked, padded, and marked as padded.
+//!
+//! Pure, and copies nothing: a [`Frame`] says which pieces to write. It looks at the four bytes of the
+//! encapsulation header only (RTPS 2.5, 10.2).
+
+use sgc_ros::RosError;
+
+/// Largest payload written or received, bytes, header and padding included.
+pub const PAYLOAD_BYTES_MAX: usize = 64 << 20;
+
+/// Length of the encapsulation header, bytes.
+pub const HEADER_BYTES: usize = 4;
+
+/// A payload cut into what Cyclone is given: a header of its own, the body, and zeros up to a multiple of four.
+///
+/// Cyclone sends samples in multiples of four bytes. Given a sample of another length it reads on past the end of
+/// the buffer, and what it finds there goes onto the network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame<'a> {
+    /// The encapsulation header, its two pad bits saying how many of the last bytes are padding.
+    pub header: [u8; HEADER_BYTES],
+    /// The body, untouched.
+    pub body: &'a [u8],
+    /// How many zero bytes to append, 0 to 3.
+    pub pad: usize,
+}
+
+impl<'a> Frame<'a> {
+    /// Checks a payload and says how to write it.
+    ///
+    /// # Errors
+    /// [`RosError::Payload`] if it is shorter than its header, longer than [`PAYLOAD_BYTES_MAX`] or of an
+    /// encapsulation that no specification defines.
+    pub fn new(payload: &'a [u8]) -> Result<Self, RosError> {
+        let refused = RosError::Payload { bytes: payload.len() };
+        let Some((&header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else { return Err(refused) };
+        let pad = payload.len().wrapping_neg() & 3;
+        if payload.len() + pad > PAYLOAD_BYTES_MAX
+            || !is_encapsulation(u16::from_be_bytes([header[0], header[1]]))
+        {
+            return Err(refused);
+        }
+        let mut frame = Self { header, body, pad };
+        if pad > 0 {
+            // Bits set before said how an aligned payload was padded, so they mean nothing here.
+            frame.header[3] = (frame.header[3] & !3) | pad as u8;
+        }
+        Ok(frame)
+    }
+
+    /// Length of header, body and padding, bytes: a multiple of four.
+    pub fn bytes(&self) -> usize {
+        HEADER_BYTES + self.body.len() + self.pad
+    }
+}
+
+/// Encapsulation identifiers: 0 to 4 of RTPS 2.5 table 10.1 (CDR, PL_CDR, XML), 6 to 11 of XTypes 1.3
+/// table 60 (XCDR2), 16 to 21 as RTPS 2.5 numbers XCDR2.
+fn is_encapsulation(id: u16) -> bool {
+    matches!(id, 0x0000..=0x0004 | 0x0006..=0x000b | 0x0010..=0x0015)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn aligned_payloads_are_left_alone() {
+        let frame = Frame::new(&[0, 1, 0, 2, 9, 9, 0, 0]).unwrap();
+        assert_eq!(frame, Frame { header: [0, 1, 0, 2], body: &[9, 9, 0, 0], pad: 0 });
+        assert_eq!(Frame::new(&[0, 1, 0, 0]).unwrap().bytes(), 4);
+    }
+
+    #[test]
+    fn others_are_padded_and_say_so() {
+        for (body, pad) in [(1, 3), (2, 2), (3, 1), (5, 3)] {
+            let payload = [vec![0, 1, 0, 0xf0], vec![7; body]].concat();
+            let frame = Frame::new(&payload).unwrap();
+            assert_eq!((frame.pad, frame.header[3]), (pad, 0xf0 | pad as u8));
+            assert_eq!(frame.bytes() % 4, 0);
+        }
+    }
+
+    #[test]
+    fn what_is_no_sample_is_refused() {
+        for bytes in [&[][..], &[0], &[0, 1, 0], &[0x12, 0x34, 0, 0], &[0, 5, 0, 0]] {
+            assert_eq!(Frame::new(bytes), Err(RosError::Payload { bytes: bytes.len() }));
+        }
+        let large = vec![0; PAYLOAD_BYTES_MAX + 1];
+        assert_eq!(Frame::new(&large), Err(RosError::Payload { bytes: large.len() }));
+        assert!(Frame::new(&large[1..]).is_ok());
+    }
+}

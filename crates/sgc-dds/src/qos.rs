@@ -1,0 +1,364 @@
+//! [`sgc_wire::Qos`] to and from Cyclone's QoS object.
+//!
+//! Says what a policy is called, never what it should be; that is decided in `sgc-ros`.
+
+// Cyclone's constants stand in patterns here under the names that bindgen gave them.
+#![allow(non_upper_case_globals)]
+
+use std::ffi::{CStr, CString, c_char, c_void};
+
+use cyclors::*;
+use sgc_ros::EndpointKind;
+use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
+
+use crate::entity::{INFINITE, c_string};
+
+/// How many instances' worth of history is kept for a keyed topic, since Cyclone is not told the keys and
+/// takes all samples for one instance.
+pub const KEYED_INSTANCES_KEPT: u32 = 256;
+
+/// Deepest history kept by an endpoint made here, and what a reader that asks for all is given: Cyclone's
+/// own bound on a reader stops delivery to *every* reader of the domain while it is reached, so a handler
+/// that is stuck would take the others with it. A writer that keeps all keeps all that is not acknowledged
+/// yet, and blocks beyond half a megabyte of it; of what is, late joiners get as much as said here.
+pub const HISTORY_DEPTH_MAX: u32 = 4096;
+
+/// How long a write waits for a reader that does not acknowledge, milliseconds. Only writers that keep all
+/// wait: one that keeps the last samples overwrites them, acknowledged or not.
+pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
+
+/// Cyclone's QoS object, deleted on drop.
+pub(crate) struct NativeQos(*mut dds_qos_t);
+
+impl NativeQos {
+    pub(crate) fn new() -> Result<Self, String> {
+        // SAFETY: no arguments; allocates.
+        let qos = unsafe { dds_create_qos() };
+        if qos.is_null() { Err("out of memory".into()) } else { Ok(Self(qos)) }
+    }
+
+    /// The QoS of an endpoint of ours.
+    pub(crate) fn endpoint(
+        kind: EndpointKind,
+        qos: &Qos,
+        keyless: bool,
+        user_data: &[u8],
+    ) -> Result<Self, String> {
+        let native = Self::new()?;
+        let (history, depth) = history_of(kind, qos.history, keyless);
+        // SAFETY: the object is valid and every setter copies its arguments.
+        unsafe {
+            dds_qset_reliability(
+                native.0,
+                match qos.reliability {
+                    Reliability::BestEffort => dds_reliability_kind_DDS_RELIABILITY_BEST_EFFORT,
+                    Reliability::Reliable => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
+                },
+                WRITE_BLOCK_MAX_MS as i64 * 1_000_000,
+            );
+            dds_qset_durability(
+                native.0,
+                match qos.durability {
+                    Durability::Volatile => dds_durability_kind_DDS_DURABILITY_VOLATILE,
+                    Durability::TransientLocal => dds_durability_kind_DDS_DURABILITY_TRANSIENT_LOCAL,
+                    Durability::Transient => dds_durability_kind_DDS_DURABILITY_TRANSIENT,
+                    Durability::Persistent => dds_durability_kind_DDS_DURABILITY_PERSISTENT,
+                },
+            );
+            dds_qset_history(native.0, history, depth);
+            if qos.is_transient_local() {
+                // What late joiners get is governed by this one, whose default is a single sample.
+                let unlimited = DDS_LENGTH_UNLIMITED;
+                let kept = dds_history_kind_DDS_HISTORY_KEEP_LAST;
+                dds_qset_durability_service(native.0, 0, kept, depth, unlimited, unlimited, unlimited);
+            }
+            dds_qset_deadline(native.0, duration(qos.deadline_ns));
+            dds_qset_liveliness(
+                native.0,
+                match qos.liveliness {
+                    Liveliness::Automatic => dds_liveliness_kind_DDS_LIVELINESS_AUTOMATIC,
+                    Liveliness::ManualByParticipant => {
+                        dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_PARTICIPANT
+                    }
+                    Liveliness::ManualByTopic => dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC,
+                },
+                duration(qos.lease_ns),
+            );
+            if kind == EndpointKind::Writer {
+                dds_qset_lifespan(native.0, duration(qos.lifespan_ns));
+                dds_qset_writer_data_lifecycle(native.0, false);
+            }
+            // What we write must never come back to us through our own readers.
+            dds_qset_ignorelocal(native.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT);
+        }
+        native.set_user_data(user_data);
+        Ok(native)
+    }
+
+    /// The QoS of a publisher or subscriber, which is where partitions are.
+    pub(crate) fn group(partitions: &[String]) -> Result<Self, String> {
+        let native = Self::new()?;
+        let names: Vec<CString> = partitions.iter().map(|p| c_string(p)).collect::<Result<_, _>>()?;
+        let mut pointers: Vec<*const c_char> = names.iter().map(|n| n.as_ptr()).collect();
+        // SAFETY: `pointers` holds as many NUL-terminated strings as it says, and they are copied.
+        unsafe { dds_qset_partition(native.0, pointers.len() as u32, pointers.as_mut_ptr()) };
+        Ok(native)
+    }
+
+    pub(crate) fn set_user_data(&self, user_data: &[u8]) {
+        if !user_data.is_empty() {
+            // SAFETY: pointer and length are those of a slice, which is copied.
+            unsafe { dds_qset_userdata(self.0, user_data.as_ptr().cast(), user_data.len()) };
+        }
+    }
+
+    pub(crate) fn as_ptr(&self) -> *const dds_qos_t {
+        self.0
+    }
+}
+
+impl Drop for NativeQos {
+    fn drop(&mut self) {
+        // SAFETY: created by `dds_create_qos` and deleted once.
+        unsafe { dds_delete_qos(self.0) }
+    }
+}
+
+fn history_of(kind: EndpointKind, history: History, keyless: bool) -> (dds_history_kind_t, i32) {
+    let wanted = match history {
+        History::KeepLast(n) => n.max(1),
+        History::KeepAll => HISTORY_DEPTH_MAX,
+    };
+    let instances = if keyless { 1 } else { KEYED_INSTANCES_KEPT };
+    let depth = wanted.saturating_mul(instances).min(HISTORY_DEPTH_MAX);
+    let all = kind == EndpointKind::Writer && history == History::KeepAll;
+    let native =
+        if all { dds_history_kind_DDS_HISTORY_KEEP_ALL } else { dds_history_kind_DDS_HISTORY_KEEP_LAST };
+    (native, depth as i32)
+}
+
+fn duration(ns: Option<u64>) -> i64 {
+    ns.map_or(INFINITE, |ns| i64::try_from(ns).unwrap_or(INFINITE))
+}
+
+fn finite(ns: i64) -> Option<u64> {
+    u64::try_from(ns).ok().filter(|_| ns != INFINITE)
+}
+
+/// Reads the QoS of a discovered endpoint; a policy that its announcement omits has the default of the
+/// specification (DDS 1.4, 2.2.3). `None` if it cannot be carried: too many or too long partitions.
+///
+/// Few vendors announce history. Where it is missing, that of the durability service is taken, and else
+/// the last sample.
+///
+/// # Safety
+/// `qos` must be a valid QoS object.
+pub(crate) unsafe fn discovered(kind: EndpointKind, qos: *const dds_qos_t) -> Option<Qos> {
+    let mut reliability = match kind {
+        EndpointKind::Reader => dds_reliability_kind_DDS_RELIABILITY_BEST_EFFORT,
+        EndpointKind::Writer => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
+    };
+    let mut durability = dds_durability_kind_DDS_DURABILITY_VOLATILE;
+    let (mut history, mut depth) = (dds_history_kind_DDS_HISTORY_KEEP_LAST, 1);
+    let (mut deadline, mut lifespan, mut lease) = (INFINITE, INFINITE, INFINITE);
+    let mut liveliness = dds_liveliness_kind_DDS_LIVELINESS_AUTOMATIC;
+    let mut unused = [0_i64; 2];
+    let mut limits = [0_i32; 3];
+    let [max_samples, max_instances, max_per_instance] = &mut limits;
+    let [blocking, cleanup] = &mut unused;
+    // SAFETY: `qos` is valid by contract; getters write only to the places given, and only if the policy
+    // is present.
+    unsafe {
+        dds_qget_reliability(qos, &mut reliability, blocking);
+        dds_qget_durability(qos, &mut durability);
+        if !dds_qget_history(qos, &mut history, &mut depth)
+            && durability != dds_durability_kind_DDS_DURABILITY_VOLATILE
+        {
+            dds_qget_durability_service(
+                qos,
+                cleanup,
+                &mut history,
+                &mut depth,
+                max_samples,
+                max_instances,
+                max_per_instance,
+            );
+        }
+        dds_qget_deadline(qos, &mut deadline);
+        dds_qget_lifespan(qos, &mut lifespan);
+        dds_qget_liveliness(qos, &mut liveliness, &mut lease);
+    }
+    Some(Qos {
+        reliability: if reliability == dds_reliability_kind_DDS_RELIABILITY_RELIABLE {
+            Reliability::Reliable
+        } else {
+            Reliability::BestEffort
+        },
+        durability: match durability {
+            dds_durability_kind_DDS_DURABILITY_TRANSIENT_LOCAL => Durability::TransientLocal,
+            dds_durability_kind_DDS_DURABILITY_TRANSIENT => Durability::Transient,
+            dds_durability_kind_DDS_DURABILITY_PERSISTENT => Durability::Persistent,
+            _ => Durability::Volatile,
+        },
+        history: if history == dds_history_kind_DDS_HISTORY_KEEP_ALL {
+            History::KeepAll
+        } else {
+            History::KeepLast(u32::try_from(depth).unwrap_or(1).max(1))
+        },
+        deadline_ns: finite(deadline),
+        lifespan_ns: finite(lifespan),
+        liveliness: match liveliness {
+            dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_PARTICIPANT => Liveliness::ManualByParticipant,
+            dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC => Liveliness::ManualByTopic,
+            _ => Liveliness::Automatic,
+        },
+        lease_ns: finite(lease),
+        // SAFETY: as above.
+        partitions: unsafe { partitions(qos) }?,
+    })
+}
+
+/// # Safety
+/// `qos` must be a valid QoS object.
+unsafe fn partitions(qos: *const dds_qos_t) -> Option<Vec<String>> {
+    let (mut n, mut names) = (0_u32, std::ptr::null_mut::<*mut c_char>());
+    // SAFETY: `qos` is valid by contract; on success `names` is an array of `n` strings, all ours to free.
+    if !unsafe { dds_qget_partition(qos, &mut n, &mut names) } || names.is_null() {
+        return Some(Vec::new());
+    }
+    let mut partitions = Some(Vec::new());
+    for i in 0..n as usize {
+        // SAFETY: `i` is below `n`, so this is one of the strings.
+        let name = unsafe { *names.add(i) };
+        // SAFETY: a NUL-terminated string that lives until it is freed below.
+        let text = unsafe { CStr::from_ptr(name) }.to_str();
+        partitions = match (partitions, text) {
+            (Some(mut list), Ok(text))
+                if text.len() <= Qos::PARTITION_BYTES_MAX && list.len() < Qos::PARTITIONS_MAX =>
+            {
+                list.push(text.to_owned());
+                Some(list)
+            }
+            _ => None,
+        };
+        // SAFETY: allocated by the getter for the caller, freed once.
+        unsafe { dds_free(name.cast()) };
+    }
+    // SAFETY: allocated by the getter for the caller, freed once.
+    unsafe { dds_free(names.cast()) };
+    // One empty name is the default partition (DDS 1.4, 2.2.3.13).
+    partitions.map(|list| if list == [""] { Vec::new() } else { list })
+}
+
+/// The USER_DATA of a discovered endpoint; empty if it has none.
+///
+/// # Safety
+/// `qos` must be a valid QoS object.
+pub(crate) unsafe fn user_data(qos: *const dds_qos_t) -> Vec<u8> {
+    let (mut data, mut bytes) = (std::ptr::null_mut::<c_void>(), 0_usize);
+    // SAFETY: `qos` is valid by contract; on success `data` is a copy that is ours to free.
+    if !unsafe { dds_qget_userdata(qos, &mut data, &mut bytes) } || data.is_null() {
+        return Vec::new();
+    }
+    // SAFETY: the getter returned that many bytes.
+    let copy = unsafe { std::slice::from_raw_parts(data.cast::<u8>(), bytes) }.to_vec();
+    // SAFETY: allocated by the getter for the caller, freed once.
+    unsafe { dds_free(data) };
+    copy
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads back what was set, as discovery does with what was announced.
+    fn round_trip(kind: EndpointKind, qos: &Qos, keyless: bool) -> Qos {
+        let native = NativeQos::endpoint(kind, qos, keyless, b"sgc=x;").unwrap();
+        // SAFETY: a valid object that outlives the calls.
+        unsafe {
+            assert_eq!(user_data(native.as_ptr()), b"sgc=x;");
+            discovered(kind, native.as_ptr()).unwrap()
+        }
+    }
+
+    #[test]
+    fn every_policy_survives() {
+        for reliability in [Reliability::BestEffort, Reliability::Reliable] {
+            for durability in [
+                Durability::Volatile,
+                Durability::TransientLocal,
+                Durability::Transient,
+                Durability::Persistent,
+            ] {
+                for liveliness in
+                    [Liveliness::Automatic, Liveliness::ManualByParticipant, Liveliness::ManualByTopic]
+                {
+                    let qos = Qos {
+                        reliability,
+                        durability,
+                        history: History::KeepLast(7),
+                        deadline_ns: Some(1_000),
+                        lifespan_ns: Some(2_000),
+                        liveliness,
+                        lease_ns: Some(3_000_000),
+                        partitions: vec![],
+                    };
+                    assert_eq!(round_trip(EndpointKind::Writer, &qos, true), qos);
+                }
+            }
+        }
+        assert_eq!(round_trip(EndpointKind::Reader, &Qos::default(), true), Qos::default());
+    }
+
+    #[test]
+    fn partitions_survive_and_the_empty_one_is_none() {
+        let read = |names: &[String]| {
+            let native = NativeQos::group(names).unwrap();
+            // SAFETY: a valid object that outlives the call.
+            unsafe { partitions(native.as_ptr()) }
+        };
+        let names = ["a".to_owned(), "b*".to_owned()];
+        assert_eq!(read(&names).unwrap(), names);
+        assert_eq!(read(&[]).unwrap(), Vec::<String>::new());
+        assert_eq!(read(&[String::new()]).unwrap(), Vec::<String>::new());
+        assert_eq!(read(&vec!["x".to_owned(); Qos::PARTITIONS_MAX + 1]), None);
+        assert_eq!(read(&["x".repeat(Qos::PARTITION_BYTES_MAX + 1)]), None);
+        assert!(NativeQos::group(&["a\0b".to_owned()]).is_err());
+    }
+
+    #[test]
+    fn silence_means_the_defaults_of_the_specification() {
+        let native = NativeQos::new().unwrap();
+        // SAFETY: a valid object that outlives the calls.
+        let (reader, writer) = unsafe {
+            (
+                discovered(EndpointKind::Reader, native.as_ptr()).unwrap(),
+                discovered(EndpointKind::Writer, native.as_ptr()).unwrap(),
+            )
+        };
+        assert_eq!(reader.reliability, Reliability::BestEffort);
+        assert_eq!(writer.reliability, Reliability::Reliable);
+        assert_eq!(writer.history, History::KeepLast(1));
+        assert_eq!((writer.durability, writer.lease_ns), (Durability::Volatile, None));
+    }
+
+    #[test]
+    fn history_is_bounded_and_deeper_for_keyed_topics() {
+        let depth = |kind, history, keyless| history_of(kind, history, keyless).1;
+        let (reader, writer) = (EndpointKind::Reader, EndpointKind::Writer);
+        let last = dds_history_kind_DDS_HISTORY_KEEP_LAST;
+        assert_eq!(history_of(reader, History::KeepAll, true), (last, HISTORY_DEPTH_MAX as i32));
+        assert_eq!(depth(writer, History::KeepLast(u32::MAX), false), HISTORY_DEPTH_MAX as i32);
+        assert_eq!(depth(writer, History::KeepLast(0), true), 1);
+        assert_eq!(depth(writer, History::KeepLast(2), false), 2 * KEYED_INSTANCES_KEPT as i32);
+        let all = Qos { history: History::KeepAll, ..Qos::default() };
+        assert_eq!(round_trip(writer, &all, true), all);
+    }
+
+    #[test]
+    fn durations_beyond_what_dds_can_say_are_infinite() {
+        assert_eq!(duration(None), INFINITE);
+        assert_eq!(duration(Some(u64::MAX)), INFINITE);
+        assert_eq!((finite(INFINITE), finite(-1), finite(5)), (None, None, Some(5)));
+    }
+}

@@ -1,0 +1,88 @@
+//! The USER_DATA of endpoints: `key=value;` elements, as rmw writes them.
+//!
+//! Pure. Two keys matter here: `typehash` (REP 2016, written by rmw from Iron on) and `sgc`, by which
+//! SGC nodes know each other's endpoints and keep out of loops.
+
+const TAG_KEY: &str = "sgc";
+const TYPE_HASH_KEY: &str = "typehash";
+
+/// Bound on one value, bytes.
+pub const VALUE_BYTES_MAX: usize = 128;
+
+/// Bound on the USER_DATA that is looked at, bytes; what follows is ignored.
+pub const USER_DATA_BYTES_MAX: usize = 4096;
+
+/// True if a text can be a value: printable ASCII without the separators, not empty, not too long.
+pub fn is_value(text: &str) -> bool {
+    (1..=VALUE_BYTES_MAX).contains(&text.len())
+        && text.bytes().all(|b| (b.is_ascii_graphic() || b == b' ') && b != b';' && b != b'=')
+}
+
+/// The USER_DATA of an endpoint made here. The caller has checked both values with [`is_value`].
+pub fn build(tag: Option<&str>, type_hash: Option<&str>) -> Vec<u8> {
+    let mut text = String::new();
+    for (key, value) in [(TAG_KEY, tag), (TYPE_HASH_KEY, type_hash)] {
+        if let Some(value) = value {
+            text.push_str(key);
+            text.push('=');
+            text.push_str(value);
+            text.push(';');
+        }
+    }
+    text.into_bytes()
+}
+
+/// True if an SGC node made the endpoint, whichever node it was.
+pub fn is_tagged(user_data: &[u8]) -> bool {
+    elements(user_data).any(|(key, _)| key == TAG_KEY.as_bytes())
+}
+
+/// The type hash (`RIHS01_…`) of an endpoint, if it carries a plausible one.
+pub fn type_hash(user_data: &[u8]) -> Option<String> {
+    elements(user_data)
+        .find(|(key, _)| *key == TYPE_HASH_KEY.as_bytes())
+        .and_then(|(_, value)| std::str::from_utf8(value).ok())
+        .filter(|value| value.starts_with("RIHS") && is_value(value))
+        .map(str::to_owned)
+}
+
+fn elements(user_data: &[u8]) -> impl Iterator<Item = (&[u8], &[u8])> {
+    let bounded = &user_data[..user_data.len().min(USER_DATA_BYTES_MAX)];
+    bounded.split(|b| *b == b';').filter_map(|element| {
+        let at = element.iter().position(|b| *b == b'=')?;
+        Some((&element[..at], &element[at + 1..]))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_built_is_read() {
+        let data = build(Some("arm-1"), Some("RIHS01_ab"));
+        assert_eq!(data, b"sgc=arm-1;typehash=RIHS01_ab;");
+        assert!(is_tagged(&data));
+        assert_eq!(type_hash(&data).as_deref(), Some("RIHS01_ab"));
+        assert!(build(None, None).is_empty());
+    }
+
+    #[test]
+    fn the_tag_is_known_whatever_node_and_order() {
+        assert!(is_tagged(b"typehash=RIHS01_ab;sgc=another node;"));
+        assert!(is_tagged(b"sgc=x"));
+        assert!(!is_tagged(b"typehash=sgc;notsgc=1;sgcx=1;sgc;"));
+        assert!(!is_tagged(b""));
+    }
+
+    #[test]
+    fn foreign_data_never_makes_a_hash() {
+        assert_eq!(type_hash(b"typehash=RIHS01_ab"), Some("RIHS01_ab".into()));
+        assert_eq!(type_hash(b"typehash=;"), None);
+        assert_eq!(type_hash(b"typehash=MD5_00;"), None);
+        assert_eq!(type_hash(b"typehash=RIHS01_\xff;"), None);
+        assert_eq!(type_hash(&[b'='; 10_000]), None);
+        let long = [b"typehash=RIHS01_".as_slice(), &[b'a'; 200], b";"].concat();
+        assert_eq!(type_hash(&long), None);
+    }
+}

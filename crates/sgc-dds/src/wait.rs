@@ -1,0 +1,91 @@
+//! How the threads of this crate sleep and end: [`WaitSet`], [`Stop`], [`join`].
+//!
+//! No thread polls and none sleeps for a time: each blocks until a condition of Cyclone's is true.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+
+use cyclors::{
+    dds_create_guardcondition, dds_create_waitset, dds_set_guardcondition, dds_waitset_attach,
+    dds_waitset_wait,
+};
+
+use crate::entity::{Entity, INFINITE, check};
+use crate::network::Participant;
+
+/// Ends a thread that waits: a flag for when it works, a guard condition for when it sleeps.
+#[derive(Debug)]
+pub(crate) struct Stop {
+    flag: AtomicBool,
+    guard: Entity,
+    /// The guard condition must go before the participant does, and whoever asks a thread to end holds this
+    /// longer than the thread.
+    _participant: Arc<Participant>,
+}
+
+impl Stop {
+    pub(crate) fn new(participant: &Arc<Participant>) -> Result<Arc<Self>, String> {
+        // SAFETY: takes a number, checked by Cyclone.
+        let guard = Entity::new(unsafe { dds_create_guardcondition(participant.entity().handle()) })?;
+        Ok(Arc::new(Self { flag: AtomicBool::new(false), guard, _participant: Arc::clone(participant) }))
+    }
+
+    /// Asks the thread to end, for ever.
+    pub(crate) fn request(&self) {
+        self.flag.store(true, Ordering::Release);
+        // SAFETY: takes a number, checked by Cyclone.
+        if let Err(reason) = check(unsafe { dds_set_guardcondition(self.guard.handle(), true) }) {
+            tracing::error!(reason, "cannot wake a DDS thread");
+        }
+    }
+
+    pub(crate) fn is_requested(&self) -> bool {
+        self.flag.load(Ordering::Acquire)
+    }
+}
+
+/// Sleeps until a condition is true or the thread is asked to end.
+#[derive(Debug)]
+pub(crate) struct WaitSet {
+    set: Entity,
+    stop: Arc<Stop>,
+}
+
+impl WaitSet {
+    /// The conditions must belong to the participant and outlive the wait set.
+    pub(crate) fn new(
+        participant: &Participant,
+        stop: Arc<Stop>,
+        conditions: &[&Entity],
+    ) -> Result<Self, String> {
+        // SAFETY: takes a number, checked by Cyclone.
+        let set = Entity::new(unsafe { dds_create_waitset(participant.entity().handle()) })?;
+        for condition in std::iter::once(&stop.guard).chain(conditions.iter().copied()) {
+            // SAFETY: takes numbers only; handles are checked by Cyclone, the attachment is opaque to it.
+            check(unsafe { dds_waitset_attach(set.handle(), condition.handle(), 0) })?;
+        }
+        Ok(Self { set, stop })
+    }
+
+    /// Blocks without limit; `false` when the thread shall end.
+    pub(crate) fn wait(&self) -> bool {
+        // SAFETY: no attachments are asked for, so the null pointer with length 0 is not written to.
+        let ret = unsafe { dds_waitset_wait(self.set.handle(), std::ptr::null_mut(), 0, INFINITE) };
+        if let Err(reason) = check(ret) {
+            tracing::error!(reason, "waiting for DDS failed");
+            return false;
+        }
+        !self.stop.is_requested()
+    }
+}
+
+/// Joins a thread, unless it is the calling one: a handler may drop what calls it.
+pub(crate) fn join(thread: JoinHandle<()>) {
+    if thread.thread().id() == std::thread::current().id() {
+        return;
+    }
+    if thread.join().is_err() {
+        tracing::error!("a DDS thread ended by a panic of its handler");
+    }
+}

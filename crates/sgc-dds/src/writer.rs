@@ -1,0 +1,115 @@
+//! [`CycloneWriter`]: a raw writer.
+//!
+//! Writes on the caller's thread, which may block for [`crate::qos::WRITE_BLOCK_MAX_MS`]; it must not be a
+//! thread of Cyclone's or of an async runtime.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+use cyclors::{
+    DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_create_writer,
+    dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
+    dds_publication_matched_status,
+};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleKind};
+
+use crate::entity::{Entity, check, reason};
+use crate::network::Participant;
+use crate::payload::Frame;
+use crate::serdata::Serdata;
+
+/// Latest source time stamp that RTPS can say, nanoseconds since the Unix epoch: seconds are 32 bits
+/// (RTPS 2.5, 9.3.2.1).
+const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
+
+/// A raw writer; dropping it deletes the entities. With reliable readers that lack data, Cyclone keeps
+/// sending for up to a second.
+///
+/// Fields drop in this order: children first.
+#[derive(Debug)]
+pub struct CycloneWriter {
+    writer: Entity,
+    _group: Option<Entity>,
+    _topic: Entity,
+    _participant: Arc<Participant>,
+    guid: Guid,
+    keyless: bool,
+}
+
+impl CycloneWriter {
+    pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
+        let qos = participant.endpoint_qos(EndpointKind::Writer, spec)?;
+        let topic = participant.topic(spec)?;
+        let group = participant.group(EndpointKind::Writer, spec)?;
+        let parent = group.as_ref().unwrap_or(participant.entity()).handle();
+        // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
+        let writer = Entity::new(unsafe {
+            dds_create_writer(parent, topic.handle(), qos.as_ptr(), std::ptr::null())
+        })?;
+        let guid = writer.guid()?;
+        Ok(Self {
+            writer,
+            _group: group,
+            _topic: topic,
+            _participant: Arc::clone(participant),
+            guid,
+            keyless: spec.keyless,
+        })
+    }
+
+    /// GUID of the writer, as others discover it.
+    pub fn guid(&self) -> Guid {
+        self.guid
+    }
+}
+
+impl RosWriter for CycloneWriter {
+    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        let failed = |reason: String| RosError::Write { reason };
+        let frame = Frame::new(&payload)?;
+        if !(0..=TIMESTAMP_MAX_NS).contains(&source_timestamp_ns) {
+            return Err(failed(format!("RTPS cannot say the time stamp {source_timestamp_ns} ns")));
+        }
+        let (key_only, statusinfo) = match kind {
+            SampleKind::Write => (false, 0),
+            SampleKind::Dispose => (true, DDSI_STATUSINFO_DISPOSE),
+            SampleKind::Unregister => (true, DDSI_STATUSINFO_UNREGISTER),
+        };
+        if key_only && self.keyless {
+            return Err(failed("a topic without key has no instances to dispose of".into()));
+        }
+
+        let mut sertype = std::ptr::null();
+        // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
+        check(unsafe { dds_get_entity_sertype(self.writer.handle(), &mut sertype) }).map_err(failed)?;
+        // SAFETY: the blob sertype of this writer, which keeps it alive.
+        let sample = unsafe { Serdata::build(sertype, key_only, &frame) };
+        let mut sample = sample.ok_or_else(|| failed("out of memory".into()))?;
+        sample.stamp(source_timestamp_ns, statusinfo);
+
+        let started = Instant::now();
+        // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
+        let ret = unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) };
+        match ret {
+            DDS_RETCODE_TIMEOUT => {
+                Err(RosError::WriteTimeout { waited_ms: started.elapsed().as_millis() as u64 })
+            }
+            ret if ret < 0 => Err(failed(reason(ret))),
+            _ => Ok(()),
+        }
+    }
+
+    fn matched_readers(&self) -> u32 {
+        let mut status = dds_publication_matched_status {
+            total_count: 0,
+            total_count_change: 0,
+            current_count: 0,
+            current_count_change: 0,
+            last_subscription_handle: 0,
+        };
+        // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
+        let ret = unsafe { dds_get_publication_matched_status(self.writer.handle(), &mut status) };
+        if ret < 0 { 0 } else { status.current_count }
+    }
+}

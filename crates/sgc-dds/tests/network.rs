@@ -1,0 +1,626 @@
+//! Behaviour of [`CycloneNetwork`] between participants that talk over the loopback interface.
+//!
+//! Each test has a ROS domain of its own, so that they run side by side. An untagged network stands in for
+//! a plain ROS 2 process: each network is a Cyclone domain of its own, so everything here crosses sockets.
+
+#![allow(clippy::unwrap_used)]
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
+use sgc_ros::{
+    DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosError, RosNetwork, RosWriter,
+    Sample, SampleKind,
+};
+use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
+
+/// Longest wait for an event, far beyond what any takes.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// How long nothing must happen where nothing may; events that would be wrong come within milliseconds.
+const QUIET: Duration = Duration::from_millis(300);
+
+fn config(domain: u32, tag: Option<&str>) -> DdsConfig {
+    DdsConfig {
+        domain,
+        discovery: DiscoveryRange::LocalHost,
+        tag: tag.map(str::to_owned),
+        ..DdsConfig::default()
+    }
+}
+
+fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
+    CycloneNetwork::open(&config(domain, tag)).unwrap()
+}
+
+fn spec(topic: &str) -> EndpointSpec {
+    EndpointSpec {
+        topic: format!("rt/{topic}"),
+        type_name: "std_msgs::msg::dds_::String_".into(),
+        keyless: true,
+        type_hash: None,
+        qos: Qos::default(),
+    }
+}
+
+fn with(spec: EndpointSpec, change: impl FnOnce(&mut Qos)) -> EndpointSpec {
+    let mut spec = spec;
+    change(&mut spec.qos);
+    spec
+}
+
+/// A `std_msgs/String` as CDR, little endian, unpadded.
+fn string_cdr(text: &str) -> Bytes {
+    let mut payload = vec![0, 1, 0, 0];
+    payload.extend((text.len() as u32 + 1).to_le_bytes());
+    payload.extend(text.as_bytes());
+    payload.push(0);
+    payload.into()
+}
+
+/// What a reader gets for a payload: zeros up to a multiple of four, and how many in the pad bits.
+fn padded(payload: &[u8]) -> Vec<u8> {
+    let mut payload = payload.to_vec();
+    let pad = payload.len().wrapping_neg() % 4;
+    payload[3] = (payload[3] & !3) | pad as u8;
+    payload.resize(payload.len() + pad, 0);
+    payload
+}
+
+fn read(network: &CycloneNetwork, spec: &EndpointSpec) -> (CycloneReader, Receiver<Sample>) {
+    let (tx, rx) = channel();
+    let reader = network
+        .create_reader(
+            spec,
+            Box::new(move |sample| {
+                let _ = tx.send(sample);
+            }),
+        )
+        .unwrap();
+    (reader, rx)
+}
+
+/// A writer that `readers` readers are matched with.
+fn writer(network: &CycloneNetwork, spec: &EndpointSpec, readers: u32) -> CycloneWriter {
+    let writer = network.create_writer(spec).unwrap();
+    matched(&writer, readers);
+    writer
+}
+
+fn matched(writer: &CycloneWriter, readers: u32) {
+    eventually("the readers match", || writer.matched_readers() == readers);
+}
+
+fn eventually(what: &str, mut done: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !done() {
+        assert!(Instant::now() < deadline, "waited in vain: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn write(writer: &CycloneWriter, payload: &Bytes) {
+    writer.write(SampleKind::Write, 1_000_000_000, payload.clone()).unwrap();
+}
+
+fn next<T>(events: &Receiver<T>) -> T {
+    events.recv_timeout(PATIENCE).expect("an event")
+}
+
+fn quiet<T: std::fmt::Debug>(events: &Receiver<T>) {
+    match events.recv_timeout(QUIET) {
+        Err(RecvTimeoutError::Timeout) => {}
+        other => panic!("nothing was to happen: {other:?}"),
+    }
+}
+
+fn discover(network: &CycloneNetwork) -> Receiver<DiscoveryEvent> {
+    let (tx, rx): (Sender<DiscoveryEvent>, _) = channel();
+    network
+        .discover(Box::new(move |event| {
+            let _ = tx.send(event);
+        }))
+        .unwrap();
+    rx
+}
+
+fn appeared(events: &Receiver<DiscoveryEvent>) -> DiscoveredEndpoint {
+    match next(events) {
+        DiscoveryEvent::Appeared(endpoint) => endpoint,
+        other => panic!("an appearance was expected: {other:?}"),
+    }
+}
+
+fn vanished(events: &Receiver<DiscoveryEvent>) -> Guid {
+    match next(events) {
+        DiscoveryEvent::Vanished { guid } => guid,
+        other => panic!("an end was expected: {other:?}"),
+    }
+}
+
+#[test]
+fn a_ros_process_and_sgc_exchange_strings_both_ways() {
+    let (ros, sgc) = (open(70, None), open(70, Some("arm-1")));
+    let all = |topic| with(spec(topic), |qos| qos.history = History::KeepAll);
+    let (down, up) = (all("down"), all("up"));
+    let (_r1, from_sgc) = read(&ros, &down);
+    let (_r2, from_ros) = read(&sgc, &up);
+    let (w1, w2) = (writer(&sgc, &down, 1), writer(&ros, &up, 1));
+    for i in 0..100 {
+        write(&w1, &string_cdr(&format!("down {i}")));
+        write(&w2, &string_cdr(&format!("up {i}")));
+    }
+    for i in 0..100 {
+        let sample = next(&from_sgc);
+        assert_eq!(sample.payload, padded(&string_cdr(&format!("down {i}"))));
+        assert_eq!((sample.kind, sample.writer), (SampleKind::Write, Some(w1.guid())));
+        assert_eq!(next(&from_ros).payload, padded(&string_cdr(&format!("up {i}"))));
+    }
+}
+
+#[test]
+fn discovery_tells_name_type_hash_and_full_qos_and_the_end() {
+    let (ros, sgc) = (open(71, None), open(71, Some("arm-1")));
+    let events = discover(&sgc);
+    let hash = format!("RIHS01_{}", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18");
+    let qos = Qos {
+        reliability: Reliability::Reliable,
+        durability: Durability::TransientLocal,
+        history: History::KeepLast(7),
+        deadline_ns: Some(1_500_000_000),
+        lifespan_ns: Some(60_000_000_000),
+        liveliness: Liveliness::ManualByTopic,
+        lease_ns: Some(2_000_000_000),
+        partitions: vec!["left".into(), "right".into()],
+    };
+    let writer_spec = EndpointSpec { type_hash: Some(hash.clone()), qos: qos.clone(), ..spec("chatter") };
+    let writer = ros.create_writer(&writer_spec).unwrap();
+    let seen = appeared(&events);
+    assert_eq!(
+        seen,
+        DiscoveredEndpoint {
+            kind: EndpointKind::Writer,
+            guid: writer.guid(),
+            topic: "rt/chatter".into(),
+            type_name: "std_msgs::msg::dds_::String_".into(),
+            keyless: true,
+            type_hash: Some(hash),
+            qos,
+        }
+    );
+
+    let reader_spec = with(spec("chatter"), |qos| {
+        qos.reliability = Reliability::BestEffort;
+        qos.history = History::KeepLast(3);
+    });
+    let (reader, _samples) = read(&ros, &reader_spec);
+    let seen = appeared(&events);
+    assert_eq!((seen.kind, seen.guid, seen.type_hash), (EndpointKind::Reader, reader.guid(), None));
+    assert_eq!(seen.qos.reliability, Reliability::BestEffort);
+    assert_eq!(seen.qos.durability, Durability::Volatile);
+    assert_eq!((seen.qos.deadline_ns, seen.qos.lease_ns), (None, None));
+
+    let guid = reader.guid();
+    drop(reader);
+    assert_eq!(vanished(&events), guid);
+    let guid = writer.guid();
+    drop(writer);
+    assert_eq!(vanished(&events), guid);
+}
+
+#[test]
+fn discovery_tells_what_was_there_before() {
+    let ros = open(72, None);
+    let keyed = EndpointSpec { keyless: false, ..spec("keyed") };
+    let _keyed = ros.create_writer(&keyed).unwrap();
+    let _plain = ros.create_writer(&spec("plain")).unwrap();
+    let sgc = open(72, Some("arm-1"));
+    let (_reader, _samples) = read(&sgc, &spec("plain"));
+    eventually("a writer is matched", || _plain.matched_readers() == 1);
+
+    let events = discover(&sgc);
+    let mut seen = [appeared(&events), appeared(&events)];
+    seen.sort_by(|a, b| a.topic.cmp(&b.topic));
+    assert_eq!((seen[0].topic.as_str(), seen[0].keyless), ("rt/keyed", false));
+    assert_eq!((seen[1].topic.as_str(), seen[1].keyless), ("rt/plain", true));
+    quiet(&events);
+    assert!(matches!(sgc.discover(Box::new(|_| {})), Err(RosError::Domain { domain: 72, .. })));
+}
+
+#[test]
+fn sgc_nodes_do_not_see_each_others_endpoints_nor_their_own() {
+    let (one, two, ros) = (open(73, Some("arm-1")), open(73, Some("arm-2")), open(73, None));
+    let (events_one, events_ros) = (discover(&one), discover(&ros));
+    let w1 = one.create_writer(&spec("a")).unwrap();
+    let w2 = two.create_writer(&EndpointSpec { type_hash: Some("RIHS01_0".into()), ..spec("b") }).unwrap();
+    let mut tagged = [appeared(&events_ros).guid, appeared(&events_ros).guid];
+    tagged.sort();
+    let mut expected = [w1.guid(), w2.guid()];
+    expected.sort();
+    assert_eq!(tagged, expected, "a network without tag sees them");
+
+    let plain = ros.create_writer(&spec("c")).unwrap();
+    assert_eq!(appeared(&events_one).guid, plain.guid(), "the first that the tagged network is told");
+    quiet(&events_one);
+    quiet(&events_ros);
+    drop((w1, w2));
+    quiet(&events_one);
+}
+
+#[test]
+fn a_network_does_not_hear_itself() {
+    let (sgc, ros) = (open(74, Some("arm-1")), open(74, None));
+    let (_own, own) = read(&sgc, &spec("echo"));
+    let (_other, other) = read(&ros, &spec("echo"));
+    let writer = writer(&sgc, &spec("echo"), 1);
+    write(&writer, &string_cdr("hello"));
+    next(&other);
+    quiet(&own);
+    assert_eq!(writer.matched_readers(), 1, "its own reader is no match");
+}
+
+#[test]
+fn domains_are_apart_even_in_one_process() {
+    let (here, there) = (open(75, None), open(76, None));
+    let (peer_here, peer_there) = (open(75, Some("a")), open(76, Some("b")));
+    let (events_here, events_there) = (discover(&peer_here), discover(&peer_there));
+    let (w1, w2) = (here.create_writer(&spec("t")).unwrap(), there.create_writer(&spec("t")).unwrap());
+    assert_eq!(appeared(&events_here).guid, w1.guid());
+    assert_eq!(appeared(&events_there).guid, w2.guid());
+    quiet(&events_here);
+    quiet(&events_there);
+}
+
+#[test]
+fn large_messages_arrive_intact() {
+    let (ros, sgc) = (open(77, None), open(77, Some("arm-1")));
+    let (_reader, samples) = read(&ros, &spec("image"));
+    let writer = writer(&sgc, &spec("image"), 1);
+    for (round, bytes) in [1_000_000_usize, 13_000_000, 1_000_003].into_iter().enumerate() {
+        let mut payload = vec![0, 1, 0, 0];
+        payload.extend((0..bytes as u32).map(|i| (i.wrapping_mul(2_654_435_761) >> (8 + round)) as u8));
+        let payload = Bytes::from(payload);
+        write(&writer, &payload);
+        let got = next(&samples).payload;
+        assert!(got == padded(&payload), "{bytes} bytes came as {}", got.len());
+    }
+}
+
+#[test]
+fn odd_lengths_are_padded_with_zeros_and_say_so() {
+    let (ros, sgc) = (open(78, None), open(78, Some("arm-1")));
+    let (_reader, samples) = read(&ros, &spec("odd"));
+    let writer = writer(&sgc, &spec("odd"), 1);
+    for body in 0..9 {
+        // The payload lies in the middle of a buffer full of what must not get out.
+        let mut buffer = vec![0xaa; 64];
+        buffer[16..20].copy_from_slice(&[0, 1, 0, 0]);
+        buffer[20..20 + body].fill(0x55);
+        let payload = Bytes::from(buffer).slice(16..20 + body);
+        write(&writer, &payload);
+        let got = next(&samples).payload;
+        assert_eq!(got, padded(&payload));
+        assert_eq!(got[3] & 3, (body.wrapping_neg() & 3) as u8);
+        assert!(!got.contains(&0xaa));
+    }
+}
+
+#[test]
+fn what_is_no_sample_is_refused() {
+    let sgc = open(79, Some("arm-1"));
+    let writer = sgc.create_writer(&spec("bad")).unwrap();
+    let write = |ts, payload: &'static [u8]| writer.write(SampleKind::Write, ts, Bytes::from_static(payload));
+    assert_eq!(write(0, b""), Err(RosError::Payload { bytes: 0 }));
+    assert_eq!(write(0, &[0, 1, 0]), Err(RosError::Payload { bytes: 3 }));
+    assert_eq!(write(0, b"{\"data\":1}"), Err(RosError::Payload { bytes: 10 }));
+    assert!(matches!(write(-1, &[0, 1, 0, 0]), Err(RosError::Write { .. })));
+    assert!(matches!(write(i64::MAX, &[0, 1, 0, 0]), Err(RosError::Write { .. })));
+    let dispose = writer.write(SampleKind::Dispose, 0, Bytes::from_static(&[0, 1, 0, 0]));
+    assert!(matches!(dispose, Err(RosError::Write { .. })), "no key, nothing to dispose of");
+    assert_eq!(write(0, &[0, 1, 0, 0]), Ok(()));
+
+    let nul = EndpointSpec { topic: "rt/a\0b".into(), ..spec("bad") };
+    assert!(matches!(sgc.create_writer(&nul), Err(RosError::Create { kind: "writer", .. })));
+    let hash = EndpointSpec { type_hash: Some("RIHS01;sgc=x".into()), ..spec("bad") };
+    assert!(matches!(
+        sgc.create_reader(&hash, Box::new(|_| {})),
+        Err(RosError::Create { kind: "reader", .. })
+    ));
+}
+
+#[test]
+fn late_joiners_get_history_of_the_depth_asked_for() {
+    let (ros, sgc) = (open(80, None), open(80, Some("arm-1")));
+    let latched = |depth| {
+        with(spec("map"), |qos| {
+            qos.durability = Durability::TransientLocal;
+            qos.history = History::KeepLast(depth);
+        })
+    };
+    let writer = sgc.create_writer(&latched(5)).unwrap();
+    for i in 0..20 {
+        write(&writer, &string_cdr(&i.to_string()));
+    }
+    let (_late, samples) = read(&ros, &latched(50));
+    for i in 15..20 {
+        assert_eq!(next(&samples).payload, padded(&string_cdr(&i.to_string())));
+    }
+    let (_volatile, live) = read(&ros, &spec("map"));
+    matched(&writer, 2);
+    write(&writer, &string_cdr("live"));
+    assert_eq!(next(&live).payload, padded(&string_cdr("live")), "a volatile reader gets no history");
+}
+
+#[test]
+fn source_time_and_writer_are_preserved() {
+    let (ros, sgc) = (open(81, None), open(81, Some("arm-1")));
+    let events = discover(&sgc);
+    let (_reader, samples) = read(&sgc, &spec("stamped"));
+    let writer = writer(&ros, &spec("stamped"), 1);
+    let seen = appeared(&events);
+    // RTPS carries 2⁻³² s, so what comes out may be off by a nanosecond.
+    for ns in [0, 1, 1_700_000_000_123_456_789, 4_294_967_295_999_999_999] {
+        writer.write(SampleKind::Write, ns, string_cdr("x")).unwrap();
+        let sample = next(&samples);
+        assert!((sample.source_timestamp_ns - ns).abs() <= 1, "{} for {ns}", sample.source_timestamp_ns);
+        assert_eq!(sample.writer, Some(seen.guid));
+    }
+    assert_eq!(seen.guid, writer.guid());
+}
+
+#[test]
+fn a_handler_that_blocks_delays_no_other_reader() {
+    let (ros, sgc) = (open(82, None), open(82, Some("arm-1")));
+    let (release, gate) = channel::<()>();
+    let (entered_tx, entered) = channel();
+    let shallow = with(spec("stuck"), |qos| qos.history = History::KeepLast(1));
+    let stuck = sgc
+        .create_reader(
+            &shallow,
+            Box::new(move |sample| {
+                let _ = entered_tx.send(sample.payload);
+                let _ = gate.recv();
+            }),
+        )
+        .unwrap();
+    let (_free, free) = read(&sgc, &spec("free"));
+    let (w_stuck, w_free) = (writer(&ros, &spec("stuck"), 1), writer(&ros, &spec("free"), 1));
+    write(&w_stuck, &string_cdr("first"));
+    assert_eq!(next(&entered), padded(&string_cdr("first")));
+    for i in 0..50 {
+        write(&w_stuck, &string_cdr(&format!("stuck {i}")));
+        write(&w_free, &string_cdr(&format!("free {i}")));
+        assert_eq!(next(&free).payload, padded(&string_cdr(&format!("free {i}"))));
+    }
+    release.send(()).unwrap();
+    assert_eq!(next(&entered), padded(&string_cdr("stuck 49")), "only the newest was kept");
+
+    // Dropping the reader waits for its handler, which the closed gate lets go.
+    drop(release);
+    drop(stuck);
+    assert_eq!(entered.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the handler is gone");
+}
+
+#[test]
+fn a_reader_may_be_dropped_by_its_own_handler() {
+    let (ros, sgc) = (open(83, None), open(83, Some("arm-1")));
+    let slot = std::sync::Arc::new(std::sync::Mutex::new(None));
+    let (done_tx, done) = channel();
+    let mine = std::sync::Arc::clone(&slot);
+    let reader = sgc
+        .create_reader(
+            &spec("once"),
+            Box::new(move |_| {
+                drop(mine.lock().unwrap().take());
+                let _ = done_tx.send(());
+            }),
+        )
+        .unwrap();
+    *slot.lock().unwrap() = Some(reader);
+    let writer = writer(&ros, &spec("once"), 1);
+    write(&writer, &string_cdr("x"));
+    next(&done);
+    matched(&writer, 0);
+    assert_eq!(done.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the thread has ended");
+}
+
+#[test]
+fn dropping_a_network_ends_its_threads_and_endpoints() {
+    let (ros, sgc) = (open(84, None), open(84, Some("arm-1")));
+    let events = discover(&sgc);
+    let ros_events = discover(&ros);
+    let (reader, samples) = read(&ros, &spec("t"));
+    let writer = ros.create_writer(&spec("u")).unwrap();
+    let mut guids = [appeared(&events).guid, appeared(&events).guid];
+    guids.sort();
+
+    // Endpoints outlive the network that made them; discovery does not.
+    drop(ros);
+    assert_eq!(ros_events.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected));
+    quiet(&events);
+    drop((reader, writer));
+    assert!(matches!(samples.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected)));
+    let mut gone = [vanished(&events), vanished(&events)];
+    gone.sort();
+    assert_eq!(gone, guids);
+
+    let own = discover(&open(84, Some("arm-2")));
+    assert!(matches!(own.try_recv(), Err(std::sync::mpsc::TryRecvError::Disconnected)), "the drop waited");
+}
+
+#[test]
+fn nothing_leaks_when_endpoints_come_and_go() {
+    let (ros, sgc) = (open(85, None), open(85, Some("arm-1")));
+    let partitioned = with(spec("cycle"), |qos| qos.partitions = vec!["p".into()]);
+    let (_reader, samples) = read(&ros, &partitioned);
+    let idle = sgc.entity_count();
+    for round in 0..200 {
+        let writer = sgc.create_writer(&partitioned).unwrap();
+        let (reader, _) = read(&sgc, &spec("other"));
+        assert!(sgc.entity_count() > idle);
+        if round % 20 == 0 {
+            matched(&writer, 1);
+            write(&writer, &string_cdr("x"));
+            next(&samples);
+        }
+        drop((reader, writer));
+        assert_eq!(sgc.entity_count(), idle, "round {round}");
+    }
+}
+
+#[test]
+fn samples_are_freed_when_their_bytes_are() {
+    let (ros, sgc) = (open(86, None), open(86, Some("arm-1")));
+    let (_reader, samples) = read(&sgc, &spec("leak"));
+    let writer = writer(&ros, &spec("leak"), 1);
+    let payload = Bytes::from([&[0, 1, 0, 0][..], &vec![7; 1_000_000]].concat());
+    let pass = |rounds| {
+        for _ in 0..rounds {
+            write(&writer, &payload);
+            assert_eq!(next(&samples).payload.len(), payload.len());
+        }
+    };
+    pass(50);
+    let before = resident_bytes();
+    pass(400);
+    let grown = resident_bytes().saturating_sub(before);
+    // 400 MB have passed; other tests of this process may hold some tens of megabytes meanwhile.
+    assert!(grown < 200_000_000, "{grown} bytes more are resident");
+}
+
+fn resident_bytes() -> usize {
+    let statm = std::fs::read_to_string("/proc/self/statm").unwrap();
+    statm.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() * 4096
+}
+
+#[test]
+fn payloads_outlive_reader_and_network() {
+    let (ros, sgc) = (open(87, None), open(87, Some("arm-1")));
+    let (reader, samples) = read(&sgc, &spec("kept"));
+    let writer = writer(&ros, &spec("kept"), 1);
+    write(&writer, &string_cdr("still here"));
+    let sample = next(&samples);
+    drop((reader, sgc, writer, ros));
+    assert_eq!(sample.payload, padded(&string_cdr("still here")));
+    assert_eq!(sample.payload.slice(8..18), "still here".as_bytes());
+}
+
+#[test]
+fn keyed_data_passes_in_both_directions_and_disposals_can_be_written() {
+    let (ros, sgc) = (open(88, None), open(88, Some("arm-1")));
+    let keyed = |topic| EndpointSpec { keyless: false, ..spec(topic) };
+    let (_r1, from_sgc) = read(&ros, &with(keyed("k"), |q| q.history = History::KeepLast(1)));
+    let w1 = writer(&sgc, &with(keyed("k"), |q| q.history = History::KeepLast(1)), 1);
+    for i in 0..100 {
+        write(&w1, &string_cdr(&i.to_string()));
+    }
+    for i in 0..100 {
+        let sample = next(&from_sgc);
+        assert_eq!(sample.payload, padded(&string_cdr(&i.to_string())), "instances are not told apart");
+    }
+    for kind in [SampleKind::Dispose, SampleKind::Unregister] {
+        w1.write(kind, 0, string_cdr("1")).unwrap();
+        write(&w1, &string_cdr("again"));
+        let sample = next(&from_sgc);
+        assert_eq!((sample.kind, sample.payload), (SampleKind::Write, padded(&string_cdr("again")).into()));
+    }
+
+    // A keyless reader is no match for a keyed writer.
+    let (_keyless, _) = read(&ros, &spec("k2"));
+    let w2 = sgc.create_writer(&keyed("k2")).unwrap();
+    let (_match, _samples) = read(&ros, &keyed("k2b"));
+    let w3 = writer(&sgc, &keyed("k2b"), 1);
+    assert_eq!((w2.matched_readers(), w3.matched_readers()), (0, 1));
+}
+
+#[test]
+fn partitions_keep_endpoints_apart() {
+    let (ros, sgc) = (open(89, None), open(89, Some("arm-1")));
+    let part = |name: &str| with(spec("p"), |qos| qos.partitions = vec![name.into()]);
+    let (_left, left) = read(&ros, &part("left"));
+    let (_right, right) = read(&ros, &part("right"));
+    let writer = writer(&sgc, &part("left"), 1);
+    write(&writer, &string_cdr("l"));
+    next(&left);
+    quiet(&right);
+}
+
+#[test]
+fn a_write_that_nobody_acknowledges_ends_with_a_timeout() {
+    let (ros, sgc) = (open(90, None), open(90, Some("arm-1")));
+    let (_reader, samples) = read(&ros, &spec("deaf"));
+    let writer = writer(&sgc, &with(spec("deaf"), |qos| qos.history = History::KeepAll), 1);
+    write(&writer, &string_cdr("x"));
+    next(&samples);
+    ros.set_deaf_mute(Duration::from_secs(6));
+    let payload = Bytes::from([&[0, 1, 0, 0][..], &vec![7; 400_000]].concat());
+    let error = (0..50).find_map(|_| writer.write(SampleKind::Write, 0, payload.clone()).err());
+    let Some(RosError::WriteTimeout { waited_ms }) = error else { panic!("{error:?}") };
+    assert!((1_500..10_000).contains(&waited_ms), "{waited_ms}");
+}
+
+#[test]
+fn rmw_cyclonedds_on_localhost_is_found() {
+    // What rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (from Iron on), and of
+    // ROS_LOCALHOST_ONLY=1 (up to Humble).
+    let iron = "<General><AllowMulticast>false</AllowMulticast></General><Discovery>\
+                <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>\
+                <Peers><Peer address=\"localhost\"/></Peers></Discovery>";
+    let humble = "<General><Interfaces><NetworkInterface address=\"127.0.0.1\"/></Interfaces></General>";
+    for (domain, body) in [(91, iron), (92, humble)] {
+        let ros = CycloneNetwork::open(&DdsConfig {
+            domain,
+            discovery: DiscoveryRange::SystemDefault,
+            cyclonedds_uri: Some(format!("<CycloneDDS><Domain Id=\"{domain}\">{body}</Domain></CycloneDDS>")),
+            ..DdsConfig::default()
+        })
+        .unwrap();
+        let sgc = open(domain, Some("arm-1"));
+        let (_reader, samples) = read(&ros, &spec("t"));
+        let (_reader, back) = read(&sgc, &spec("back"));
+        let (w1, w2) = (writer(&sgc, &spec("t"), 1), writer(&ros, &spec("back"), 1));
+        write(&w1, &string_cdr("x"));
+        next(&samples);
+        write(&w2, &string_cdr("y"));
+        next(&back);
+    }
+}
+
+#[test]
+fn off_is_seen_by_nobody() {
+    let off =
+        CycloneNetwork::open(&DdsConfig { discovery: DiscoveryRange::Off, ..config(93, None) }).unwrap();
+    let (ros, sgc) = (open(93, None), open(93, Some("arm-1")));
+    let events = discover(&sgc);
+    let hidden = off.create_writer(&spec("hidden")).unwrap();
+    let shown = ros.create_writer(&spec("shown")).unwrap();
+    assert_eq!(appeared(&events).guid, shown.guid());
+    quiet(&events);
+    assert_eq!(hidden.matched_readers(), 0);
+}
+
+#[test]
+fn what_cyclone_refuses_is_an_error_with_its_reason() {
+    let open = |config: DdsConfig| CycloneNetwork::open(&config).unwrap_err().to_string();
+    let xml = DdsConfig { cyclonedds_uri: Some("<NoSuchElement/>".into()), ..config(94, None) };
+    assert!(open(xml).contains("NoSuchElement"));
+    let interface = "<General><Interfaces><NetworkInterface name=\"no-such0\"/></Interfaces></General>";
+    let xml = DdsConfig { cyclonedds_uri: Some(interface.into()), ..config(94, None) };
+    assert!(open(xml).contains("no-such0"));
+    assert!(open(DdsConfig { domain: 233, ..DdsConfig::default() }).contains("232"));
+}
+
+#[test]
+fn the_users_configuration_overrides_ours() {
+    let off = "<Discovery><Tag>elsewhere</Tag></Discovery>";
+    let apart = DdsConfig { cyclonedds_uri: Some(off.into()), ..config(95, None) };
+    let apart = CycloneNetwork::open(&apart).unwrap();
+    let (ros, sgc) = (open(95, None), open(95, Some("arm-1")));
+    let events = discover(&sgc);
+    let _hidden = apart.create_writer(&spec("hidden")).unwrap();
+    let shown = ros.create_writer(&spec("shown")).unwrap();
+    assert_eq!(appeared(&events).guid, shown.guid());
+    quiet(&events);
+}
