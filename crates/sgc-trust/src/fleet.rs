@@ -165,11 +165,7 @@ impl Fleet {
     }
 
     /// Makes an identity: a key pair, a certificate for it, and unless it is for a router the fleet secret.
-    pub fn enroll(
-        &self,
-        request: &EnrollRequest,
-        rng: &mut impl CryptoRng,
-    ) -> Result<Identity, FleetError> {
+    pub fn enroll(&self, request: &EnrollRequest, rng: &mut impl CryptoRng) -> Result<Identity, FleetError> {
         let now = request.now;
         if now.secs() > self.validity.not_after.secs() {
             return Err(FleetError::CaExpired { not_after: self.validity.not_after, now });
@@ -323,7 +319,9 @@ pub enum FleetError {
     #[error("block \"{SECRET_BLOCK}\" does not hold {SECRET_BYTES} bytes")]
     Secret,
     /// The CA is over.
-    #[error("the fleet's CA expired at {not_after} and the clock here says {now}: create a new fleet, or set the clock")]
+    #[error(
+        "the fleet's CA expired at {not_after} and the clock here says {now}: create a new fleet, or set the clock"
+    )]
     CaExpired {
         /// Its end.
         not_after: UnixMillis,

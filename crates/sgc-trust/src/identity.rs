@@ -93,8 +93,7 @@ impl Identity {
         }
         let (node, fleet) = read_about(&about.content)?;
         let length = |name| move || IdentityError::SecretLength(name);
-        let secret =
-            secret.map(|b| read_secret(&b.content).ok_or_else(length(SECRET_BLOCK))).transpose()?;
+        let secret = secret.map(|b| read_secret(&b.content).ok_or_else(length(SECRET_BLOCK))).transpose()?;
         let reset_key = reset_key
             .map(|b| b.content.as_slice().try_into().map_err(|_| length(RESET_BLOCK)()).map(Zeroizing::new))
             .transpose()?;
@@ -207,13 +206,14 @@ impl Identity {
     /// Checks that the parts fit together.
     pub(crate) fn assemble(parts: IdentityParts) -> Result<Self, IdentityError> {
         let pkcs8 = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(parts.key.as_slice()));
-        let key = rustls::crypto::aws_lc_rs::sign::any_supported_type(&pkcs8)
-            .map_err(|_| IdentityError::Key)?;
+        let key =
+            rustls::crypto::aws_lc_rs::sign::any_supported_type(&pkcs8).map_err(|_| IdentityError::Key)?;
         check_signs(&*key)?;
         let leaf = parts.chain.first().ok_or(IdentityError::Missing(CHAIN_BLOCK))?;
         // At the chain's own beginning: whether it holds now is another question.
-        let validity = Validity::of(leaf)
-            .ok_or_else(|| IdentityError::Chain(CertError::Malformed("its validity cannot be read".into())))?;
+        let validity = Validity::of(leaf).ok_or_else(|| {
+            IdentityError::Chain(CertError::Malformed("its validity cannot be read".into()))
+        })?;
         let own = parts.anchors.verify(&parts.chain, validity.not_before).map_err(IdentityError::Chain)?;
         let certified = CertifiedKey::new(parts.chain.clone(), key);
         certified.keys_match().map_err(|_| IdentityError::KeyMismatch)?;

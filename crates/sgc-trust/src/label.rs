@@ -127,7 +127,9 @@ mod tests {
         assert_eq!(refused(""), LabelError::Empty { kind: "group" });
         assert!(matches!(refused(&"x".repeat(65)), LabelError::TooLong { bytes: 65, .. }));
         assert!(matches!(refused("-a"), LabelError::Start { .. }));
-        for (text, character) in [("Arm", 'A'), ("a b", ' '), ("a:b", ':'), ("a/b", '/'), ("ü", 'ü'), ("a\n", '\n')] {
+        for (text, character) in
+            [("Arm", 'A'), ("a b", ' '), ("a:b", ':'), ("a/b", '/'), ("ü", 'ü'), ("a\n", '\n')]
+        {
             assert!(matches!(refused(text), LabelError::Character { character: c, .. } if c == character));
         }
     }

@@ -19,7 +19,9 @@ mod signed;
 mod verify;
 mod x509;
 
-pub use fleet::{CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT};
+pub use fleet::{
+    CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT,
+};
 pub use grant::{GrantError, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
@@ -32,6 +34,6 @@ pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, verify_advert, verify_answer, verify_join,
 };
 pub use verify::{
-    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, GROUPS_MAX,
-    SignatureError, TrustAnchors, VerifiedPeer, node_id,
+    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, GROUPS_MAX, SignatureError, TrustAnchors,
+    VerifiedPeer, node_id,
 };

@@ -80,7 +80,10 @@ mod tests {
         for (metadata, name) in [
             (&plain, "601073d3847e79d3db60fcd14aa8569a002053404728fbf3da75e6b9a5c07364"),
             (&full, "e7f411adc7d43de473d8706a951c9047a69faafcf6f8ee06061e42b7bfab2dc7"),
-            (&Metadata::catalogue("arm-1"), "a59aa68b61aa409eea546027b1f84203de8f853115e5bd5ad215b7107dd3a89b"),
+            (
+                &Metadata::catalogue("arm-1"),
+                "a59aa68b61aa409eea546027b1f84203de8f853115e5bd5ad215b7107dd3a89b",
+            ),
         ] {
             assert_eq!(derive_name(&fleet, &owner, metadata).to_string(), name);
         }

@@ -222,8 +222,14 @@ mod tests {
         for h in altered {
             assert!(opened(&h, &good).is_err(), "{h:?}");
         }
-        assert_eq!(opened(&PacketHeader { epoch: 2, ..h.clone() }, &good), Err(OpenError::Epoch { found: 2 }));
-        assert_eq!(opened(&PacketHeader { suite: 9, ..h.clone() }, &good), Err(OpenError::Suite { found: 9 }));
+        assert_eq!(
+            opened(&PacketHeader { epoch: 2, ..h.clone() }, &good),
+            Err(OpenError::Epoch { found: 2 })
+        );
+        assert_eq!(
+            opened(&PacketHeader { suite: 9, ..h.clone() }, &good),
+            Err(OpenError::Suite { found: 9 })
+        );
         assert_eq!(opened(&h, &good[1..]), Err(OpenError::Length));
     }
 

@@ -8,9 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustls_pki_types::CertificateDer;
-use sgc_wire::{
-    AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, Signed, UnixMillis,
-};
+use sgc_wire::{AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, Signed, UnixMillis};
 
 use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
 

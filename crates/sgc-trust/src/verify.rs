@@ -70,7 +70,8 @@ impl TrustAnchors {
             if index == ANCHORS_MAX {
                 return Err(AnchorError::TooMany);
             }
-            let (anchor, path) = Anchor::parse(der).map_err(|reason| AnchorError::Malformed { index, reason })?;
+            let (anchor, path) =
+                Anchor::parse(der).map_err(|reason| AnchorError::Malformed { index, reason })?;
             anchors.push(anchor);
             paths.push(path);
         }
@@ -82,11 +83,7 @@ impl TrustAnchors {
 
     /// Verifies a chain, leaf first, at the time `now`: path to one of the CAs, signatures, validity, key usage,
     /// and that the leaf names a node of SGC.
-    pub fn verify(
-        &self,
-        chain: &[CertificateDer<'_>],
-        now: UnixMillis,
-    ) -> Result<VerifiedPeer, CertError> {
+    pub fn verify(&self, chain: &[CertificateDer<'_>], now: UnixMillis) -> Result<VerifiedPeer, CertError> {
         let (leaf_der, intermediates) = chain.split_first().ok_or(CertError::NoCertificate)?;
         if chain.len() > CHAIN_CERTS_MAX {
             return Err(CertError::ChainTooLong { certificates: chain.len() });
@@ -358,7 +355,9 @@ pub enum CertError {
     #[error("the certificate's signature is wrong: it was altered or forged")]
     BadSignature,
     /// It is over.
-    #[error("the certificate expired at {not_after} and the clock here says {now}: enroll again, or set the clock")]
+    #[error(
+        "the certificate expired at {not_after} and the clock here says {now}: enroll again, or set the clock"
+    )]
     Expired {
         /// Its end.
         not_after: UnixMillis,

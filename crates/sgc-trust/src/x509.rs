@@ -59,7 +59,8 @@ impl<'a> Der<'a> {
         let mut length = usize::from(*first);
         if length & 0x80 != 0 {
             let digits;
-            (digits, rest) = rest.split_at_checked(length & 0x7f).filter(|(d, _)| (1..=3).contains(&d.len()))?;
+            (digits, rest) =
+                rest.split_at_checked(length & 0x7f).filter(|(d, _)| (1..=3).contains(&d.len()))?;
             length = digits.iter().fold(0, |n, digit| (n << 8) | usize::from(*digit));
         }
         let (content, rest) = rest.split_at_checked(length).filter(|_| *found == tag)?;
@@ -130,7 +131,8 @@ mod tests {
 
     #[test]
     fn broken_lengths_are_none() {
-        for der in [&[][..], &[SEQUENCE], &[SEQUENCE, 5, 1], &[SEQUENCE, 0x84, 1, 1, 1, 1], &[SEQUENCE, 0x80]] {
+        for der in [&[][..], &[SEQUENCE], &[SEQUENCE, 5, 1], &[SEQUENCE, 0x84, 1, 1, 1, 1], &[SEQUENCE, 0x80]]
+        {
             assert!(Der(der).enter(SEQUENCE).is_none());
             assert!(Validity::of(der).is_none() && split_spki(der).is_none());
         }

@@ -1,4 +1,5 @@
 //! Who is believed to be whom: enrolment, files, chains.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::time::Duration;
 
@@ -42,10 +43,7 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
     // Computed with Python's hmac and hashlib.
     let secret = FleetSecret::from_bytes(std::array::from_fn(|i| i as u8));
     let pseudonym = secret.pseudonym("arm-1");
-    assert_eq!(
-        pseudonym.to_string(),
-        "35cfe4dbd58268ed66a35a9d31970b71c1924b1f868abc11bb0c3de8a6dad380"
-    );
+    assert_eq!(pseudonym.to_string(), "35cfe4dbd58268ed66a35a9d31970b71c1924b1f868abc11bb0c3de8a6dad380");
     assert_eq!(
         secret.group_tag("operators").to_string(),
         "fd07842555f47b1a744689f2cab99ce38dd9e62f916589055a6c679aea52306c"
@@ -246,12 +244,12 @@ fn leaves_of_an_existing_pki_are_judged_by_what_they_say() {
     assert_eq!(judge(&many).unwrap_err(), CertError::TooManyGroups);
 
     let mail = Some(ExtendedKeyUsagePurpose::EmailProtection);
-    assert_eq!(ca.issue(&[node.clone()], mail, p256).unwrap_err(), CertError::WrongUsage);
+    assert_eq!(ca.issue(std::slice::from_ref(&node), mail, p256).unwrap_err(), CertError::WrongUsage);
     for usage in [ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth] {
-        assert!(ca.issue(&[node.clone()], Some(usage), p256).is_ok());
+        assert!(ca.issue(std::slice::from_ref(&node), Some(usage), p256).is_ok());
     }
     for algorithm in [&rcgen::PKCS_ECDSA_P384_SHA384, &rcgen::PKCS_ED25519] {
-        assert!(ca.issue(&[node.clone()], None, algorithm).is_ok());
+        assert!(ca.issue(std::slice::from_ref(&node), None, algorithm).is_ok());
     }
     let p521 = &rcgen::PKCS_ECDSA_P521_SHA512;
     assert_eq!(ca.issue(&[node], None, p521).unwrap_err(), CertError::KeyUnsupported);
@@ -300,10 +298,7 @@ fn a_router_has_no_secret() {
     assert!(router.fleet_secret().is_none());
     assert_eq!(router.node_id_of("arm-1"), None);
     let text = router.to_text();
-    let secret = base64::Engine::encode(
-        &base64::engine::general_purpose::STANDARD,
-        fleet.secret().expose(),
-    );
+    let secret = base64::Engine::encode(&base64::engine::general_purpose::STANDARD, fleet.secret().expose());
     assert!(fleet.to_text().contains(&secret[..40]));
     assert!(!text.contains(&secret[..40]) && !text.contains("FLEET SECRET"));
     let back = Identity::parse(&text).unwrap();
@@ -372,7 +367,10 @@ fn broken_identity_files_name_the_block() {
     assert_eq!(refused(&text.replace(block(&text, "PRIVATE KEY"), garbage)), IdentityError::Key);
     let about = |base64| format!("-----BEGIN SGC IDENTITY-----\n{base64}\n-----END SGC IDENTITY-----\n");
     let with_about = |base64| refused(&text.replace(block(&text, "SGC IDENTITY"), &about(base64)));
-    assert!(matches!(with_about("CQ=="), IdentityError::About(sgc_wire::DecodeError::Version { found: 9, .. })));
+    assert!(matches!(
+        with_about("CQ=="),
+        IdentityError::About(sgc_wire::DecodeError::Version { found: 9, .. })
+    ));
     assert!(matches!(with_about("AQ=="), IdentityError::About(sgc_wire::DecodeError::Truncated { .. })));
     assert!(matches!(refused("-----BEGIN X-----"), IdentityError::File(PemError::Unterminated { .. })));
 }

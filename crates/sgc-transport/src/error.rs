@@ -1,0 +1,457 @@
+//! Everything that ends a link, a flow or an attempt at a link, each with its cause.
+//!
+//! What the other side is told is not what is logged here: over the wire go a TLS alert or a small code, and text
+//! that comes from there is shown only after being shortened and stripped of control characters.
+
+use std::fmt;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use quinn::{ConnectionError, TransportErrorCode};
+use sgc_trust::CertError;
+use sgc_wire::DecodeError;
+
+use crate::framing::CONTROL_FRAME_BYTES_MAX;
+use crate::metrics::RefusalKind;
+use crate::url::LinkUrl;
+
+const TEXT_CHARS_MAX: usize = 200;
+
+/// Why a node closes a link, told to its peer.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CloseReason {
+    /// The node stops, or needs the link no more.
+    #[error("it says goodbye")]
+    Goodbye,
+    /// The same two nodes have a newer link.
+    #[error("a newer link took its place")]
+    Replaced,
+    /// The peer broke the protocol.
+    #[error("protocol error: {0}")]
+    Protocol(String),
+    /// The peer may not have a link here.
+    #[error("not permitted: {0}")]
+    Denied(String),
+    /// The node has too much to do.
+    #[error("it is overloaded")]
+    Overloaded,
+    /// A reason that this version does not know.
+    #[error("reason {code}: {text}")]
+    Other {
+        /// Its number.
+        code: u64,
+        /// What the peer says of it.
+        text: String,
+    },
+}
+
+impl CloseReason {
+    pub(crate) fn to_wire(&self) -> (u32, String) {
+        let (code, text) = match self {
+            Self::Goodbye => (0, ""),
+            Self::Replaced => (1, ""),
+            Self::Protocol(text) => (2, text.as_str()),
+            Self::Denied(text) => (3, text.as_str()),
+            Self::Overloaded => (4, ""),
+            Self::Other { code, text } => (u32::try_from(*code).unwrap_or(u32::MAX), text.as_str()),
+        };
+        (code, printable(text.as_bytes()))
+    }
+
+    pub(crate) fn from_wire(code: u64, text: &[u8]) -> Self {
+        match code {
+            0 => Self::Goodbye,
+            1 => Self::Replaced,
+            2 => Self::Protocol(printable(text)),
+            3 => Self::Denied(printable(text)),
+            4 => Self::Overloaded,
+            code => Self::Other { code, text: printable(text) },
+        }
+    }
+}
+
+/// Why one end of a flow ends it before its time, told to the other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FlowEnd {
+    /// No one needs it any more.
+    Unwanted,
+    /// What came was malformed.
+    Malformed,
+    /// The flow's version is not spoken.
+    Version,
+    /// What remains is out of date.
+    Stale,
+    /// A reason that this version does not know.
+    Other(u64),
+}
+
+impl FlowEnd {
+    pub(crate) fn to_wire(self) -> u32 {
+        match self {
+            Self::Unwanted => 0,
+            Self::Malformed => 1,
+            Self::Version => 2,
+            Self::Stale => 3,
+            Self::Other(code) => u32::try_from(code).unwrap_or(u32::MAX),
+        }
+    }
+
+    pub(crate) fn from_wire(code: u64) -> Self {
+        match code {
+            0 => Self::Unwanted,
+            1 => Self::Malformed,
+            2 => Self::Version,
+            3 => Self::Stale,
+            code => Self::Other(code),
+        }
+    }
+}
+
+impl fmt::Display for FlowEnd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unwanted => f.write_str("no one needs it any more"),
+            Self::Malformed => f.write_str("what it carried was malformed"),
+            Self::Version => f.write_str("its version is not spoken there"),
+            Self::Stale => f.write_str("what remained was out of date"),
+            Self::Other(code) => write!(f, "reason {code}"),
+        }
+    }
+}
+
+/// Why the far side refused this node, as far as it lets on.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PeerRefusal {
+    /// It saw no certificate of ours.
+    #[error("it saw no certificate: does this node have an identity?")]
+    NoCertificate,
+    /// Our CA is not one that it trusts.
+    #[error("it does not trust our CA: are the two nodes of different fleets?")]
+    OtherCa,
+    /// To it our certificate is over, or has not begun.
+    #[error("to it our certificate is expired or not yet valid: enroll again, or compare the clocks")]
+    Expired,
+    /// Our certificate was revoked.
+    #[error("our certificate was revoked")]
+    Revoked,
+    /// It cannot use our certificate.
+    #[error("it cannot use our certificate (alert {0}); its log says why")]
+    BadCertificate(u8),
+    /// It speaks another version of the protocol, or another protocol.
+    #[error("it does not speak this version of SGC: are both nodes of one release?")]
+    Version,
+    /// It has too much to do.
+    #[error("it is overloaded: try again later")]
+    Overloaded,
+    /// It gave up before the link was made.
+    #[error("it gave up while connecting")]
+    GaveUp,
+    /// Something else.
+    #[error("{0}")]
+    Other(String),
+}
+
+impl PeerRefusal {
+    /// From the close frame of a peer's transport (RFC 9000, 20.1; TLS alerts: RFC 8446, 6.2).
+    pub(crate) fn from_code(code: TransportErrorCode, text: &[u8]) -> Self {
+        const TLS_ALERT: u64 = 0x100;
+        match u64::from(code) {
+            0x02 => Self::Overloaded,
+            0x00 | 0x0c => Self::GaveUp,
+            raw if raw & !0xff == TLS_ALERT => match raw as u8 {
+                116 => Self::NoCertificate,
+                48 => Self::OtherCa,
+                45 => Self::Expired,
+                44 => Self::Revoked,
+                alert @ (42 | 43 | 46 | 49 | 51) => Self::BadCertificate(alert),
+                70 | 120 => Self::Version,
+                alert => Self::Other(format!("TLS alert {alert}")),
+            },
+            _ => Self::Other(format!("{code}: {}", printable(text))),
+        }
+    }
+}
+
+/// How a peer broke the protocol. It ends the link.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ProtocolError {
+    /// A control frame claims to be too long.
+    #[error("control frame of {bytes} bytes, at most {CONTROL_FRAME_BYTES_MAX} are allowed")]
+    ControlFrameTooLong {
+        /// What it claims.
+        bytes: u64,
+    },
+    /// The control stream ended while the link lives.
+    #[error("the control stream ended before the link did")]
+    ControlEnded,
+    /// The first control frame is no greeting.
+    #[error("the greeting is malformed: {0}")]
+    Greeting(#[source] DecodeError),
+}
+
+/// Why a link ended or could not be made.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum LinkError {
+    /// It was closed.
+    #[error("closed by {}: {reason}", if *by_peer { "the peer" } else { "this node" })]
+    Closed {
+        /// By the peer, or here.
+        by_peer: bool,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// Nothing came for too long.
+    #[error("nothing arrived for {} s: the network is down or the peer is gone", after.as_secs_f32())]
+    TimedOut {
+        /// How long.
+        after: Duration,
+    },
+    /// The peer did not finish its part of connecting.
+    #[error("no answer within {} s: is a node listening there, and does UDP get through?", after.as_secs_f32())]
+    HandshakeTimedOut {
+        /// How long.
+        after: Duration,
+    },
+    /// The peer is there and has forgotten the link.
+    #[error("the peer restarted and no longer knows this link")]
+    PeerRestarted,
+    /// The peer's certificate is refused here.
+    #[error("refused: {0}")]
+    RefusedHere(#[source] CertError),
+    /// The peer refused us.
+    #[error("the peer refused this node: {0}")]
+    RefusedByPeer(#[source] PeerRefusal),
+    /// The peer broke the protocol.
+    #[error("protocol error: {0}")]
+    Protocol(#[from] ProtocolError),
+    /// The peer ended the flow that was to be sent on; the link lives.
+    #[error("the peer stopped this flow: {0}")]
+    FlowStopped(FlowEnd),
+    /// A control frame that is too long to be sent; the link lives.
+    #[error("a control frame of {bytes} bytes cannot be sent, at most {CONTROL_FRAME_BYTES_MAX} can")]
+    FrameTooLong {
+        /// Its length.
+        bytes: usize,
+    },
+    /// A packet that is too long to be sent as a datagram; the link lives, and a flow would take it.
+    #[error("a datagram of {bytes} bytes cannot be sent, at most {max} can")]
+    DatagramTooLong {
+        /// Its length.
+        bytes: usize,
+        /// The most that fits now; 0 if this link has no datagrams.
+        max: usize,
+    },
+    /// The socket failed.
+    #[error("socket: {0}")]
+    Io(#[source] Arc<io::Error>),
+    /// The transport failed in another way.
+    #[error("transport: {0}")]
+    Transport(String),
+}
+
+impl LinkError {
+    /// True if the link lives on.
+    pub fn is_link_alive(&self) -> bool {
+        matches!(self, Self::FlowStopped(_) | Self::FrameTooLong { .. } | Self::DatagramTooLong { .. })
+    }
+
+    pub(crate) fn from_quinn(error: &ConnectionError, idle_timeout: Duration) -> Self {
+        match error {
+            ConnectionError::VersionMismatch => Self::RefusedByPeer(PeerRefusal::Version),
+            ConnectionError::TransportError(e) => Self::Transport(e.to_string()),
+            ConnectionError::ConnectionClosed(c) => {
+                Self::RefusedByPeer(PeerRefusal::from_code(c.error_code, &c.reason))
+            }
+            ConnectionError::ApplicationClosed(c) => Self::Closed {
+                by_peer: true,
+                reason: CloseReason::from_wire(c.error_code.into_inner(), &c.reason),
+            },
+            ConnectionError::Reset => Self::PeerRestarted,
+            ConnectionError::TimedOut => Self::TimedOut { after: idle_timeout },
+            ConnectionError::LocallyClosed => Self::Closed { by_peer: false, reason: CloseReason::Goodbye },
+            ConnectionError::CidsExhausted => Self::Transport(error.to_string()),
+        }
+    }
+}
+
+impl From<io::Error> for LinkError {
+    fn from(error: io::Error) -> Self {
+        Self::Io(Arc::new(error))
+    }
+}
+
+/// Why no more can be read from a flow. Only [`FlowError::Link`] concerns the link.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum FlowError {
+    /// A flow of a version that is not spoken here.
+    #[error("a flow of version {found}, {} is spoken here", crate::framing::FLOW_VERSION)]
+    Version {
+        /// Its version.
+        found: u8,
+    },
+    /// A packet claims to be too long.
+    #[error("a packet of {bytes} bytes, at most {} are allowed", crate::framing::FLOW_PACKET_BYTES_MAX)]
+    PacketTooLong {
+        /// What it claims.
+        bytes: u64,
+    },
+    /// A packet's header is malformed, or of an unknown version.
+    #[error("malformed packet: {0}")]
+    Packet(#[source] DecodeError),
+    /// The flow ended inside of a packet.
+    #[error("the flow ended inside of a packet")]
+    Truncated,
+    /// The sender ended it before its time.
+    #[error("the sender ended the flow: {0}")]
+    Ended(FlowEnd),
+    /// The link ended.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+}
+
+impl FlowError {
+    /// What the sender is told, if anything is left to tell.
+    pub(crate) fn stop_code(&self) -> Option<FlowEnd> {
+        match self {
+            Self::Version { .. } | Self::Packet(DecodeError::Version { .. }) => Some(FlowEnd::Version),
+            Self::PacketTooLong { .. } | Self::Packet(_) | Self::Truncated => Some(FlowEnd::Malformed),
+            Self::Ended(_) | Self::Link(_) => None,
+        }
+    }
+}
+
+/// Why a peer that came to a listener has no link.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum Refusal {
+    /// Its certificate is not accepted.
+    #[error("{0}")]
+    Certificate(#[source] CertError),
+    /// It speaks another version, or another protocol.
+    #[error("it does not speak this version of SGC: {0}")]
+    Version(String),
+    /// Its greeting is none.
+    #[error("{0}")]
+    Greeting(#[source] ProtocolError),
+    /// It did not finish in time.
+    #[error("it did not finish connecting within {} s", after.as_secs_f32())]
+    TimedOut {
+        /// The time it had.
+        after: Duration,
+    },
+    /// Too many connect at once.
+    #[error(
+        "{pending} nodes are connecting already; {unreported} more were refused since this was last said"
+    )]
+    TooMany {
+        /// How many.
+        pending: usize,
+        /// How many were refused since the last such report.
+        unreported: u64,
+    },
+    /// It refused us, or gave up.
+    #[error("{0}")]
+    ByPeer(#[source] PeerRefusal),
+    /// The transport failed.
+    #[error("transport: {0}")]
+    Transport(String),
+}
+
+impl Refusal {
+    /// What it counts as.
+    pub fn kind(&self) -> RefusalKind {
+        match self {
+            Self::Certificate(CertError::NoCertificate) => RefusalKind::NoCertificate,
+            // A dialer of another fleet looks at our certificate before we see its own.
+            Self::Certificate(CertError::UnknownIssuer) | Self::ByPeer(PeerRefusal::OtherCa) => {
+                RefusalKind::OtherCa
+            }
+            Self::Certificate(CertError::Expired { .. } | CertError::CaExpired { .. }) => {
+                RefusalKind::Expired
+            }
+            Self::Certificate(CertError::NotYetValid { .. }) => RefusalKind::NotYetValid,
+            Self::Certificate(_) => RefusalKind::BadCertificate,
+            Self::Version(_) => RefusalKind::Version,
+            Self::Greeting(_) => RefusalKind::BadGreeting,
+            Self::TimedOut { .. } => RefusalKind::TimedOut,
+            Self::TooMany { .. } => RefusalKind::TooMany,
+            Self::ByPeer(_) => RefusalKind::ByPeer,
+            Self::Transport(_) => RefusalKind::Transport,
+        }
+    }
+}
+
+/// Why dialling led to no link.
+#[derive(Debug, thiserror::Error)]
+pub enum DialError {
+    /// The host name could not be looked up.
+    #[error("{url}: the host name cannot be looked up: {source}")]
+    Resolve {
+        /// What was dialled.
+        url: LinkUrl,
+        /// What the resolver said.
+        source: io::Error,
+    },
+    /// The host name has no address.
+    #[error("{0}: the host name has no address")]
+    NoAddress(LinkUrl),
+    /// Every address failed.
+    #[error("{url}: {}", Attempts(attempts))]
+    Failed {
+        /// What was dialled.
+        url: LinkUrl,
+        /// What was tried, and what came of it.
+        attempts: Vec<(SocketAddr, LinkError)>,
+    },
+}
+
+struct Attempts<'a>(&'a [(SocketAddr, LinkError)]);
+
+impl fmt::Display for Attempts<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, (address, error)) in self.0.iter().enumerate() {
+            write!(f, "{}{address}: {error}", if index > 0 { "; " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+/// Text of a peer, fit for a log.
+fn printable(text: &[u8]) -> String {
+    let text = String::from_utf8_lossy(text);
+    text.chars().filter(|c| !c.is_control()).take(TEXT_CHARS_MAX).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reasons_survive_the_wire() {
+        for reason in [
+            CloseReason::Goodbye,
+            CloseReason::Replaced,
+            CloseReason::Protocol("x".into()),
+            CloseReason::Denied("y".into()),
+            CloseReason::Overloaded,
+            CloseReason::Other { code: 77, text: "z".into() },
+        ] {
+            let (code, text) = reason.to_wire();
+            assert_eq!(CloseReason::from_wire(code.into(), text.as_bytes()), reason);
+        }
+        for end in
+            [FlowEnd::Unwanted, FlowEnd::Malformed, FlowEnd::Version, FlowEnd::Stale, FlowEnd::Other(9)]
+        {
+            assert_eq!(FlowEnd::from_wire(end.to_wire().into()), end);
+        }
+    }
+
+    #[test]
+    fn foreign_text_cannot_draw_on_the_terminal() {
+        let long = [b"\x1b[2J\n\xff".as_slice(), &[b'a'; 500]].concat();
+        let CloseReason::Denied(text) = CloseReason::from_wire(3, &long) else { panic!() };
+        assert!(text.starts_with("[2J\u{fffd}aaa"), "{text}");
+        assert_eq!(text.chars().count(), TEXT_CHARS_MAX);
+    }
+}

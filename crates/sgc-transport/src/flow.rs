@@ -1,0 +1,141 @@
+//! Flows: one reliable, ordered sequence of packets, which no other flow of the link holds up.
+//!
+//! The framing is the same over every transport; the halves of the stream below are the transport's.
+
+use bytes::Bytes;
+use sgc_wire::Packet;
+
+use crate::error::{FlowEnd, FlowError, LinkError};
+use crate::framing::{Pieces, packet_head};
+use crate::quic;
+
+/// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once.
+#[derive(Debug)]
+pub struct FlowTx {
+    outlet: Outlet,
+    has_begun: bool,
+}
+
+#[derive(Debug)]
+pub(crate) enum Outlet {
+    Quic(quic::Outlet),
+}
+
+impl FlowTx {
+    pub(crate) fn new(outlet: Outlet) -> Self {
+        Self { outlet, has_begun: false }
+    }
+
+    /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied.
+    ///
+    /// If the future is dropped, the packet is either not sent at all or sent as a whole before the next.
+    pub async fn send(&mut self, packet: &Packet) -> Result<(), LinkError> {
+        let pieces = packet.payload.0.iter().filter(|p| !p.is_empty()).cloned();
+        match &mut self.outlet {
+            Outlet::Quic(outlet) => {
+                outlet.flush().await?;
+                let head = packet_head(packet, !self.has_begun);
+                self.has_begun = true;
+                outlet.queue(std::iter::once(head).chain(pieces));
+                outlet.flush().await
+            }
+        }
+    }
+
+    /// Ends the flow after what was sent, which the transport still delivers.
+    pub async fn finish(mut self) -> Result<(), LinkError> {
+        match &mut self.outlet {
+            Outlet::Quic(outlet) => outlet.finish().await,
+        }
+    }
+
+    /// Ends the flow at once; what has not arrived will not.
+    pub fn reset(mut self, end: FlowEnd) {
+        match &mut self.outlet {
+            Outlet::Quic(outlet) => outlet.reset(end),
+        }
+    }
+}
+
+/// The receiving end of a flow. Dropped, it tells the sender that no one needs the flow any more.
+#[derive(Debug)]
+pub struct FlowRx {
+    inlet: Inlet,
+    pieces: Pieces,
+    state: State,
+}
+
+#[derive(Debug)]
+pub(crate) enum Inlet {
+    Quic(quic::Inlet),
+}
+
+#[derive(Debug, PartialEq, Eq)]
+enum State {
+    ExpectVersion,
+    ExpectPacket,
+    Ended,
+}
+
+impl FlowRx {
+    pub(crate) fn new(inlet: Inlet) -> Self {
+        Self { inlet, pieces: Pieces::default(), state: State::ExpectVersion }
+    }
+
+    /// Receives the next packet, `None` once the flow is over. The payload consists of slices of what the
+    /// transport hands out (quinn joins pieces by itself where many small ones would hold much memory). An error ends this flow, is told to the sender, and leaves
+    /// the link alone. Dropping the future loses nothing.
+    pub async fn recv(&mut self) -> Result<Option<Packet>, FlowError> {
+        let result = self.next().await;
+        match &result {
+            Ok(Some(_)) => {}
+            Ok(None) => self.state = State::Ended,
+            Err(error) => {
+                self.state = State::Ended;
+                if let Some(end) = error.stop_code() {
+                    self.tell(end);
+                }
+            }
+        }
+        result
+    }
+
+    /// Tells the sender why no more will be received.
+    pub fn stop(mut self, end: FlowEnd) {
+        self.tell(end);
+    }
+
+    async fn next(&mut self) -> Result<Option<Packet>, FlowError> {
+        loop {
+            match self.state {
+                State::Ended => return Ok(None),
+                State::ExpectVersion => {
+                    if self.pieces.next_flow_version()?.is_some() {
+                        self.state = State::ExpectPacket;
+                        continue;
+                    }
+                }
+                State::ExpectPacket => {
+                    if let Some(packet) = self.pieces.next_packet()? {
+                        return Ok(Some(packet));
+                    }
+                }
+            }
+            let has_more = match &mut self.inlet {
+                Inlet::Quic(inlet) => inlet.fill(&mut self.pieces).await?,
+            };
+            if !has_more {
+                return if self.pieces.is_empty() { Ok(None) } else { Err(FlowError::Truncated) };
+            }
+        }
+    }
+
+    fn tell(&mut self, end: FlowEnd) {
+        match &mut self.inlet {
+            Inlet::Quic(inlet) => inlet.stop(end),
+        }
+    }
+}
+
+/// Pieces of one frame that are to be written in order.
+pub(crate) type Chunks = Vec<Bytes>;

@@ -1,0 +1,29 @@
+//! Links: authenticated connections between two nodes, the same to their users over every transport.
+//!
+//! A [`Link`] carries control frames (reliable, ordered), flows (reliable packets of one topic each, none waiting
+//! for another) and datagrams (best effort). It exists only after both ends have proven who they are with the
+//! certificates of their [`sgc_trust::Identity`]. [`Listener`] and [`Dialer`] make links.
+//!
+//! What is *not* here: routing, queues, reconnecting, policy. A link says who is at the other end and why it
+//! ended; what follows from that is the node's. QUIC is the one transport so far.
+#![forbid(unsafe_code)]
+
+mod endpoint;
+mod error;
+mod flow;
+mod framing;
+mod link;
+mod metrics;
+mod options;
+mod quic;
+mod url;
+
+pub use endpoint::{Dialer, Listener, RefusedPeer};
+pub use error::{CloseReason, DialError, FlowEnd, FlowError, LinkError, PeerRefusal, ProtocolError, Refusal};
+pub use flow::{FlowRx, FlowTx};
+pub use framing::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
+pub use link::{AnyLink, Link, LinkStats};
+pub use metrics::{RefusalKind, TransportMetrics};
+pub use options::LinkOptions;
+pub use quic::QuicLink;
+pub use url::{DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};

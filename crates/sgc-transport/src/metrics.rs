@@ -1,0 +1,133 @@
+//! Counts of what links went through, for `sgc status` and the metrics page. It counts; it logs nothing.
+
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// Why peers are refused, as far as counting goes; [`crate::Refusal`] tells more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum RefusalKind {
+    /// No certificate was presented.
+    NoCertificate,
+    /// The certificate is from a CA that is not trusted, there or here.
+    OtherCa,
+    /// The certificate, or its CA, is over.
+    Expired,
+    /// The certificate has not begun.
+    NotYetValid,
+    /// The certificate is altered, malformed or for something else.
+    BadCertificate,
+    /// It speaks another version of the protocol, or another protocol.
+    Version,
+    /// It connected and then said something that is no greeting.
+    BadGreeting,
+    /// It did not finish in time.
+    TimedOut,
+    /// Too many were connecting at once.
+    TooMany,
+    /// It refused us, or gave up.
+    ByPeer,
+    /// The transport failed.
+    Transport,
+}
+
+impl RefusalKind {
+    /// Every kind, in the order of the counters.
+    pub const ALL: [Self; 11] = [
+        Self::NoCertificate,
+        Self::OtherCa,
+        Self::Expired,
+        Self::NotYetValid,
+        Self::BadCertificate,
+        Self::Version,
+        Self::BadGreeting,
+        Self::TimedOut,
+        Self::TooMany,
+        Self::ByPeer,
+        Self::Transport,
+    ];
+
+    /// Its name as a label of a metric.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::NoCertificate => "no_certificate",
+            Self::OtherCa => "other_ca",
+            Self::Expired => "expired",
+            Self::NotYetValid => "not_yet_valid",
+            Self::BadCertificate => "bad_certificate",
+            Self::Version => "version",
+            Self::BadGreeting => "bad_greeting",
+            Self::TimedOut => "timed_out",
+            Self::TooMany => "too_many",
+            Self::ByPeer => "by_peer",
+            Self::Transport => "transport",
+        }
+    }
+}
+
+/// Counters of all listeners and dialers that share them.
+#[derive(Debug, Default)]
+pub struct TransportMetrics {
+    accepted: AtomicU64,
+    dialed: AtomicU64,
+    pending: AtomicU64,
+    refused: [AtomicU64; RefusalKind::ALL.len()],
+}
+
+impl TransportMetrics {
+    /// Links that came in.
+    pub fn accepted(&self) -> u64 {
+        self.accepted.load(Relaxed)
+    }
+
+    /// Links that were dialled.
+    pub fn dialed(&self) -> u64 {
+        self.dialed.load(Relaxed)
+    }
+
+    /// Incoming handshakes under way now.
+    pub fn handshakes_pending(&self) -> u64 {
+        self.pending.load(Relaxed)
+    }
+
+    /// Peers that were refused at a listener, for one kind of reason.
+    pub fn refused(&self, kind: RefusalKind) -> u64 {
+        self.refused[kind as usize].load(Relaxed)
+    }
+
+    pub(crate) fn count_accepted(&self) {
+        self.accepted.fetch_add(1, Relaxed);
+    }
+
+    pub(crate) fn count_dialed(&self) {
+        self.dialed.fetch_add(1, Relaxed);
+    }
+
+    pub(crate) fn count_refused(&self, kind: RefusalKind) {
+        self.refused[kind as usize].fetch_add(1, Relaxed);
+    }
+
+    /// Counts a handshake as pending for as long as the result lives.
+    pub(crate) fn pending(self: &std::sync::Arc<Self>) -> Pending {
+        self.pending.fetch_add(1, Relaxed);
+        Pending(std::sync::Arc::clone(self))
+    }
+}
+
+pub(crate) struct Pending(std::sync::Arc<TransportMetrics>);
+
+impl Drop for Pending {
+    fn drop(&mut self) {
+        self.0.pending.fetch_sub(1, Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_kind_has_its_own_counter() {
+        for (index, kind) in RefusalKind::ALL.into_iter().enumerate() {
+            assert_eq!(kind as usize, index);
+        }
+    }
+}

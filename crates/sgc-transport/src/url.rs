@@ -1,0 +1,216 @@
+//! Where links lead and where they are awaited: `quic://router.example:7447`, `quic://[::]:7447`.
+//!
+//! It parses and prints; host names are resolved when a link is dialled.
+
+use std::fmt;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::str::FromStr;
+
+/// The port where none is given.
+pub const DEFAULT_PORT: u16 = 7447;
+
+const HOST_BYTES_MAX: usize = 253;
+
+/// A transport, by the scheme of its URLs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Scheme {
+    /// QUIC (RFC 9000) over UDP.
+    Quic,
+}
+
+impl Scheme {
+    fn parse(text: &str) -> Result<Self, UrlError> {
+        match text {
+            "quic" => Ok(Self::Quic),
+            "dtls" | "tls" | "tcp" | "udp" | "ws" | "wss" => Err(UrlError::SchemePlanned(text.to_owned())),
+            _ => Err(UrlError::SchemeUnknown(text.chars().take(40).collect())),
+        }
+    }
+}
+
+impl fmt::Display for Scheme {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Quic => "quic",
+        })
+    }
+}
+
+/// Where to dial.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct LinkUrl {
+    /// By which transport.
+    pub scheme: Scheme,
+    /// Host name or IP address, an IPv6 address without brackets.
+    pub host: String,
+    /// Port.
+    pub port: u16,
+}
+
+impl FromStr for LinkUrl {
+    type Err = UrlError;
+
+    fn from_str(text: &str) -> Result<Self, UrlError> {
+        let (scheme, host, port) = split(text)?;
+        if port == 0 {
+            return Err(UrlError::Port("0".into()));
+        }
+        let is_name = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '.' | '_');
+        let is_host = host.parse::<IpAddr>().is_ok() || (!host.is_empty() && host.chars().all(is_name));
+        if !is_host || host.len() > HOST_BYTES_MAX {
+            return Err(UrlError::Host(host.chars().take(80).collect()));
+        }
+        Ok(Self { scheme, host: host.to_owned(), port })
+    }
+}
+
+impl fmt::Display for LinkUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.host.contains(':') {
+            write!(f, "{}://[{}]:{}", self.scheme, self.host, self.port)
+        } else {
+            write!(f, "{}://{}:{}", self.scheme, self.host, self.port)
+        }
+    }
+}
+
+/// Where to listen.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct ListenAddr {
+    /// For which transport.
+    pub scheme: Scheme,
+    /// The address to bind: `[::]` for every interface, IPv4 and IPv6 alike. Port 0 lets the system choose.
+    pub addr: SocketAddr,
+}
+
+impl FromStr for ListenAddr {
+    type Err = UrlError;
+
+    fn from_str(text: &str) -> Result<Self, UrlError> {
+        let (scheme, host, port) = split(text)?;
+        let ip = match host {
+            "*" => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
+            host => host.parse().map_err(|_| UrlError::NotAnAddress(host.chars().take(80).collect()))?,
+        };
+        Ok(Self { scheme, addr: SocketAddr::new(ip, port) })
+    }
+}
+
+impl fmt::Display for ListenAddr {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}://{}", self.scheme, self.addr)
+    }
+}
+
+/// Why a text is no URL of a link.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum UrlError {
+    /// There is no scheme.
+    #[error("{0:?} has no transport in front: write quic://HOST or quic://HOST:PORT")]
+    SchemeMissing(String),
+    /// A transport that is to come.
+    #[error("{0}:// is not in this version: quic:// is")]
+    SchemePlanned(String),
+    /// No transport of that name is known.
+    #[error("{0}:// is not known: quic:// is")]
+    SchemeUnknown(String),
+    /// The host is none.
+    #[error("{0:?} is neither a host name nor an IP address (IPv6 is written in brackets)")]
+    Host(String),
+    /// Only addresses can be listened on.
+    #[error("{0:?} is no IP address to listen on: [::] and 0.0.0.0 stand for every interface")]
+    NotAnAddress(String),
+    /// The port is none.
+    #[error("{0:?} is not a port number")]
+    Port(String),
+    /// Something follows.
+    #[error("{0:?} does not belong into the address of a link")]
+    Trailing(String),
+}
+
+fn split(text: &str) -> Result<(Scheme, &str, u16), UrlError> {
+    let short = |s: &str| s.chars().take(80).collect::<String>();
+    let (scheme, rest) = text.split_once("://").ok_or_else(|| UrlError::SchemeMissing(short(text)))?;
+    let scheme = Scheme::parse(scheme)?;
+    let authority = match rest.split_once(['/', '?', '#', '@']) {
+        None => rest,
+        Some((authority, "")) if rest.ends_with('/') => authority,
+        Some((authority, _)) => return Err(UrlError::Trailing(short(&rest[authority.len()..]))),
+    };
+    let (host, port) = match authority.strip_prefix('[') {
+        Some(bracketed) => {
+            let (host, port) = bracketed.split_once(']').ok_or_else(|| UrlError::Host(short(authority)))?;
+            if host.parse::<Ipv6Addr>().is_err() {
+                return Err(UrlError::Host(short(authority)));
+            }
+            match port {
+                "" => (host, None),
+                port => (host, Some(port.strip_prefix(':').ok_or_else(|| UrlError::Trailing(short(port)))?)),
+            }
+        }
+        None => match authority.split_once(':') {
+            None => (authority, None),
+            Some((_, port)) if port.contains(':') => return Err(UrlError::Host(short(authority))),
+            Some((host, port)) => (host, Some(port)),
+        },
+    };
+    let digits = |p: &&str| p.bytes().all(|b| b.is_ascii_digit());
+    let port = match port {
+        None => DEFAULT_PORT,
+        Some(p) => {
+            Some(p).filter(digits).and_then(|p| p.parse().ok()).ok_or_else(|| UrlError::Port(short(p)))?
+        }
+    };
+    Ok((scheme, host, port))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn urls_round_trip() {
+        for (text, shown) in [
+            ("quic://router.lab.example:7000", "quic://router.lab.example:7000"),
+            ("quic://router", "quic://router:7447"),
+            ("quic://10.0.0.1/", "quic://10.0.0.1:7447"),
+            ("quic://[fe80::1]:9", "quic://[fe80::1]:9"),
+            ("quic://[::1]", "quic://[::1]:7447"),
+        ] {
+            let url: LinkUrl = text.parse().unwrap();
+            assert_eq!(url.to_string(), shown);
+            assert_eq!(shown.parse(), Ok(url));
+        }
+        for (text, shown) in [
+            ("quic://[::]:0", "quic://[::]:0"),
+            ("quic://0.0.0.0", "quic://0.0.0.0:7447"),
+            ("quic://*", "quic://[::]:7447"),
+        ] {
+            assert_eq!(text.parse::<ListenAddr>().unwrap().to_string(), shown);
+        }
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let refused = |text: &str| text.parse::<LinkUrl>().unwrap_err();
+        assert!(matches!(refused("router:7447"), UrlError::SchemeMissing(_)));
+        for scheme in ["dtls", "tls", "tcp", "udp", "ws", "wss"] {
+            let error = refused(&format!("{scheme}://router"));
+            assert_eq!(error, UrlError::SchemePlanned(scheme.into()));
+            assert!(error.to_string().contains("not in this version"));
+        }
+        assert!(matches!(refused("http://router"), UrlError::SchemeUnknown(_)));
+        for text in
+            ["quic://", "quic://a b", "quic://fe80::1", "quic://[fe80::1", "quic://[router]", "quic://:1"]
+        {
+            assert!(matches!(refused(text), UrlError::Host(_)), "{text}: {:?}", refused(text));
+        }
+        for text in ["quic://a:", "quic://a:0", "quic://a:65536", "quic://a:x", "quic://a:+1"] {
+            assert!(matches!(refused(text), UrlError::Port(_)), "{text}");
+        }
+        for text in ["quic://a/path", "quic://user@a", "quic://[::1]x"] {
+            assert!(matches!(refused(text), UrlError::Trailing(_)), "{text}");
+        }
+        assert!(matches!("quic://router".parse::<ListenAddr>(), Err(UrlError::NotAnAddress(_))));
+    }
+}

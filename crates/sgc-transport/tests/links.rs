@@ -1,0 +1,752 @@
+//! What links do for their users, over loopback; misbehaving peers are played by bare quinn.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
+use std::future::Future;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use bytes::{Bytes, BytesMut};
+use quinn::crypto::rustls::QuicClientConfig;
+use quinn::{Connection, ConnectionError, Endpoint, VarInt};
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
+use sgc_transport::*;
+use sgc_trust::{CertError, EnrollRequest, Fleet, Identity};
+use sgc_wire::{
+    Class, DecodeError, Encode, HOP_LIMIT, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis,
+};
+use tokio::sync::mpsc;
+
+const MINUTE: u64 = 60_000;
+
+fn now() -> UnixMillis {
+    UnixMillis(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64)
+}
+
+fn fleet(seed: u64) -> Fleet {
+    let created = UnixMillis(now().0 - 100 * 24 * 60 * MINUTE);
+    Fleet::create("acme".parse().unwrap(), created, &mut ChaCha20Rng::seed_from_u64(seed)).unwrap()
+}
+
+fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
+    enroll_at(fleet, node, now())
+}
+
+fn enroll_at(fleet: &Fleet, node: &str, now: UnixMillis) -> Arc<Identity> {
+    let valid = Duration::from_secs(3600);
+    let request = EnrollRequest { valid, ..EnrollRequest::new(node.parse().unwrap(), now) };
+    Arc::new(fleet.enroll(&request, &mut ChaCha20Rng::seed_from_u64(node.len() as u64)).unwrap())
+}
+
+/// Whatever hangs fails.
+async fn soon<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(Duration::from_secs(30), future).await.expect("it hangs")
+}
+
+/// A listener whose results come by a channel.
+struct Server {
+    url: LinkUrl,
+    addr: SocketAddr,
+    metrics: Arc<TransportMetrics>,
+    results: mpsc::Receiver<Result<AnyLink, RefusedPeer>>,
+}
+
+impl Server {
+    fn start(identity: Arc<Identity>, options: LinkOptions) -> Self {
+        Self::start_at("quic://127.0.0.1:0", identity, options)
+    }
+
+    fn start_at(addr: &str, identity: Arc<Identity>, options: LinkOptions) -> Self {
+        let metrics = Arc::new(TransportMetrics::default());
+        let mut listener =
+            Listener::bind(&addr.parse().unwrap(), identity, options, Arc::clone(&metrics)).unwrap();
+        let url = listener.local().to_string().parse().unwrap();
+        let addr = listener.local().addr;
+        let (tx, results) = mpsc::channel(16);
+        tokio::spawn(async move {
+            while let Some(result) = listener.accept().await {
+                if tx.send(result).await.is_err() {
+                    break;
+                }
+            }
+        });
+        Self { url, addr, metrics, results }
+    }
+
+    async fn link(&mut self) -> AnyLink {
+        soon(self.results.recv()).await.unwrap().unwrap()
+    }
+
+    async fn refusal(&mut self) -> RefusedPeer {
+        soon(self.results.recv()).await.unwrap().unwrap_err()
+    }
+}
+
+fn dialer(identity: Arc<Identity>) -> Dialer {
+    Dialer::new(identity, LinkOptions::default(), Arc::new(TransportMetrics::default()))
+}
+
+async fn dial(identity: Arc<Identity>, url: &LinkUrl) -> Result<AnyLink, LinkError> {
+    match soon(dialer(identity).dial(url)).await {
+        Ok(link) => Ok(link),
+        Err(DialError::Failed { mut attempts, .. }) => Err(attempts.pop().unwrap().1),
+        Err(other) => panic!("{other}"),
+    }
+}
+
+/// A dialled link and its other end.
+async fn pair(options: LinkOptions) -> (AnyLink, AnyLink) {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), options.clone());
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
+    let near = soon(dialer.dial(&server.url)).await.unwrap();
+    (near, server.link().await)
+}
+
+fn packet(seq: u64, payload: Bytes) -> Packet {
+    let header = PacketHeader {
+        reliable: true,
+        class: Class::Default,
+        hops: HOP_LIMIT,
+        suite: 1,
+        epoch: 1,
+        name: Name([1; 32]),
+        source: SourceId([2; 16]),
+        seq,
+        total: payload.len() as u32,
+        index: 0,
+        grid: 16_384,
+        to: None,
+    };
+    Packet::new(header, payload.into()).unwrap()
+}
+
+fn joined(payload: &Payload) -> Bytes {
+    let mut out = BytesMut::new();
+    payload.copy_into(&mut out);
+    out.freeze()
+}
+
+// Who gets a link.
+
+#[tokio::test]
+async fn both_ends_know_each_other() {
+    let fleet = fleet(1);
+    let (router, arm) = (enroll(&fleet, "router"), enroll(&fleet, "arm-1"));
+    let mut server = Server::start(Arc::clone(&router), LinkOptions::default());
+    let metrics = Arc::new(TransportMetrics::default());
+    let dialer = Dialer::new(Arc::clone(&arm), LinkOptions::default(), Arc::clone(&metrics));
+    let near = soon(dialer.dial(&server.url)).await.unwrap();
+    let far = server.link().await;
+    assert_eq!(near.peer().node_id, router.node_id());
+    assert_eq!(far.peer().node_id, arm.node_id());
+    assert_eq!(near.remote(), server.addr);
+    assert!(near.is_dialer() && !far.is_dialer());
+    assert!(near.stats().mtu_bytes >= 1200 && far.stats().received_bytes > 0);
+    assert_eq!((metrics.dialed(), server.metrics.accepted()), (1, 1));
+    assert_eq!(server.metrics.handshakes_pending(), 0);
+    assert!(RefusalKind::ALL.into_iter().all(|k| server.metrics.refused(k) == 0));
+}
+
+#[tokio::test]
+async fn a_listener_on_every_interface_takes_both_families() {
+    let fleet = fleet(1);
+    let mut server = Server::start_at("quic://[::]:0", enroll(&fleet, "router"), LinkOptions::default());
+    let dialer = dialer(enroll(&fleet, "arm-1"));
+    for host in ["127.0.0.1", "[::1]"] {
+        let url = format!("quic://{host}:{}", server.addr.port()).parse().unwrap();
+        let _near = soon(dialer.dial(&url)).await.unwrap();
+        let far = server.link().await;
+        assert_eq!(far.remote().is_ipv4(), host.contains('.'), "{:?}", far.remote());
+    }
+}
+
+#[tokio::test]
+async fn every_address_of_a_host_is_tried() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    // Where localhost is ::1 as well, nothing answers there.
+    let url = format!("quic://localhost:{}", server.addr.port()).parse().unwrap();
+    let _near = soon(dialer(enroll(&fleet, "arm-1")).dial(&url)).await.unwrap();
+    server.link().await;
+}
+
+#[tokio::test]
+async fn a_dialer_of_another_fleet_is_refused() {
+    let ours = fleet(1);
+    let theirs = fleet(2);
+    let mut server = Server::start(enroll(&ours, "router"), LinkOptions::default());
+    let error = dial(enroll(&theirs, "arm-1"), &server.url).await.unwrap_err();
+    assert!(matches!(error, LinkError::RefusedHere(CertError::UnknownIssuer)), "{error}");
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::OtherCa)), "{refused}");
+    assert_eq!(server.metrics.refused(RefusalKind::OtherCa), 1);
+    assert_eq!(server.metrics.accepted(), 0);
+}
+
+#[tokio::test]
+async fn a_dialer_of_another_fleet_that_trusts_ours_is_refused() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    let mut server = Server::start(enroll(&ours, "router"), LinkOptions::default());
+    let text = enroll(&ours, "x").to_text();
+    let start = text.find("-----BEGIN SGC CA CERTIFICATE-----").unwrap();
+    let end = "-----END SGC CA CERTIFICATE-----\n";
+    let ca = &text[start..text.find(end).unwrap() + end.len()];
+    let both = format!("{}{ca}", enroll(&theirs, "arm-1").to_text().as_str());
+    let error = dial(Arc::new(Identity::parse(&both).unwrap()), &server.url).await.unwrap_err();
+    assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::OtherCa)), "{error}");
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::UnknownIssuer)), "{refused}");
+    assert!(refused.to_string().contains("127.0.0.1"), "{refused}");
+    assert_eq!(server.metrics.refused(RefusalKind::OtherCa), 1);
+}
+
+#[tokio::test]
+async fn expired_and_early_certificates_are_refused() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    let past = enroll_at(&fleet, "arm-1", UnixMillis(now().0 - 120 * MINUTE));
+    let error = dial(past, &server.url).await.unwrap_err();
+    assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Expired)), "{error}");
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::Expired { .. })), "{refused}");
+    let future = enroll_at(&fleet, "arm-1", UnixMillis(now().0 + 120 * MINUTE));
+    dial(future, &server.url).await.unwrap_err();
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::NotYetValid { .. })), "{refused}");
+    let kinds = [RefusalKind::Expired, RefusalKind::NotYetValid];
+    assert_eq!(kinds.map(|k| server.metrics.refused(k)), [1, 1]);
+}
+
+#[tokio::test]
+async fn a_listener_with_an_expired_certificate_gets_no_link() {
+    let fleet = fleet(1);
+    let past = enroll_at(&fleet, "router", UnixMillis(now().0 - 120 * MINUTE));
+    let mut server = Server::start(past, LinkOptions::default());
+    let error = dial(enroll(&fleet, "arm-1"), &server.url).await.unwrap_err();
+    assert!(matches!(error, LinkError::RefusedHere(CertError::Expired { .. })), "{error}");
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::Expired)), "{refused}");
+}
+
+#[tokio::test]
+async fn nobody_at_the_address_is_said() {
+    let unused = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let url = format!("quic://{}", unused.local_addr().unwrap()).parse().unwrap();
+    let options = LinkOptions { handshake_timeout: Duration::from_millis(200), ..LinkOptions::default() };
+    let dialer = Dialer::new(enroll(&fleet(1), "arm-1"), options, Arc::default());
+    let error = soon(dialer.dial(&url)).await.unwrap_err();
+    let DialError::Failed { attempts, .. } = &error else { panic!("{error}") };
+    assert!(matches!(attempts[..], [(_, LinkError::HandshakeTimedOut { .. })]), "{error}");
+    assert!(error.to_string().contains("UDP"), "{error}");
+    let url: LinkUrl = "quic://no-such-host.invalid".parse().unwrap();
+    assert!(matches!(soon(dialer.dial(&url)).await, Err(DialError::Resolve { .. })));
+}
+
+// Bare peers.
+
+#[derive(Debug)]
+struct TrustAnyone;
+
+impl ServerCertVerifier for TrustAnyone {
+    fn verify_server_cert(
+        &self,
+        _: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: UnixTime,
+    ) -> Result<ServerCertVerified, rustls::Error> {
+        Ok(ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &rustls::DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &rustls::DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, rustls::Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
+        vec![rustls::SignatureScheme::ECDSA_NISTP256_SHA256]
+    }
+}
+
+/// A bare QUIC connection, as yet without greeting.
+async fn bare(
+    addr: SocketAddr,
+    identity: Option<&Identity>,
+    alpn: &str,
+) -> Result<Connection, ConnectionError> {
+    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+    let tls = rustls::ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(TrustAnyone));
+    let mut tls = match identity {
+        None => tls.with_no_client_auth(),
+        Some(i) => {
+            tls.with_client_cert_resolver(Arc::new(rustls::sign::SingleCertAndKey::from(i.certified_key())))
+        }
+    };
+    tls.alpn_protocols = vec![alpn.into()];
+    let config = quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()));
+    let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
+    soon(endpoint.connect_with(config, addr, "x.invalid").unwrap()).await
+}
+
+fn frame(body: &[u8]) -> Vec<u8> {
+    [&(body.len() as u32).to_be_bytes(), body].concat()
+}
+
+const GREETING: [u8; 6] = [0, 1, 0, 0, 0, 0];
+
+/// A bare connection that has greeted, with its control stream, and the link at the listener.
+async fn greeted(server: &mut Server, identity: &Identity) -> (Connection, quinn::SendStream, AnyLink) {
+    let connection = bare(server.addr, Some(identity), "sgc/1").await.unwrap();
+    let (mut tx, mut rx) = soon(connection.open_bi()).await.unwrap();
+    tx.write_all(&frame(&GREETING)).await.unwrap();
+    let mut answer = [0; 10];
+    soon(rx.read_exact(&mut answer)).await.unwrap();
+    assert_eq!(answer[..], frame(&GREETING));
+    (connection, tx, server.link().await)
+}
+
+#[tokio::test]
+async fn a_dialer_without_a_certificate_is_refused() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    if let Ok(connection) = bare(server.addr, None, "sgc/1").await {
+        soon(connection.closed()).await;
+    }
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::NoCertificate)), "{refused}");
+    assert_eq!(server.metrics.refused(RefusalKind::NoCertificate), 1);
+}
+
+#[tokio::test]
+async fn other_versions_are_refused() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    bare(server.addr, Some(&arm), "sgc/2").await.unwrap_err();
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Version(_)), "{refused}");
+    let greet = async |greeting: &[u8]| {
+        let connection = bare(server.addr, Some(&arm), "sgc/1").await.unwrap();
+        let (mut tx, _rx) = connection.open_bi().await.unwrap();
+        tx.write_all(greeting).await.unwrap();
+        soon(connection.closed()).await
+    };
+    let ConnectionError::ApplicationClosed(closed) = greet(&frame(&[0, 2])).await else { panic!() };
+    assert_eq!(closed.error_code, VarInt::from_u32(2));
+    assert!(String::from_utf8_lossy(&closed.reason).contains("version 2"), "{closed}");
+    greet(&frame(b"GET / HTTP/1.1")).await;
+    greet(&[0xff; 8]).await;
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Version(_)), "{refused}");
+    let refused = server.refusal().await;
+    // "GE" is a version, too.
+    assert!(matches!(refused.reason, Refusal::Version(_)), "{refused}");
+    let refused = server.refusal().await;
+    let Refusal::Greeting(ProtocolError::ControlFrameTooLong { bytes }) = refused.reason else { panic!() };
+    assert_eq!(bytes, u64::from(u32::MAX));
+    assert_eq!(server.metrics.refused(RefusalKind::Version), 3);
+    assert_eq!(server.metrics.refused(RefusalKind::BadGreeting), 1);
+}
+
+#[tokio::test]
+async fn a_handshake_that_never_ends_holds_up_no_one() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let after = Duration::from_millis(1500);
+    let options = LinkOptions { handshake_timeout: after, ..LinkOptions::default() };
+    let mut server = Server::start(enroll(&fleet, "router"), options);
+    let started = Instant::now();
+    let mut silent = Vec::new();
+    for _ in 0..10 {
+        silent.push(bare(server.addr, Some(&arm), "sgc/1").await.unwrap());
+    }
+    assert_eq!(server.metrics.handshakes_pending(), 10);
+    let _near = dial(Arc::clone(&arm), &server.url).await.unwrap();
+    server.link().await;
+    assert!(started.elapsed() < after, "the others were waited for");
+    for _ in 0..10 {
+        let refused = server.refusal().await;
+        assert!(matches!(refused.reason, Refusal::TimedOut { .. }), "{refused}");
+    }
+    assert_eq!(server.metrics.refused(RefusalKind::TimedOut), 10);
+    assert_eq!(server.metrics.handshakes_pending(), 0);
+}
+
+#[tokio::test]
+async fn too_many_handshakes_are_refused_and_reported_once() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let options = LinkOptions { handshakes_max: 2, handshakes_unvalidated_max: 1, ..LinkOptions::default() };
+    let mut server = Server::start(enroll(&fleet, "router"), options);
+    let first = bare(server.addr, Some(&arm), "sgc/1").await.unwrap();
+    // This one has to prove its address first.
+    let second = bare(server.addr, Some(&arm), "sgc/1").await.unwrap();
+    for _ in 0..3 {
+        let error = dial(Arc::clone(&arm), &server.url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Overloaded)), "{error}");
+    }
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::TooMany { pending: 2, unreported: 0 }), "{refused}");
+    assert_eq!(server.metrics.refused(RefusalKind::TooMany), 3);
+    drop((first, second));
+    for _ in 0..2 {
+        let refused = server.refusal().await;
+        assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::GaveUp)), "{refused}");
+    }
+    let _near = dial(arm, &server.url).await.unwrap();
+    server.link().await;
+}
+
+// Control.
+
+#[tokio::test]
+async fn control_frames_go_both_ways_in_order() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let frames = [
+        Bytes::new(),
+        Bytes::from_static(b"hello"),
+        Bytes::from(vec![7; CONTROL_FRAME_BYTES_MAX]),
+        Bytes::from_static(b"end"),
+    ];
+    for (from, to) in [(&near, &far), (&far, &near)] {
+        let send = async {
+            for frame in &frames {
+                from.send_control(frame.clone()).await.unwrap();
+            }
+        };
+        let receive = async {
+            for frame in &frames {
+                assert_eq!(to.recv_control().await.unwrap(), frame);
+            }
+        };
+        soon(async { tokio::join!(send, receive) }).await;
+    }
+    let too_long = near.send_control(Bytes::from(vec![0; CONTROL_FRAME_BYTES_MAX + 1])).await.unwrap_err();
+    assert!(matches!(too_long, LinkError::FrameTooLong { .. }) && too_long.is_link_alive());
+    near.send_control(Bytes::from_static(b"still here")).await.unwrap();
+    assert_eq!(soon(far.recv_control()).await.unwrap(), "still here");
+}
+
+#[tokio::test]
+async fn an_oversized_control_frame_ends_the_link_and_says_so() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    let (connection, mut tx, link) = greeted(&mut server, &enroll(&fleet, "arm-1")).await;
+    tx.write_all(&(CONTROL_FRAME_BYTES_MAX as u32 + 1).to_be_bytes()).await.unwrap();
+    let expected = ProtocolError::ControlFrameTooLong { bytes: CONTROL_FRAME_BYTES_MAX as u64 + 1 };
+    for error in [soon(link.recv_control()).await.unwrap_err(), soon(link.closed()).await] {
+        assert!(matches!(error, LinkError::Protocol(e) if e == expected));
+    }
+    let ConnectionError::ApplicationClosed(closed) = soon(connection.closed()).await else { panic!() };
+    assert!(String::from_utf8_lossy(&closed.reason).contains("1048577"), "{closed}");
+}
+
+#[tokio::test]
+async fn a_control_stream_that_ends_ends_the_link() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    let (connection, mut tx, link) = greeted(&mut server, &enroll(&fleet, "arm-1")).await;
+    tx.finish().unwrap();
+    let error = soon(link.recv_control()).await.unwrap_err();
+    assert!(matches!(error, LinkError::Protocol(ProtocolError::ControlEnded)), "{error}");
+    soon(connection.closed()).await;
+}
+
+// Flows.
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn thirteen_megabytes_arrive_intact_and_in_order() {
+    const GRID: usize = 16 * 1024;
+    let (near, far) = pair(LinkOptions::default()).await;
+    let image: Bytes = (0..13_000_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let sent = image.clone();
+    let send = tokio::spawn(async move {
+        let mut flow = near.open_flow(Class::Bulk).await.unwrap();
+        for (seq, start) in (0..sent.len()).step_by(GRID).enumerate() {
+            let piece = sent.slice(start..sent.len().min(start + GRID));
+            flow.send(&packet(seq as u64, piece)).await.unwrap();
+        }
+        flow.finish().await.unwrap();
+        near
+    });
+    let mut flow = soon(far.accept_flow()).await.unwrap();
+    let (mut at, mut seq) = (0, 0);
+    while let Some(got) = soon(flow.recv()).await.unwrap() {
+        assert_eq!(got.header.seq, seq);
+        for piece in &got.payload.0 {
+            assert_eq!(image[at..at + piece.len()], piece[..]);
+            at += piece.len();
+        }
+        seq += 1;
+    }
+    assert_eq!(at, image.len());
+    assert!(soon(flow.recv()).await.unwrap().is_none());
+    send.await.unwrap();
+}
+
+#[tokio::test]
+async fn flows_do_not_wait_for_each_other() {
+    let options = LinkOptions { flow_window_bytes: 64 << 10, ..LinkOptions::default() };
+    let (near, far) = pair(options).await;
+    let mut stuck = near.open_flow(Class::Bulk).await.unwrap();
+    let full = packet(1, Bytes::from(vec![0; 16 << 10]));
+    // Fills the window of a flow that no one reads.
+    while tokio::time::timeout(Duration::from_millis(100), stuck.send(&full)).await.is_ok() {}
+    let mut free = near.open_flow(Class::Realtime).await.unwrap();
+    free.send(&packet(7, Bytes::from_static(b"go"))).await.unwrap();
+    let mut first = soon(far.accept_flow()).await.unwrap();
+    let mut second = soon(far.accept_flow()).await.unwrap();
+    assert_eq!(soon(second.recv()).await.unwrap().unwrap().header.seq, 7);
+    // The send that was given up left the flow whole: what it had begun comes first.
+    let last = packet(2, Bytes::from_static(b"last"));
+    let finish = async {
+        stuck.send(&last).await.unwrap();
+        stuck.finish().await.unwrap();
+    };
+    let drain = async {
+        let mut count = 0;
+        while let Some(got) = first.recv().await.unwrap() {
+            assert_eq!(joined(&got.payload).len(), got.header.total as usize);
+            count += 1;
+            if got.header.seq == 2 {
+                assert_eq!(joined(&got.payload), "last");
+            }
+        }
+        count
+    };
+    let ((), count) = soon(async { tokio::join!(finish, drain) }).await;
+    assert!(count >= 2, "{count}");
+}
+
+#[tokio::test]
+async fn a_flow_given_up_inside_of_a_packet_does_not_pass_for_finished() {
+    let options = LinkOptions { flow_window_bytes: 40 << 10, ..LinkOptions::default() };
+    let (near, far) = pair(options).await;
+    let mut tx = near.open_flow(Class::Bulk).await.unwrap();
+    let full = packet(1, Bytes::from(vec![0; 16 << 10]));
+    tx.send(&full).await.unwrap();
+    tx.send(&full).await.unwrap();
+    // The window holds two and a half, and no one reads: the third cannot end.
+    let third = tokio::time::timeout(Duration::from_millis(200), tx.send(&full)).await;
+    assert!(third.is_err());
+    drop(tx);
+    let mut rx = soon(far.accept_flow()).await.unwrap();
+    let error = loop {
+        match soon(rx.recv()).await {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("half a packet passed for the end"),
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(error, FlowError::Ended(FlowEnd::Unwanted)), "{error}");
+}
+
+#[tokio::test]
+async fn malformed_flows_end_alone() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    let (connection, mut control, link) = greeted(&mut server, &enroll(&fleet, "arm-1")).await;
+    let good = packet(1, Bytes::from_static(b"x"));
+    let mut header = good.header.to_vec();
+    header[0] = 0xf0;
+    let oversized = (FLOW_PACKET_BYTES_MAX as u32 + 1).to_be_bytes();
+    let cases: [(Vec<u8>, u32); 4] = [
+        (vec![9], 2),
+        ([&[1][..], &oversized].concat(), 1),
+        ([&[1][..], &frame(&header)].concat(), 2),
+        ([&[1][..], &frame(&[0x10])].concat(), 1),
+    ];
+    for (index, (bytes, code)) in cases.into_iter().enumerate() {
+        let mut tx = connection.open_uni().await.unwrap();
+        tx.write_all(&bytes).await.unwrap();
+        let mut flow = soon(link.accept_flow()).await.unwrap();
+        let error = soon(flow.recv()).await.unwrap_err();
+        match index {
+            0 => assert!(matches!(error, FlowError::Version { found: 9 })),
+            1 => assert!(matches!(error, FlowError::PacketTooLong { .. })),
+            2 => assert!(matches!(error, FlowError::Packet(DecodeError::Version { found: 0xf0, .. }))),
+            _ => assert!(matches!(error, FlowError::Packet(DecodeError::Truncated { .. }))),
+        }
+        assert!(soon(flow.recv()).await.unwrap().is_none());
+        assert_eq!(soon(tx.stopped()).await.unwrap(), Some(VarInt::from_u32(code)));
+    }
+    let mut cut = connection.open_uni().await.unwrap();
+    cut.write_all(&[1, 0, 0, 0, 99, 1]).await.unwrap();
+    cut.finish().unwrap();
+    let mut flow = soon(link.accept_flow()).await.unwrap();
+    assert!(matches!(soon(flow.recv()).await, Err(FlowError::Truncated)));
+    control.write_all(&frame(b"alive")).await.unwrap();
+    assert_eq!(soon(link.recv_control()).await.unwrap(), "alive");
+}
+
+#[tokio::test]
+async fn either_end_can_end_a_flow() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let one = packet(1, Bytes::from_static(b"x"));
+    let mut tx = near.open_flow(Class::Default).await.unwrap();
+    tx.send(&one).await.unwrap();
+    let mut rx = soon(far.accept_flow()).await.unwrap();
+    soon(rx.recv()).await.unwrap().unwrap();
+    tx.reset(FlowEnd::Stale);
+    assert!(matches!(soon(rx.recv()).await, Err(FlowError::Ended(FlowEnd::Stale))));
+
+    let mut tx = near.open_flow(Class::Default).await.unwrap();
+    tx.send(&one).await.unwrap();
+    soon(far.accept_flow()).await.unwrap().stop(FlowEnd::Unwanted);
+    let error = loop {
+        if let Err(error) = soon(tx.send(&one)).await {
+            break error;
+        }
+        tokio::task::yield_now().await;
+    };
+    assert!(matches!(error, LinkError::FlowStopped(FlowEnd::Unwanted)), "{error}");
+    assert!(error.is_link_alive());
+}
+
+// Datagrams.
+
+#[tokio::test]
+async fn datagrams_carry_small_packets() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let small = packet(5, Bytes::from(vec![3; 700]));
+    near.send_datagram(&small).await.unwrap();
+    let got = soon(far.recv_datagram()).await.unwrap().unwrap();
+    assert_eq!((got.header, joined(&got.payload)), (small.header, joined(&small.payload)));
+    let max = near.datagram_max().unwrap();
+    let big = packet(6, Bytes::from(vec![0; max]));
+    let error = near.send_datagram(&big).await.unwrap_err();
+    assert!(matches!(error, LinkError::DatagramTooLong { bytes, .. } if bytes == big.encoded_bytes()));
+    assert!(error.is_link_alive());
+}
+
+#[tokio::test]
+async fn a_malformed_datagram_is_dropped_alone() {
+    let fleet = fleet(1);
+    let mut server = Server::start(enroll(&fleet, "router"), LinkOptions::default());
+    let (connection, _control, link) = greeted(&mut server, &enroll(&fleet, "arm-1")).await;
+    let mut bytes = packet(1, Bytes::new()).header.to_vec();
+    for (first, cut) in [(0x20, 0), (0x10, 5)] {
+        bytes[0] = first;
+        connection.send_datagram(Bytes::copy_from_slice(&bytes[..bytes.len() - cut])).unwrap();
+    }
+    connection.send_datagram(Bytes::copy_from_slice(&bytes)).unwrap();
+    let mut results = Vec::new();
+    for _ in 0..3 {
+        results.push(soon(link.recv_datagram()).await.unwrap());
+    }
+    assert!(matches!(results[0], Err(DecodeError::Version { found: 0x20, .. })));
+    assert!(matches!(results[1], Err(DecodeError::Truncated { .. })));
+    assert!(results[2].is_ok());
+}
+
+// Ends.
+
+#[tokio::test]
+async fn the_peer_learns_why_a_link_is_closed() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let waiting = {
+        let far = far.clone();
+        tokio::spawn(async move { far.recv_control().await.unwrap_err() })
+    };
+    let reason = CloseReason::Denied("not in this fleet's roster".into());
+    near.close(reason.clone());
+    for error in [soon(far.closed()).await, soon(waiting).await.unwrap()] {
+        assert!(matches!(error, LinkError::Closed { by_peer: true, reason: r } if r == reason));
+    }
+    let here = soon(near.closed()).await;
+    assert!(matches!(here, LinkError::Closed { by_peer: false, reason: r } if r == reason));
+    assert!(soon(far.open_flow(Class::Bulk)).await.is_err());
+}
+
+#[tokio::test]
+async fn a_link_without_users_closes() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    drop(near);
+    let error = soon(far.closed()).await;
+    assert!(matches!(error, LinkError::Closed { by_peer: true, reason: CloseReason::Goodbye }), "{error}");
+}
+
+#[tokio::test]
+async fn closing_a_listener_or_dialer_says_goodbye_on_its_links() {
+    let fleet = fleet(1);
+    let metrics = Arc::new(TransportMetrics::default());
+    let addr = "quic://127.0.0.1:0".parse().unwrap();
+    let router = enroll(&fleet, "router");
+    let mut listener = Listener::bind(&addr, router, LinkOptions::default(), metrics).unwrap();
+    let url = listener.local().to_string().parse().unwrap();
+    let dialer = dialer(enroll(&fleet, "arm-1"));
+    let (near, far) = soon(async { tokio::join!(dialer.dial(&url), listener.accept()) }).await;
+    let (near, far) = (near.unwrap(), far.unwrap().unwrap());
+    soon(dialer.close(CloseReason::Goodbye)).await;
+    let error = soon(far.closed()).await;
+    assert!(matches!(error, LinkError::Closed { by_peer: true, reason: CloseReason::Goodbye }), "{error}");
+    drop((near, far));
+    let (near, far) = soon(async { tokio::join!(dialer.dial(&url), listener.accept()) }).await;
+    let (near, _far) = (near.unwrap(), far.unwrap().unwrap());
+    soon(listener.close(CloseReason::Overloaded)).await;
+    let error = soon(near.closed()).await;
+    assert!(matches!(error, LinkError::Closed { by_peer: true, reason: CloseReason::Overloaded }), "{error}");
+}
+
+#[tokio::test]
+async fn a_dead_peer_is_noticed_and_a_restarted_one_at_once() {
+    let fleet = fleet(1);
+    let router = enroll(&fleet, "router");
+    let options = LinkOptions {
+        keep_alive: Duration::from_millis(100),
+        idle_timeout: Duration::from_secs(20),
+        ..LinkOptions::default()
+    };
+    let listen = |runtime: &tokio::runtime::Runtime, addr: &str| {
+        let _inside = runtime.enter();
+        Server::start_at(addr, Arc::clone(&router), options.clone())
+    };
+    let runtime =
+        || tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+    let first = runtime();
+    let server = listen(&first, "quic://127.0.0.1:0");
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options.clone(), Arc::default());
+    let link = soon(dialer.dial(&server.url)).await.unwrap();
+    // Ends all its tasks between two polls, as a kill would: no one says goodbye.
+    let killed = tokio::task::spawn_blocking(move || first.shutdown_timeout(Duration::from_secs(5)));
+    soon(killed).await.unwrap();
+    let url = server.url.to_string();
+    drop(server); // and with it the last hold on the socket
+    let second = runtime();
+    let _restarted = listen(&second, &url);
+    let error = soon(link.closed()).await;
+    assert!(matches!(error, LinkError::PeerRestarted), "{error}");
+    second.shutdown_background();
+
+    let quick = LinkOptions { idle_timeout: Duration::from_millis(500), ..options.clone() };
+    let third = runtime();
+    let server = listen(&third, "quic://127.0.0.1:0");
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), quick, Arc::default());
+    let link = soon(dialer.dial(&server.url)).await.unwrap();
+    let killed = tokio::task::spawn_blocking(move || third.shutdown_timeout(Duration::from_secs(5)));
+    soon(killed).await.unwrap();
+    let error = soon(link.closed()).await;
+    assert!(matches!(error, LinkError::TimedOut { .. }), "{error}");
+}
