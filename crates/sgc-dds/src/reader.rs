@@ -18,7 +18,9 @@ use sgc_wire::History;
 use crate::entity::{Entity, check};
 use crate::network::Participant;
 use crate::payload::HEADER_BYTES;
+use crate::qos;
 use crate::serdata::Serdata;
+use crate::user_data;
 use crate::wait::{Stop, WaitSet, join};
 
 /// Most samples taken at once. A reader of smaller depth takes no more than its depth, so that a handler
@@ -65,7 +67,7 @@ impl CycloneReader {
             _group: group,
             _topic: topic,
             stop: Arc::clone(&stop),
-            _participant: Arc::clone(participant),
+            participant: Arc::clone(participant),
             batch,
             writers: HashMap::new(),
             handler,
@@ -92,6 +94,14 @@ impl Drop for CycloneReader {
     }
 }
 
+/// Who wrote a sample.
+#[derive(Clone, Copy)]
+struct KnownWriter {
+    guid: Guid,
+    /// True if it carries a tag: an SGC proxy made it, this one's or another's.
+    tagged: bool,
+}
+
 /// What the thread owns. Fields drop in this order: children first.
 struct Service {
     wait_set: WaitSet,
@@ -100,9 +110,9 @@ struct Service {
     _group: Option<Entity>,
     _topic: Entity,
     stop: Arc<Stop>,
-    _participant: Arc<Participant>,
+    participant: Arc<Participant>,
     batch: usize,
-    writers: HashMap<dds_instance_handle_t, Guid>,
+    writers: HashMap<dds_instance_handle_t, KnownWriter>,
     handler: SampleHandler,
 }
 
@@ -156,35 +166,48 @@ impl Service {
         if !info.valid_data {
             return;
         }
+        let writer = self.writer(info.publication_handle);
+        // DDS matches readers with writers of other proxies on this network too. What those wrote came through
+        // SGC already: sharing it again would send it round and round.
+        if writer.is_some_and(|w| w.tagged) && self.participant.ignores_tagged() {
+            return;
+        }
         let payload = sample.into_payload();
         if payload.len() < HEADER_BYTES {
             tracing::debug!(bytes = payload.len(), "a sample without encapsulation header is dropped");
             return;
         }
-        let writer = self.writer(info.publication_handle);
         (self.handler)(Sample {
             kind: SampleKind::Write,
-            writer,
+            writer: writer.map(|w| w.guid),
             source_timestamp_ns: info.source_timestamp,
             payload,
         });
     }
 
-    /// The GUID of a writer; `None` if it is gone already and was never asked for.
-    fn writer(&mut self, handle: dds_instance_handle_t) -> Option<Guid> {
-        if let Some(guid) = self.writers.get(&handle) {
-            return Some(*guid);
+    /// Who a writer is; `None` if it is gone already and was never asked for.
+    fn writer(&mut self, handle: dds_instance_handle_t) -> Option<KnownWriter> {
+        if let Some(writer) = self.writers.get(&handle) {
+            return Some(*writer);
         }
         // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
         let data = unsafe { dds_get_matched_publication_data(self.reader.handle(), handle) };
         // SAFETY: null or valid, see above.
-        let guid = Guid(unsafe { data.as_ref() }?.key.v);
+        let endpoint = unsafe { data.as_ref() }?;
+        let guid = Guid(endpoint.key.v);
+        let tagged = if endpoint.qos.is_null() {
+            false
+        } else {
+            // SAFETY: not null, and valid as long as the endpoint is.
+            user_data::is_tagged(&unsafe { qos::user_data(endpoint.qos) })
+        };
         // SAFETY: not null, not used any more, freed once.
         unsafe { dds_builtintopic_free_endpoint(data) };
         if self.writers.len() >= WRITERS_MAX {
             self.writers.clear();
         }
-        self.writers.insert(handle, guid);
-        Some(guid)
+        let writer = KnownWriter { guid, tagged };
+        self.writers.insert(handle, writer);
+        Some(writer)
     }
 }

@@ -261,6 +261,19 @@ fn a_network_does_not_hear_itself() {
     assert_eq!(writer.matched_readers(), 1, "its own reader is no match");
 }
 
+/// The proof against loops: DDS matches the two, SGC must not pass on what the other wrote.
+#[test]
+fn what_another_sgc_node_wrote_is_not_read_again() {
+    let (first, second, ros) = (open(94, Some("a")), open(94, Some("b")), open(94, None));
+    let (_reader, samples) = read(&first, &spec("loop"));
+    let other = writer(&second, &spec("loop"), 1);
+    let plain = writer(&ros, &spec("loop"), 1);
+    write(&other, &string_cdr("from sgc"));
+    write(&plain, &string_cdr("from ros"));
+    assert_eq!(next(&samples).payload, padded(&string_cdr("from ros")));
+    quiet(&samples);
+}
+
 #[test]
 fn domains_are_apart_even_in_one_process() {
     let (here, there) = (open(75, None), open(76, None));

@@ -700,7 +700,11 @@ impl Endpoint {
                 if was_granted {
                     self.lost(name, LostReason::Refused(reason));
                 }
-                return self.refused(name, by);
+                // That a share has ended is no refusal: it is what the owner wanted.
+                if !(was_granted && reason == RefuseReason::NotShared) {
+                    self.refused(name, by);
+                }
+                return;
             }
         };
         match reply_key.open(&name, &sink, serial, &enc, &sealed) {

@@ -1,7 +1,7 @@
 //! The seam between SGC and a local ROS 2 network: discovery in, raw samples in and out.
 //!
 //! Nothing here knows a DDS implementation; `sgc-dds` implements [`RosNetwork`] with Cyclone DDS,
-//! [`crate::fake`] in memory for tests. Payloads are serialised samples: the four-byte encapsulation
+//! `sgc-testkit` in memory for tests. Payloads are serialised samples: the four-byte encapsulation
 //! header (RTPS 2.5, 10.2) and the body, untouched.
 
 use std::fmt;
@@ -176,7 +176,8 @@ pub trait RosNetwork: Send + Sync + 'static {
     /// Starts discovery; each endpoint already there is told as an appearance. Call once.
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError>;
 
-    /// Creates a reader whose samples go to `handler`.
+    /// Creates a reader whose samples go to `handler`. Samples of writers made by SGC, this process's or another's,
+    /// never do: what they wrote came through SGC already.
     fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<Self::Reader, RosError>;
 
     /// Creates a writer.

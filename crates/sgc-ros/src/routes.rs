@@ -565,13 +565,18 @@ impl<R: RngCore> Routes<R> {
         share.own.retain(|guid, _| share.writers.contains_key(guid));
         let mut problem = None;
         if offer.is_transient_local() {
-            for guid in share.writers.keys() {
-                if share.own.len() >= ENTRY_SOURCES_MAX {
-                    let topic = self.share_rules[share.rule].metadata.ros_name.clone();
-                    problem = Some(Problem::TooManySources { topic });
-                    break;
-                }
-                share.own.entry(*guid).or_insert_with(|| random_source(&mut self.rng));
+            for guid in share.writers.keys().copied().collect::<Vec<_>>() {
+                let known: BTreeSet<_> = share.own.values().copied().collect();
+                let source = match (share.own.get(&guid), known.last()) {
+                    (Some(source), _) => *source,
+                    (None, Some(last)) if known.len() >= ENTRY_SOURCES_MAX => {
+                        let topic = self.share_rules[share.rule].metadata.ros_name.clone();
+                        problem = Some(Problem::TooManySources { topic });
+                        *last
+                    }
+                    _ => random_source(&mut self.rng),
+                };
+                share.own.insert(guid, source);
             }
         } else {
             share.own.clear();
@@ -690,10 +695,10 @@ impl<R: RngCore> Routes<R> {
 
     fn drop_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
-            self.commands.push_back(Command::Leave { name });
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
             }
+            self.commands.push_back(Command::Leave { name });
         }
     }
 

@@ -1,0 +1,106 @@
+//! Command line → draft: `sgc run --identity … --router … --share … --to … --use …` without a file.
+//!
+//! `--share /topic --to desk --to group:operators` shares with all that `--to` names;
+//! `--share /topic=desk,group:operators` says it for one topic. A share for nobody in particular is refused: access is
+//! closed until someone is named, and `--to '*'` is how one says everyone.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use super::draft::{Draft, Located, RosDraft, ShareDraft, UseDraft, Words};
+use super::error::{ConfigError, Mistake, Origin};
+
+const WORDS: Words = Words {
+    no_identity: "no `--identity`",
+    identity: "--identity",
+    dial: "`--router`",
+    listen: "`--listen`",
+    share: "`--share`",
+    uses: "`--use`",
+};
+
+/// The arguments of `sgc run` that stand in for a file, as given.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ArgsConfig {
+    /// `--identity FILE`
+    pub identity: Option<PathBuf>,
+    /// `--router URL`, any number.
+    pub routers: Vec<String>,
+    /// `--share /TOPIC` or `--share /TOPIC=NODE,group:GROUP`, any number.
+    pub shares: Vec<String>,
+    /// `--to NODE`, `--to group:GROUP` or `--to '*'`, any number: who may subscribe to the shares that do not say it
+    /// themselves.
+    pub to: Vec<String>,
+    /// `--use NODE:/TOPIC`, any number.
+    pub uses: Vec<String>,
+    /// `--listen URL`, any number.
+    pub listen: Vec<String>,
+}
+
+/// Takes the arguments apart.
+pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
+    let mut errors = Vec::new();
+    let mut record = |mistake| errors.push(ConfigError::new(Origin::Arguments, mistake));
+    let mut to_taken = false;
+    let mut shares = Vec::new();
+    for share in &args.shares {
+        let (topic, to) = match share.split_once('=') {
+            Some((topic, to)) => {
+                let to = to.split(',').map(str::trim).filter(|one| !one.is_empty());
+                (topic, Some(located("--share", to.map(|one| located("--share", one.to_owned())).collect())))
+            }
+            None if args.to.is_empty() => {
+                record(Mistake::ShareWithNobody { topic: share.clone() });
+                (share.as_str(), None)
+            }
+            None => {
+                to_taken = true;
+                (share.as_str(), Some(located("--to", all("--to", &args.to))))
+            }
+        };
+        shares.push(ShareDraft {
+            topic: Some(located("--share", topic.to_owned())),
+            to,
+            ..ShareDraft::default()
+        });
+    }
+    if !args.to.is_empty() && !to_taken {
+        record(Mistake::ToWithoutShare);
+    }
+    let mut uses = Vec::new();
+    for one in &args.uses {
+        let Some((from, topic)) = one.split_once(':') else {
+            record(Mistake::UseArgument { value: one.clone() });
+            continue;
+        };
+        uses.push(UseDraft {
+            from: Some(located("--use", from.to_owned())),
+            topic: Some(located("--use", topic.to_owned())),
+            ..UseDraft::default()
+        });
+    }
+    // A use that could not be read still makes this node more than a router.
+    let touches_ros = !args.shares.is_empty() || !args.uses.is_empty();
+    let draft = Draft {
+        origin: Origin::Arguments,
+        words: WORDS,
+        attempted: BTreeSet::new(),
+        identity: args.identity.clone().map(|identity| located("--identity", identity)),
+        name: None,
+        routers: all("--router", &args.routers),
+        listen: all("--listen", &args.listen),
+        ros: touches_ros.then(RosDraft::default),
+        shares,
+        uses,
+        admin_socket: None,
+    };
+    (draft, errors)
+}
+
+fn located<T>(key: &'static str, value: T) -> Located<T> {
+    Located { value, key, origin: Origin::Arguments }
+}
+
+fn all(key: &'static str, values: &[String]) -> Vec<Located<String>> {
+    values.iter().map(|value| located(key, value.clone())).collect()
+}

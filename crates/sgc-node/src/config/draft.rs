@@ -1,0 +1,103 @@
+//! What the user wrote, well-formed but not yet judged: texts and numbers, each with its place.
+//!
+//! `file` makes a draft from TOML, `args` from the command line; `resolve` makes a `Config` of either. So each
+//! rule about values is written once.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+use super::error::{ConfigError, Mistake, Origin};
+
+/// A value and where it came from.
+#[derive(Clone, Debug)]
+pub(super) struct Located<T> {
+    pub(super) value: T,
+    /// What the user knows it by: `to`, `--to`, `ROS_DOMAIN_ID`.
+    pub(super) key: &'static str,
+    pub(super) origin: Origin,
+}
+
+impl<T> Located<T> {
+    /// An error in this place.
+    pub(super) fn error(&self, mistake: Mistake) -> ConfigError {
+        ConfigError::new(self.origin.clone(), mistake)
+    }
+
+    /// The same place, another value.
+    pub(super) fn map<U>(self, convert: impl FnOnce(T) -> U) -> Located<U> {
+        Located { value: convert(self.value), key: self.key, origin: self.origin }
+    }
+
+    /// How another error refers to this place.
+    pub(super) fn reference(&self) -> String {
+        match &self.origin {
+            Origin::File { line: Some(line), .. } => format!("line {line}"),
+            _ => format!("a `{}`", self.key),
+        }
+    }
+}
+
+/// A whole configuration.
+#[derive(Debug)]
+pub(super) struct Draft {
+    /// The place of what is missing altogether.
+    pub(super) origin: Origin,
+    /// How the missing things are called here.
+    pub(super) words: Words,
+    /// Keys that were meant but not understood; each has an error, so that their absence needs none.
+    pub(super) attempted: BTreeSet<&'static str>,
+    pub(super) identity: Option<Located<PathBuf>>,
+    pub(super) name: Option<Located<String>>,
+    pub(super) routers: Vec<Located<String>>,
+    pub(super) listen: Vec<Located<String>>,
+    pub(super) ros: Option<RosDraft>,
+    pub(super) shares: Vec<ShareDraft>,
+    pub(super) uses: Vec<UseDraft>,
+    pub(super) admin_socket: Option<Located<PathBuf>>,
+}
+
+/// How a source of configuration names the settings that an error may ask for.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Words {
+    pub(super) no_identity: &'static str,
+    pub(super) identity: &'static str,
+    pub(super) dial: &'static str,
+    pub(super) listen: &'static str,
+    pub(super) share: &'static str,
+    pub(super) uses: &'static str,
+}
+
+/// `[ros]`.
+#[derive(Debug, Default)]
+pub(super) struct RosDraft {
+    pub(super) domain_id: Option<Located<i64>>,
+    pub(super) localhost_only: Option<Located<bool>>,
+    pub(super) discovery_range: Option<Located<String>>,
+    /// The whole list is located too, since an empty one is a choice.
+    pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
+}
+
+/// `[[share]]`. What is required is `None` only where an error has been recorded already.
+#[derive(Debug, Default)]
+pub(super) struct ShareDraft {
+    pub(super) topic: Option<Located<String>>,
+    pub(super) to: Option<Located<Vec<Located<String>>>>,
+    pub(super) type_name: Option<Located<String>>,
+    pub(super) priority: Option<Located<String>>,
+    pub(super) suite: Option<Located<String>>,
+    pub(super) description: Option<Located<String>>,
+    pub(super) author: Option<Located<String>>,
+    pub(super) maintainer: Option<Located<String>>,
+    pub(super) interface: Option<Located<String>>,
+    pub(super) unique: Option<Located<String>>,
+    pub(super) node: Option<Located<String>>,
+}
+
+/// `[[use]]`. What is required is `None` only where an error has been recorded already.
+#[derive(Debug, Default)]
+pub(super) struct UseDraft {
+    pub(super) from: Option<Located<String>>,
+    pub(super) topic: Option<Located<String>>,
+    pub(super) type_name: Option<Located<String>>,
+    pub(super) priority: Option<Located<String>>,
+}

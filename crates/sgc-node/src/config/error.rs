@@ -1,0 +1,593 @@
+//! What can be wrong with a configuration: one variant per mistake, each with the place, the value and what
+//! would be right.
+//!
+//! Finding the mistakes is the business of the other files of this module.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use sgc_transport::UrlError;
+
+/// Everything that is wrong, in the order of the file; never empty.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ConfigErrors {
+    errors: Vec<ConfigError>,
+}
+
+impl ConfigErrors {
+    /// Sorts by place and keeps the order of discovery within a line.
+    pub(super) fn new(mut errors: Vec<ConfigError>) -> Self {
+        debug_assert!(!errors.is_empty());
+        errors.sort_by_key(|error| error.origin.rank());
+        Self { errors }
+    }
+
+    /// The mistakes, one by one.
+    pub fn iter(&self) -> std::slice::Iter<'_, ConfigError> {
+        self.errors.iter()
+    }
+}
+
+impl<'e> IntoIterator for &'e ConfigErrors {
+    type Item = &'e ConfigError;
+    type IntoIter = std::slice::Iter<'e, ConfigError>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
+    }
+}
+
+impl From<ConfigError> for ConfigErrors {
+    fn from(error: ConfigError) -> Self {
+        Self::new(vec![error])
+    }
+}
+
+impl fmt::Display for ConfigErrors {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (i, error) in self.errors.iter().enumerate() {
+            if i > 0 {
+                f.write_str("\n")?;
+            }
+            write!(f, "{error}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for ConfigErrors {}
+
+/// One mistake and where it was made.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{origin}: {mistake}")]
+pub struct ConfigError {
+    /// Where.
+    pub origin: Origin,
+    /// What.
+    pub mistake: Box<Mistake>,
+}
+
+impl ConfigError {
+    pub(super) fn new(origin: Origin, mistake: Mistake) -> Self {
+        Self { origin, mistake: Box::new(mistake) }
+    }
+}
+
+/// Where a value came from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// A file; no line where the mistake is that something is missing from the whole.
+    File {
+        /// As the user named it.
+        file: Arc<str>,
+        /// Counted from 1.
+        line: Option<usize>,
+    },
+    /// The command line.
+    Arguments,
+    /// The environment.
+    Environment,
+}
+
+impl Origin {
+    fn rank(&self) -> (u8, usize) {
+        match self {
+            Self::File { line, .. } => (0, line.unwrap_or(usize::MAX)),
+            Self::Arguments => (1, 0),
+            Self::Environment => (2, 0),
+        }
+    }
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File { file, line: Some(line) } => write!(f, "{file}:{line}"),
+            Self::File { file, line: None } => f.write_str(file),
+            Self::Arguments => f.write_str("command line"),
+            Self::Environment => f.write_str("environment"),
+        }
+    }
+}
+
+/// What is wrong. `key` is what the user knows the value by: a key, an argument or a variable.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Mistake {
+    // The file.
+    /// The file could not be read.
+    #[error("cannot read the configuration: {reason}")]
+    Unreadable {
+        /// What the system said.
+        reason: String,
+    },
+    /// The file is too large to be one.
+    #[error("the file has {bytes} bytes; a configuration has at most {max}")]
+    TooLarge {
+        /// Its size.
+        bytes: u64,
+        /// The limit.
+        max: u64,
+    },
+    /// The file is not TOML.
+    #[error("not TOML: {message}")]
+    Syntax {
+        /// What the parser said.
+        message: String,
+    },
+
+    // Keys.
+    /// A key that no version knows.
+    #[error("{table} has no key `{key}`; {}", suggest_key(*nearest, known))]
+    UnknownKey {
+        /// The table, brackets included.
+        table: &'static str,
+        /// The key.
+        key: String,
+        /// What it may have been meant to be.
+        nearest: Option<&'static str>,
+        /// What the table has.
+        known: &'static [&'static str],
+    },
+    /// A key that another table has.
+    #[error("{table} has no key `{key}`; it belongs in {}", homes.join(" or "))]
+    MisplacedKey {
+        /// Where it stands.
+        table: &'static str,
+        /// The key.
+        key: String,
+        /// Where it belongs.
+        homes: Vec<&'static str>,
+    },
+    /// A key of the design that is not implemented yet.
+    #[error("`{key}` is planned but not in this version; take it out")]
+    PlannedKey {
+        /// The key.
+        key: String,
+    },
+    /// A key without which the table means nothing.
+    #[error("{table} has no `{key}`; add one, such as {key} = {example}")]
+    MissingKey {
+        /// The table, brackets included.
+        table: &'static str,
+        /// The key.
+        key: &'static str,
+        /// A right value.
+        example: &'static str,
+    },
+    /// `[share]` for `[[share]]`.
+    #[error("`{key}` is one table but may occur many times; write [[{key}]]")]
+    NotRepeated {
+        /// The table's name.
+        key: &'static str,
+    },
+    /// `[[node]]` for `[node]`.
+    #[error("`{key}` is {found} but may occur only once; write [{key}]")]
+    NotSingle {
+        /// The table's name.
+        key: &'static str,
+        /// What was found.
+        found: String,
+    },
+
+    // Values.
+    /// A value of the wrong type.
+    #[error("`{key}` is {found}; it takes {expected}")]
+    WrongType {
+        /// The key.
+        key: &'static str,
+        /// What was found.
+        found: String,
+        /// What the key takes, with an example.
+        expected: &'static str,
+    },
+    /// A text that may not be empty.
+    #[error("`{key}` is empty; give it a value, such as {example}")]
+    Empty {
+        /// The key.
+        key: &'static str,
+        /// A right value.
+        example: &'static str,
+    },
+    /// A text over its limit.
+    #[error("`{key}` has {bytes} bytes; it has at most {max}")]
+    TooLong {
+        /// The key.
+        key: &'static str,
+        /// Its length.
+        bytes: usize,
+        /// The limit.
+        max: usize,
+    },
+    /// More tables or arguments of a kind than the limit.
+    #[error("{what} occurs {count} times; it may occur at most {max} times")]
+    TooMany {
+        /// A table with its brackets, or an argument.
+        what: &'static str,
+        /// How many there are.
+        count: usize,
+        /// The limit.
+        max: usize,
+    },
+    /// A list over its limit.
+    #[error("`{key}` has {count} entries; it may have at most {max}")]
+    TooManyEntries {
+        /// The key.
+        key: &'static str,
+        /// How many there are.
+        count: usize,
+        /// The limit.
+        max: usize,
+    },
+    /// The same entry twice in one list.
+    #[error("`{key}` names {value:?} twice; once is enough")]
+    Repeated {
+        /// The key.
+        key: &'static str,
+        /// The entry.
+        value: String,
+    },
+    /// A word that is none of those allowed.
+    #[error("`{key}` is {value:?}; {}", suggest_word(*nearest, known))]
+    UnknownWord {
+        /// The key.
+        key: &'static str,
+        /// The word.
+        value: String,
+        /// What it may have been meant to be.
+        nearest: Option<&'static str>,
+        /// All that are allowed.
+        known: &'static [&'static str],
+    },
+    /// A value of the design that is not implemented yet.
+    #[error("`{key}` is {value:?}; {what} planned but not in this version: {instead}")]
+    PlannedValue {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// Subject and verb, such as `"wildcards are"`.
+        what: &'static str,
+        /// What works now.
+        instead: &'static str,
+    },
+    /// Not a ROS 2 topic name.
+    #[error("`{key}` is {value:?}; {rule}{}", suggest_value(right.as_deref()))]
+    TopicName {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The rule that it breaks.
+        rule: TopicRule,
+        /// What was probably meant.
+        right: Option<String>,
+    },
+    /// Not a ROS 2 message type.
+    #[error(
+        "`{key}` is {value:?}; a message type is PACKAGE/msg/NAME: {}",
+        right.as_ref().map_or_else(|| "\"std_msgs/msg/String\", for example".to_owned(), |r| format!("{r:?}"))
+    )]
+    TypeName {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What was probably meant.
+        right: Option<String>,
+    },
+    /// Not the name of a node.
+    #[error(
+        "`{key}` is {value:?}; a node's name is 1 to {max} of a-z, 0-9, '-', '_' and '.', the first a letter or \
+         digit: {:?}",
+        right.as_deref().unwrap_or("arm-1")
+    )]
+    NodeName {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The longest name, in bytes.
+        max: usize,
+        /// What was probably meant.
+        right: Option<String>,
+    },
+    /// Not a node, a group or everyone.
+    #[error(
+        "`{key}` names {value:?}; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 to {max} \
+         of a-z, 0-9, '-', '_' and '.'"
+    )]
+    Recipient {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The longest name, in bytes.
+        max: usize,
+    },
+    /// Not a ROS domain id.
+    #[error("`{key}` is {value}; a ROS domain id is a number from 0 to {max}")]
+    DomainId {
+        /// The key or variable.
+        key: &'static str,
+        /// The value as written.
+        value: String,
+        /// The greatest.
+        max: u32,
+    },
+    /// Not the address of a peer.
+    #[error("`{key}` names {value:?}; a peer is a host name or an IP address: \"10.0.0.2\", for example")]
+    StaticPeer {
+        /// The key or variable.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// Not the address of a node.
+    #[error("`{key}` is {value:?}; {fault}")]
+    Url {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What is wrong with it.
+        fault: UrlError,
+    },
+    /// To dial an address that means "all of mine".
+    #[error("`{key}` is {value:?}; {host} can be listened at but not dialled: name the router's host")]
+    UrlUnspecified {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The address.
+        host: String,
+    },
+    /// A value that only looks like on or off (ROS 2 reads only `1` as on).
+    #[error(
+        "`{key}` is {value:?}; ROS 2 reads \"1\" as on and anything else as off: set \"1\" or \"0\", or unset it"
+    )]
+    Switch {
+        /// The variable.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// An argument `--use` without its colon.
+    #[error("`--use` is {value:?}; write NODE:/TOPIC: \"arm-1:/camera/image\", for example")]
+    UseArgument {
+        /// The value.
+        value: String,
+    },
+
+    // What belongs together.
+    /// Nobody is allowed to subscribe, so the share has no purpose.
+    #[error(
+        "`{key}` is empty, so nobody may subscribe: name nodes (\"desk\"), groups (\"group:operators\") or \"*\""
+    )]
+    NobodyMay {
+        /// The key.
+        key: &'static str,
+    },
+    /// `--share` without saying with whom.
+    #[error(
+        "`--share` {topic:?} does not say with whom: add --to NODE (or --to group:NAME, or --to '*'), or write \
+         --share {topic}=NODE"
+    )]
+    ShareWithNobody {
+        /// The topic.
+        topic: String,
+    },
+    /// `--to` that no `--share` takes.
+    #[error("`--to` is given, but no `--share` takes it: add --share /TOPIC")]
+    ToWithoutShare,
+    /// Everyone, and some by name.
+    #[error(
+        "`{key}` names \"*\", which is every member of the fleet, and {other:?} beside it: keep one of them"
+    )]
+    EveryoneAndMore {
+        /// The key.
+        key: &'static str,
+        /// One of those named beside it.
+        other: String,
+    },
+    /// A share with this node alone.
+    #[error("`{key}` names only {name:?}, which is this node: name those who may subscribe from elsewhere")]
+    OnlyItself {
+        /// The key.
+        key: &'static str,
+        /// This node.
+        name: String,
+    },
+    /// The same topic shared twice.
+    #[error("`{key}` is {topic:?}, which {other} shares already: make it one share and join the recipients")]
+    SharedTwice {
+        /// The key.
+        key: &'static str,
+        /// The topic.
+        topic: String,
+        /// The first share.
+        other: String,
+    },
+    /// The same topic used twice from the same node.
+    #[error("`{key}` is {topic:?} from {from:?}, which {other} uses already: take one of them out")]
+    UsedTwice {
+        /// The key.
+        key: &'static str,
+        /// The topic.
+        topic: String,
+        /// The owner.
+        from: String,
+        /// The first use.
+        other: String,
+    },
+    /// A topic that would come back to where it came from.
+    #[error(
+        "`{key}` is {topic:?}, which {other} shares: what is used here would be shared again, in a loop; keep one"
+    )]
+    SharedAndUsed {
+        /// The key.
+        key: &'static str,
+        /// The topic.
+        topic: String,
+        /// The share.
+        other: String,
+    },
+    /// A use of one's own topic.
+    #[error("`{key}` is {name:?}, which is this node: name the node that shares the topic")]
+    UseFromItself {
+        /// The key.
+        key: &'static str,
+        /// This node.
+        name: String,
+    },
+    /// Neither dials nor listens.
+    #[error(
+        "neither {dial} nor {listen} is given, so this node connects to nobody: name a router \
+         (\"quic://router.lab.example:7447\") or listen as one (\"quic://0.0.0.0:7447\")"
+    )]
+    ConnectsToNobody {
+        /// How a router is named.
+        dial: &'static str,
+        /// How listening is asked for.
+        listen: &'static str,
+    },
+    /// Two settings of which only one can hold.
+    #[error("`{key}` is {value}, but `{other}` is {other_value}: {right}")]
+    Contradiction {
+        /// The one.
+        key: &'static str,
+        /// Its value.
+        value: &'static str,
+        /// The other.
+        other: &'static str,
+        /// Its value.
+        other_value: String,
+        /// What to do.
+        right: &'static str,
+    },
+
+    // The identity.
+    /// Nothing says who this node is.
+    #[error("{missing} is given: every link is authenticated, so a node needs an identity file")]
+    NoIdentity {
+        /// What is not given, as the beginning of a sentence.
+        missing: &'static str,
+    },
+    /// The identity is given at the top and in `[node]`.
+    #[error("`identity` is given on line {first} already; keep one")]
+    IdentityTwice {
+        /// The line of the other.
+        first: usize,
+    },
+    /// There is no such file.
+    #[error(
+        "`{key}` is {}{}: no such file; `sgc fleet enroll {node} --out {}` makes one",
+        path.display(),
+        if *implied { " (after the node's name)" } else { "" },
+        path.display()
+    )]
+    IdentityMissing {
+        /// The key that names it.
+        key: &'static str,
+        /// It is not written down but follows from the name.
+        implied: bool,
+        /// The file.
+        path: PathBuf,
+        /// The node, or `NODE` where the name is not known.
+        node: String,
+    },
+    /// The file cannot be read.
+    #[error("`{key}` is {}: {reason}; it must be a file that this user may read", path.display())]
+    IdentityUnreadable {
+        /// The key that names it.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
+    /// Others than the owner may read or write the private key.
+    #[error(
+        "`{key}` is {}: its mode {mode:04o} lets others at the private key; `chmod 600 {}` and, if others had access, \
+         enrol again",
+        path.display(),
+        path.display()
+    )]
+    IdentityExposed {
+        /// The key that names it.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+}
+
+/// The rules of a fully qualified ROS 2 topic name (`rmw_validate_full_topic_name`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TopicRule {
+    /// It has at least one token.
+    #[error("a topic name has at least one word after a '/'")]
+    NotEmpty,
+    /// `~` depends on the ROS node.
+    #[error("'~' stands for the name of a ROS node, which is not known here: write the name in full")]
+    NotPrivate,
+    /// It starts with a slash.
+    #[error("a topic name starts with '/'")]
+    Absolute,
+    /// It does not end with one.
+    #[error("a topic name does not end with '/'")]
+    NoTrailingSlash,
+    /// No empty token.
+    #[error("a topic name has no '//'")]
+    NoRepeatedSlash,
+    /// Letters, digits and underscores.
+    #[error("a topic name has letters, digits, '_' and '/', not {0:?}")]
+    Characters(char),
+    /// No token starts with a digit.
+    #[error("no word of a topic name starts with a digit")]
+    NoLeadingDigit,
+    /// DDS leaves this much room.
+    #[error("a topic name has at most {0} bytes")]
+    Length(usize),
+}
+
+fn suggest_key(nearest: Option<&str>, known: &[&str]) -> String {
+    match nearest {
+        Some(nearest) => format!("did you mean `{nearest}`?"),
+        None => format!("it has `{}`", known.join("`, `")),
+    }
+}
+
+fn suggest_word(nearest: Option<&str>, known: &[&str]) -> String {
+    let known = format!("\"{}\"", known.join("\", \""));
+    match nearest {
+        Some(nearest) => format!("did you mean {nearest:?}? It takes {known}"),
+        None => format!("it takes {known}"),
+    }
+}
+
+fn suggest_value(right: Option<&str>) -> String {
+    right.map(|right| format!(": {right:?}")).unwrap_or_default()
+}

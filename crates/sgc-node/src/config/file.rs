@@ -1,0 +1,378 @@
+//! TOML text → draft: tables, keys and types of values, with the line of each.
+//!
+//! What the values mean is not judged here but in `resolve`.
+
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::draft::{Draft, Located, RosDraft, ShareDraft, UseDraft, Words};
+use super::error::{ConfigError, Mistake, Origin};
+use super::schema::{Table, nearest};
+
+const WORDS: Words = Words {
+    no_identity: "neither `identity` nor `name` in [node]",
+    identity: "identity",
+    dial: "`routers` in [node]",
+    listen: "`listen` in [router]",
+    share: "[[share]]",
+    uses: "[[use]]",
+};
+
+/// Reads the text. A draft comes back even when there are errors, unless the text is not TOML at all, so that
+/// `resolve` can report its own beside them.
+pub(super) fn read(text: &str, file: &str) -> (Option<Draft>, Vec<ConfigError>) {
+    let line_starts =
+        text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at + 1).collect();
+    let mut reader =
+        FileReader { file: file.into(), text, line_starts, attempted: BTreeSet::new(), errors: Vec::new() };
+    let (top, syntax) = DeTable::parse_recoverable(text);
+    if !syntax.is_empty() {
+        reader.record_syntax(&syntax);
+        return (None, reader.errors);
+    }
+    let draft = reader.draft(top.get_ref());
+    (Some(draft), reader.errors)
+}
+
+struct FileReader<'t> {
+    file: Arc<str>,
+    text: &'t str,
+    /// Offsets of the lines after the first.
+    line_starts: Vec<usize>,
+    attempted: BTreeSet<&'static str>,
+    errors: Vec<ConfigError>,
+}
+
+/// A table of the file, on the way to becoming a draft.
+struct Section<'s, 't> {
+    table: Table,
+    entries: &'s DeTable<'t>,
+    span: Range<usize>,
+    /// Keys of the table that unknown ones were probably meant to be.
+    meant: Vec<&'static str>,
+}
+
+type Value<'t> = Spanned<DeValue<'t>>;
+
+impl FileReader<'_> {
+    fn record_syntax(&mut self, syntax: &[toml::de::Error]) {
+        let mut last = None;
+        for error in syntax {
+            let origin = self.origin(error.span().unwrap_or_default());
+            // What follows in the same line is mostly a consequence of the first.
+            if last.as_ref() != Some(&origin) {
+                let message = error.message().to_owned();
+                self.errors.push(ConfigError::new(origin.clone(), Mistake::Syntax { message }));
+                last = Some(origin);
+            }
+        }
+    }
+
+    fn draft(&mut self, top: &DeTable<'_>) -> Draft {
+        let top = self.section(Table::Top, top, 0..0);
+        let node = self.single(&top, "node", Table::Node);
+        let router = self.single(&top, "router", Table::Router);
+        let admin = self.single(&top, "admin", Table::Admin);
+        let ros = self.single(&top, "ros", Table::Ros);
+        let mut draft = Draft {
+            origin: Origin::File { file: self.file.clone(), line: None },
+            words: WORDS,
+            attempted: BTreeSet::new(),
+            identity: self.identity(&top, node.as_ref()),
+            name: self.string(node.as_ref(), "name", "a string, such as \"arm-1\""),
+            routers: self.flat_strings(
+                node.as_ref(),
+                "routers",
+                "an array of strings, such as [\"quic://router.lab.example:7447\"]",
+            ),
+            listen: self.flat_strings(
+                router.as_ref(),
+                "listen",
+                "an array of strings, such as [\"quic://0.0.0.0:7447\"]",
+            ),
+            ros: ros.map(|ros| self.ros(&ros)),
+            shares: self
+                .repeated(&top, "share", Table::Share)
+                .iter()
+                .map(|share| self.share(share))
+                .collect(),
+            uses: self.repeated(&top, "use", Table::Use).iter().map(|one| self.one_use(one)).collect(),
+            admin_socket: self
+                .string(admin.as_ref(), "socket", "a string, such as \"/run/sgc/arm-1.sock\"")
+                .map(|socket| socket.map(PathBuf::from)),
+        };
+        draft.attempted = std::mem::take(&mut self.attempted);
+        draft
+    }
+
+    fn identity(
+        &mut self,
+        top: &Section<'_, '_>,
+        node: Option<&Section<'_, '_>>,
+    ) -> Option<Located<PathBuf>> {
+        const EXPECTED: &str = "a string, such as \"arm-1.identity\"";
+        let above = self.string(Some(top), "identity", EXPECTED);
+        let within = self.string(node, "identity", EXPECTED);
+        if let (Some(above), Some(within)) = (&above, &within)
+            && let Origin::File { line: Some(first), .. } = above.origin
+        {
+            self.errors.push(within.error(Mistake::IdentityTwice { first }));
+        }
+        above.or(within).map(|identity| identity.map(PathBuf::from))
+    }
+
+    fn ros(&mut self, ros: &Section<'_, '_>) -> RosDraft {
+        let ros = Some(ros);
+        RosDraft {
+            domain_id: self.integer(ros, "domain_id", "a number from 0 to 232"),
+            localhost_only: self.boolean(ros, "localhost_only", "true or false"),
+            discovery_range: self.string(ros, "discovery_range", "a string, such as \"subnet\""),
+            static_peers: self.strings(
+                ros,
+                "static_peers",
+                "an array of strings, such as [\"10.0.0.2\", \"arm-2.local\"]",
+            ),
+        }
+    }
+
+    fn share(&mut self, share: &Section<'_, '_>) -> ShareDraft {
+        const TEXT: &str = "a string";
+        self.check_required(share, "topic", "\"/camera/image\"");
+        self.check_required(share, "to", "[\"desk\", \"group:operators\"]");
+        let share = Some(share);
+        ShareDraft {
+            topic: self.string(share, "topic", "a string, such as \"/camera/image\""),
+            to: self.strings(share, "to", "an array of strings, such as [\"desk\", \"group:operators\"]"),
+            type_name: self.string(share, "type", "a string, such as \"sensor_msgs/msg/Image\""),
+            priority: self.string(share, "priority", "a string, such as \"realtime\""),
+            suite: self.string(share, "suite", "a string, such as \"group\""),
+            description: self.string(share, "description", TEXT),
+            author: self.string(share, "author", TEXT),
+            maintainer: self.string(share, "maintainer", TEXT),
+            interface: self.string(share, "interface", TEXT),
+            unique: self.string(share, "unique", TEXT),
+            node: self.string(share, "node", TEXT),
+        }
+    }
+
+    fn one_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
+        self.check_required(one, "from", "\"arm-1\"");
+        self.check_required(one, "topic", "\"/camera/image\"");
+        let one = Some(one);
+        UseDraft {
+            from: self.string(one, "from", "a string, such as \"arm-1\""),
+            topic: self.string(one, "topic", "a string, such as \"/camera/image\""),
+            type_name: self.string(one, "type", "a string, such as \"sensor_msgs/msg/Image\""),
+            priority: self.string(one, "priority", "a string, such as \"realtime\""),
+        }
+    }
+
+    /// The table `[key]`.
+    fn single<'s, 't>(
+        &mut self,
+        top: &Section<'s, 't>,
+        key: &'static str,
+        table: Table,
+    ) -> Option<Section<'s, 't>> {
+        let value = top.entries.get(key)?;
+        if let DeValue::Table(entries) = value.get_ref() {
+            return Some(self.section(table, entries, value.span()));
+        }
+        let first = value.get_ref().as_array().and_then(|array| array.first());
+        let is_repeated = first.is_some_and(|first| first.get_ref().is_table());
+        let found = if is_repeated { "an array of tables".to_owned() } else { self.describe(value) };
+        self.attempted.insert(key);
+        self.record(value.span(), Mistake::NotSingle { key, found });
+        None
+    }
+
+    /// The tables `[[key]]`.
+    fn repeated<'s, 't>(
+        &mut self,
+        top: &Section<'s, 't>,
+        key: &'static str,
+        table: Table,
+    ) -> Vec<Section<'s, 't>> {
+        const EXPECTED: &str = "tables: [[share]] or [[use]], and the keys below";
+        let Some(value) = top.entries.get(key) else { return Vec::new() };
+        let mut sections = Vec::new();
+        match value.get_ref() {
+            DeValue::Array(array) => {
+                for item in array.iter() {
+                    if let DeValue::Table(entries) = item.get_ref() {
+                        sections.push(self.section(table, entries, item.span()));
+                    } else {
+                        self.record_type(item, key, EXPECTED);
+                    }
+                }
+            }
+            DeValue::Table(_) => self.record(value.span(), Mistake::NotRepeated { key }),
+            _ => self.record_type(value, key, EXPECTED),
+        }
+        sections
+    }
+
+    /// A section whose keys have been checked.
+    fn section<'s, 't>(
+        &mut self,
+        table: Table,
+        entries: &'s DeTable<'t>,
+        span: Range<usize>,
+    ) -> Section<'s, 't> {
+        let mut meant = Vec::new();
+        for (key, value) in entries.iter() {
+            let name: &str = key.get_ref();
+            if table.keys().contains(&name) {
+                continue;
+            }
+            // A table is told by its header, which is where the value's span begins.
+            let span = if value.get_ref().is_table() { value.span() } else { key.span() };
+            let key = name.to_owned();
+            let mistake = if table.planned_keys().contains(&name) {
+                Mistake::PlannedKey { key }
+            } else if let Some((known, homes)) = Table::homes(name) {
+                self.attempted.insert(known);
+                Mistake::MisplacedKey { table: table.header(), key, homes }
+            } else {
+                let nearest = nearest(name, table.keys());
+                meant.extend(nearest);
+                self.attempted.extend(nearest);
+                Mistake::UnknownKey { table: table.header(), key, nearest, known: table.keys() }
+            };
+            self.record(span, mistake);
+        }
+        Section { table, entries, span, meant }
+    }
+
+    fn check_required(&mut self, section: &Section<'_, '_>, key: &'static str, example: &'static str) {
+        // A key of something planned, such as `service`, stands in for `topic`; it has its own error.
+        let has = |key: &str| section.entries.contains_key(key) || section.meant.contains(&key);
+        let replaced = key == "topic" && (has("service") || has("action"));
+        if !replaced && !has(key) {
+            self.record(
+                section.span.clone(),
+                Mistake::MissingKey { table: section.table.header(), key, example },
+            );
+        }
+    }
+
+    fn string(
+        &mut self,
+        section: Option<&Section<'_, '_>>,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Located<String>> {
+        let value = section?.entries.get(key)?;
+        self.typed(value, key, expected, |value| value.as_str().map(str::to_owned))
+    }
+
+    fn boolean(
+        &mut self,
+        section: Option<&Section<'_, '_>>,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Located<bool>> {
+        let value = section?.entries.get(key)?;
+        self.typed(value, key, expected, DeValue::as_bool)
+    }
+
+    fn integer(
+        &mut self,
+        section: Option<&Section<'_, '_>>,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Located<i64>> {
+        let value = section?.entries.get(key)?;
+        self.typed(value, key, expected, |value| {
+            let integer = value.as_integer()?;
+            i64::from_str_radix(integer.as_str(), integer.radix()).ok()
+        })
+    }
+
+    fn strings(
+        &mut self,
+        section: Option<&Section<'_, '_>>,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Option<Located<Vec<Located<String>>>> {
+        let value = section?.entries.get(key)?;
+        let DeValue::Array(array) = value.get_ref() else {
+            self.record_type(value, key, expected);
+            return None;
+        };
+        let mut items = Vec::new();
+        for item in array.iter() {
+            items.extend(self.typed(item, key, expected, |item| item.as_str().map(str::to_owned)));
+        }
+        // A list of nothing but mistakes is not empty by the user's will.
+        (array.is_empty() || !items.is_empty()).then(|| Located {
+            value: items,
+            key,
+            origin: self.origin(value.span()),
+        })
+    }
+
+    fn flat_strings(
+        &mut self,
+        section: Option<&Section<'_, '_>>,
+        key: &'static str,
+        expected: &'static str,
+    ) -> Vec<Located<String>> {
+        self.strings(section, key, expected).map(|list| list.value).unwrap_or_default()
+    }
+
+    fn typed<'t, T>(
+        &mut self,
+        value: &Value<'t>,
+        key: &'static str,
+        expected: &'static str,
+        convert: impl FnOnce(&DeValue<'t>) -> Option<T>,
+    ) -> Option<Located<T>> {
+        let converted = convert(value.get_ref());
+        if converted.is_none() {
+            self.record_type(value, key, expected);
+        }
+        Some(Located { value: converted?, key, origin: self.origin(value.span()) })
+    }
+
+    /// The kind of a value and, if it is short, the value itself as written.
+    fn describe(&self, value: &Value<'_>) -> String {
+        const WRITTEN_CHARS_MAX: usize = 40;
+        let kind = match value.get_ref() {
+            DeValue::String(_) => "a string",
+            DeValue::Integer(_) => "an integer",
+            DeValue::Float(_) => "a float",
+            DeValue::Boolean(_) => "a boolean",
+            DeValue::Datetime(_) => "a date",
+            DeValue::Array(_) => return "an array".to_owned(),
+            DeValue::Table(_) => return "a table".to_owned(),
+        };
+        match self.text.get(value.span()) {
+            Some(written) if written.len() <= WRITTEN_CHARS_MAX && !written.contains('\n') => {
+                format!("{kind} ({written})")
+            }
+            _ => kind.to_owned(),
+        }
+    }
+
+    fn record_type(&mut self, value: &Value<'_>, key: &'static str, expected: &'static str) {
+        self.attempted.insert(key);
+        let found = self.describe(value);
+        self.record(value.span(), Mistake::WrongType { key, found, expected });
+    }
+
+    fn record(&mut self, span: Range<usize>, mistake: Mistake) {
+        let origin = self.origin(span);
+        self.errors.push(ConfigError::new(origin, mistake));
+    }
+
+    fn origin(&self, span: Range<usize>) -> Origin {
+        let line = 1 + self.line_starts.partition_point(|start| *start <= span.start);
+        Origin::File { file: self.file.clone(), line: Some(line) }
+    }
+}

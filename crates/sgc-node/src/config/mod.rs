@@ -1,0 +1,241 @@
+//! What the user wrote → a resolved, valid configuration, before any socket is bound.
+//!
+//! Two sources, a TOML file and the command line, become a draft (`file`, `args`); one set of rules
+//! (`resolve`, `names`, `ros_env`) makes a [`Config`] of it or says everything that is wrong with it
+//! ([`ConfigErrors`]). The reference for users is `docs/configuration.md`.
+//!
+//! Nothing here reads the environment or opens a socket: variables come through [`Environment`], and of files only
+//! [`load`] and [`load_args`] read any. Whether the identity file holds what it should, its owner's name
+//! included, is checked by the node when it opens it.
+
+mod args;
+mod draft;
+mod error;
+mod file;
+mod names;
+mod resolve;
+mod ros_env;
+mod schema;
+
+use std::fs;
+use std::io::{self, Read};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use sgc_transport::{LinkUrl, ListenAddr};
+use sgc_trust::{NodeName, Suite};
+use sgc_wire::Class;
+
+pub use args::ArgsConfig;
+pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
+pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX};
+pub use resolve::{LISTEN_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, USES_MAX};
+pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
+pub use schema::Table;
+
+/// The largest file that is read as a configuration: 1024 shares with all their metadata fit.
+pub const CONFIG_BYTES_MAX: u64 = 4 * 1024 * 1024;
+
+/// Looks up an environment variable; `&|name| std::env::var(name).ok()` outside of tests.
+pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
+
+/// A node's configuration, valid in itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// The name that the identity must have, if the user said one.
+    pub node_name: Option<NodeName>,
+    /// The identity file. Where only a name is given, it is `NAME.identity` beside the configuration.
+    pub identity: PathBuf,
+    /// Where to dial, in order of preference.
+    pub routers: Vec<LinkUrl>,
+    /// Where to listen; port 0 lets the system choose. Not empty: this node is a router.
+    pub listen: Vec<ListenAddr>,
+    /// The local ROS 2 network; none for a node that is only a router.
+    pub ros: Option<RosConfig>,
+    /// What this node offers, each topic once.
+    pub shares: Vec<ShareConfig>,
+    /// What this node wants, each topic of an owner once, none of them shared.
+    pub uses: Vec<UseConfig>,
+    /// Where the status socket goes, if not in its usual place.
+    pub admin_socket: Option<PathBuf>,
+}
+
+/// The local ROS 2 network.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RosConfig {
+    /// 0 to [`DOMAIN_ID_MAX`].
+    pub domain_id: u32,
+    /// How far to look for others.
+    pub discovery: DiscoveryRange,
+    /// Host names and IP addresses to look at besides. Empty where the range is `Off` or `SystemDefault`.
+    pub static_peers: Vec<String>,
+    /// `CYCLONEDDS_URI` as it is: what users of that middleware have set for their network holds here too.
+    pub cyclonedds_uri: Option<String>,
+}
+
+/// How far ROS 2 discovery reaches (`ROS_AUTOMATIC_DISCOVERY_RANGE`).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DiscoveryRange {
+    /// Nobody is discovered.
+    Off,
+    /// This host.
+    Localhost,
+    /// As far as multicast reaches.
+    #[default]
+    Subnet,
+    /// Whatever the middleware's own configuration says.
+    SystemDefault,
+}
+
+/// A topic that this node owns and lets others subscribe to.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ShareConfig {
+    /// A fully qualified ROS 2 name.
+    pub topic: String,
+    /// `pkg/msg/Name`; taken from discovery where it is not given.
+    pub type_name: Option<String>,
+    /// Who may subscribe; never empty, no one twice.
+    pub to: Vec<Recipient>,
+    /// What overtakes it.
+    pub priority: Class,
+    /// How its payloads are sealed.
+    pub suite: Suite,
+    /// What else goes into its name.
+    pub metadata: ShareMetadata,
+}
+
+/// The metadata fields of a share; those not given are empty. Each is at most
+/// [`sgc_wire::METADATA_FIELD_BYTES_MAX`] bytes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ShareMetadata {
+    /// Free text.
+    pub description: String,
+    /// Who wrote it.
+    pub author: String,
+    /// Who looks after it.
+    pub maintainer: String,
+    /// Interface description.
+    pub interface: String,
+    /// Tells apart what is otherwise alike.
+    pub unique: String,
+    /// The ROS node that provides it.
+    pub node: String,
+}
+
+/// A topic of another node that is to appear here.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct UseConfig {
+    /// The node that shares it.
+    pub from: NodeName,
+    /// A fully qualified ROS 2 name.
+    pub topic: String,
+    /// `pkg/msg/Name`, if the user insists on one; otherwise the owner's catalogue says.
+    pub type_name: Option<String>,
+    /// What overtakes it, if not as the owner says.
+    pub priority: Option<Class>,
+}
+
+impl DiscoveryRange {
+    /// Whether static peers count for anything.
+    fn asks_peers(self) -> bool {
+        matches!(self, Self::Localhost | Self::Subnet)
+    }
+}
+
+impl Config {
+    /// Takes part in ROS 2 not at all and only passes packets on.
+    pub fn is_pure_router(&self) -> bool {
+        self.ros.is_none()
+    }
+
+    /// Resolves the command line without looking at any file. The ROS environment counts as it does with a file.
+    pub fn from_args(args: &ArgsConfig, env: Environment<'_>) -> Result<Self, ConfigErrors> {
+        let (draft, errors) = args::read(args);
+        resolve::resolve(&draft, errors, Path::new(""), env, None).map_err(ConfigErrors::new)
+    }
+}
+
+/// Reads and resolves a file, and checks that the identity file is there, readable, and its owner's alone.
+///
+/// Relative paths in it are taken from its directory.
+pub fn load(path: &Path, env: Environment<'_>) -> Result<Config, ConfigErrors> {
+    let file_name = path.display().to_string();
+    let text = read_limited(path).map_err(|mistake| {
+        let origin = Origin::File { file: Arc::from(file_name.as_str()), line: None };
+        ConfigErrors::from(ConfigError::new(origin, mistake))
+    })?;
+    let base_dir = path.parent().unwrap_or(Path::new(""));
+    resolve_text(&text, &file_name, base_dir, env, Some(&check_identity_file))
+}
+
+/// Resolves the command line as [`Config::from_args`] does, and checks the identity file as [`load`] does.
+pub fn load_args(args: &ArgsConfig, env: Environment<'_>) -> Result<Config, ConfigErrors> {
+    let (draft, errors) = args::read(args);
+    resolve::resolve(&draft, errors, Path::new(""), env, Some(&check_identity_file))
+        .map_err(ConfigErrors::new)
+}
+
+/// Resolves the text of a file that errors call `file_name`, without looking at any file.
+pub fn parse(
+    text: &str,
+    file_name: &str,
+    base_dir: &Path,
+    env: Environment<'_>,
+) -> Result<Config, ConfigErrors> {
+    resolve_text(text, file_name, base_dir, env, None)
+}
+
+fn resolve_text(
+    text: &str,
+    file_name: &str,
+    base_dir: &Path,
+    env: Environment<'_>,
+    identity_check: Option<resolve::IdentityCheck<'_>>,
+) -> Result<Config, ConfigErrors> {
+    match file::read(text, file_name) {
+        (Some(draft), errors) => {
+            resolve::resolve(&draft, errors, base_dir, env, identity_check).map_err(ConfigErrors::new)
+        }
+        (None, errors) => Err(ConfigErrors::new(errors)),
+    }
+}
+
+fn read_limited(path: &Path) -> Result<String, Mistake> {
+    let unreadable = |error: io::Error| Mistake::Unreadable { reason: error.to_string() };
+    let file = fs::File::open(path).map_err(unreadable)?;
+    let mut bytes = Vec::new();
+    file.take(CONFIG_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(unreadable)?;
+    if bytes.len() as u64 > CONFIG_BYTES_MAX {
+        let bytes = fs::metadata(path).map_or(CONFIG_BYTES_MAX + 1, |metadata| metadata.len());
+        return Err(Mistake::TooLarge { bytes, max: CONFIG_BYTES_MAX });
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let valid = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+        let line = 1 + valid.iter().filter(|byte| **byte == b'\n').count();
+        Mistake::Unreadable { reason: format!("line {line} is not UTF-8 text") }
+    })
+}
+
+fn check_identity_file(file: &resolve::IdentityFile<'_>) -> Result<(), Mistake> {
+    const PERMISSION_BITS: u32 = 0o7777;
+    const OTHERS_BITS: u32 = 0o077;
+    let (path, key) = (file.path, file.key);
+    let unreadable = |reason: String| Mistake::IdentityUnreadable { key, path: path.to_owned(), reason };
+    let metadata = fs::metadata(path).map_err(|error| {
+        if error.kind() == io::ErrorKind::NotFound {
+            let node = file.node_name.map_or("NODE".to_owned(), ToString::to_string);
+            Mistake::IdentityMissing { key, implied: file.implied, path: path.to_owned(), node }
+        } else {
+            unreadable(error.to_string())
+        }
+    })?;
+    if !metadata.is_file() {
+        return Err(unreadable("not a file".to_owned()));
+    }
+    let mode = metadata.permissions().mode() & PERMISSION_BITS;
+    if mode & OTHERS_BITS != 0 {
+        return Err(Mistake::IdentityExposed { key, path: path.to_owned(), mode });
+    }
+    fs::File::open(path).map(drop).map_err(|error| unreadable(error.to_string()))
+}

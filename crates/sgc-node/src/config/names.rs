@@ -1,0 +1,215 @@
+//! The rules for what a user may call things: topics, message types, nodes, recipients, peers, addresses.
+//!
+//! Each function takes a text and gives the valid thing or the mistake; where the text comes from and what it
+//! has to do with other settings is the business of `resolve`.
+
+use std::net::IpAddr;
+
+use sgc_transport::{LinkUrl, ListenAddr, UrlError};
+use sgc_trust::{GroupName, LABEL_BYTES_MAX, NodeName};
+
+use super::error::{Mistake, TopicRule};
+
+/// The longest topic: 256 bytes of DDS less a terminator and 8 for the prefix that rmw adds.
+pub const TOPIC_BYTES_MAX: usize = 247;
+/// The longest message type: 256 bytes of DDS less a terminator and what `::dds_::` and `_` add.
+pub const TYPE_BYTES_MAX: usize = 240;
+/// The longest peer address, as `rmw` has it.
+pub const PEER_BYTES_MAX: usize = 255;
+
+const HOST_BYTES_MAX: usize = 253;
+
+/// Who may subscribe to a share.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Recipient {
+    /// `"*"`: every member of the fleet.
+    Everyone,
+    /// `"group:operators"`: the members of a group, without the prefix.
+    Group(GroupName),
+    /// `"desk"`: one node.
+    Node(NodeName),
+}
+
+impl std::fmt::Display for Recipient {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Everyone => f.write_str("*"),
+            Self::Group(group) => write!(f, "group:{group}"),
+            Self::Node(node) => write!(f, "{node}"),
+        }
+    }
+}
+
+/// Checks a fully qualified topic name as rmw does; repeated underscores are allowed as it allows them.
+pub(super) fn topic(key: &'static str, value: &str) -> Result<String, Mistake> {
+    if value.contains(['*', '?']) {
+        return Err(Mistake::PlannedValue {
+            key,
+            value: value.to_owned(),
+            what: "wildcards are",
+            instead: "name one topic",
+        });
+    }
+    match broken_topic_rule(value) {
+        None => Ok(value.to_owned()),
+        Some(rule) => {
+            Err(Mistake::TopicName { key, value: value.to_owned(), rule, right: repaired_topic(value) })
+        }
+    }
+}
+
+fn broken_topic_rule(value: &str) -> Option<TopicRule> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '/';
+    let words = || value.split('/').skip(1);
+    if value.trim_matches('/').is_empty() {
+        Some(TopicRule::NotEmpty)
+    } else if value.starts_with('~') {
+        Some(TopicRule::NotPrivate)
+    } else if !value.starts_with('/') {
+        Some(TopicRule::Absolute)
+    } else if value.ends_with('/') {
+        Some(TopicRule::NoTrailingSlash)
+    } else if let Some(c) = value.chars().find(|c| !allowed(*c)) {
+        Some(TopicRule::Characters(c))
+    } else if words().any(str::is_empty) {
+        Some(TopicRule::NoRepeatedSlash)
+    } else if words().any(|word| word.starts_with(|c: char| c.is_ascii_digit())) {
+        Some(TopicRule::NoLeadingDigit)
+    } else if value.len() > TOPIC_BYTES_MAX {
+        Some(TopicRule::Length(TOPIC_BYTES_MAX))
+    } else {
+        None
+    }
+}
+
+/// The valid topic that is nearest to `value`, if there is one to be guessed.
+fn repaired_topic(value: &str) -> Option<String> {
+    let value = value.trim();
+    let words = value.strip_prefix("rt/").unwrap_or(value).split('/').filter(|word| !word.is_empty());
+    let repaired: String = words
+        .flat_map(|word| {
+            std::iter::once('/')
+                .chain(word.chars().map(|c| if matches!(c, '-' | ' ' | '.') { '_' } else { c }))
+        })
+        .collect();
+    broken_topic_rule(&repaired).is_none().then_some(repaired)
+}
+
+/// Checks a message type and gives it as `pkg/msg/Name`, also from DDS's `pkg::msg::dds_::Name_`.
+pub(super) fn message_type(key: &'static str, value: &str) -> Result<String, Mistake> {
+    let planned = |what| Mistake::PlannedValue {
+        key,
+        value: value.to_owned(),
+        what,
+        instead: "name a message type, such as \"std_msgs/msg/String\"",
+    };
+    let wrong = |right| Mistake::TypeName { key, value: value.to_owned(), right };
+    if value.len() > TYPE_BYTES_MAX {
+        return Err(Mistake::TooLong { key, bytes: value.len(), max: TYPE_BYTES_MAX });
+    }
+    let dds: Vec<&str> = value.split("::").collect();
+    if let [package, "msg", "dds_", name] = dds[..]
+        && let Some(name) = name.strip_suffix('_')
+        && is_identifier(package)
+        && is_identifier(name)
+    {
+        return Ok(format!("{package}/msg/{name}"));
+    }
+    let words: Vec<&str> = value.split('/').collect();
+    match words[..] {
+        [package, "msg", name] if is_identifier(package) && is_identifier(name) => Ok(value.to_owned()),
+        [_, "srv", _] => Err(planned("services are")),
+        [_, "action", _] => Err(planned("actions are")),
+        _ => {
+            let slashed = value.trim().replace("::", "/").replace('.', "/");
+            let words: Vec<&str> = slashed.split('/').collect();
+            let right = match words[..] {
+                [package, name] | [package, "msg", name] if is_identifier(package) && is_identifier(name) => {
+                    Some(format!("{package}/msg/{name}"))
+                }
+                _ => None,
+            };
+            Err(wrong(right))
+        }
+    }
+}
+
+fn is_identifier(word: &str) -> bool {
+    word.starts_with(|c: char| c.is_ascii_alphabetic())
+        && word.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}
+
+/// Checks the name of a node.
+pub(super) fn node(key: &'static str, value: &str) -> Result<NodeName, Mistake> {
+    value.parse().map_err(|_| {
+        let right = repaired_label(value);
+        Mistake::NodeName { key, value: value.to_owned(), max: LABEL_BYTES_MAX, right }
+    })
+}
+
+/// Checks one entry of `to`.
+pub(super) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mistake> {
+    let recipient = match value.split_once(':') {
+        None if value == "*" => Some(Recipient::Everyone),
+        None => value.parse().ok().map(Recipient::Node),
+        Some(("group", group)) => group.parse().ok().map(Recipient::Group),
+        Some(_) => None,
+    };
+    recipient.ok_or_else(|| Mistake::Recipient { key, value: value.to_owned(), max: LABEL_BYTES_MAX })
+}
+
+/// The valid name that is nearest to `value`, if there is one to be guessed.
+fn repaired_label(value: &str) -> Option<String> {
+    let repaired = value.trim().trim_start_matches('/').to_lowercase().replace([' ', '/'], "-");
+    repaired.parse::<NodeName>().is_ok().then_some(repaired)
+}
+
+/// Checks a static peer: a host name or an IP address, without a port.
+pub(super) fn peer(key: &'static str, value: &str) -> Result<String, Mistake> {
+    if value.len() <= PEER_BYTES_MAX && is_host(value) {
+        Ok(value.to_owned())
+    } else {
+        Err(Mistake::StaticPeer { key, value: value.to_owned() })
+    }
+}
+
+fn is_host(value: &str) -> bool {
+    let is_label = |label: &str| {
+        (1..=63).contains(&label.len())
+            && label.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_'))
+            && !label.starts_with('-')
+            && !label.ends_with('-')
+    };
+    // Four numbers that are no address are a mistyped address, not a name: no top-level domain is a number.
+    let numeric = value.rsplit('.').next().is_some_and(|last| last.chars().all(|c| c.is_ascii_digit()));
+    value.parse::<IpAddr>().is_ok()
+        || (!numeric && value.len() <= HOST_BYTES_MAX && value.split('.').all(is_label))
+}
+
+/// Checks where to dial, `quic://HOST[:PORT]`.
+pub(super) fn router(key: &'static str, value: &str) -> Result<LinkUrl, Mistake> {
+    let url: LinkUrl = value.parse().map_err(|fault| url_mistake(key, value, fault))?;
+    let host = url.host.clone();
+    if !is_host(&host) {
+        return Err(url_mistake(key, value, UrlError::Host(host)));
+    }
+    if host.parse::<IpAddr>().is_ok_and(|address| address.is_unspecified()) {
+        return Err(Mistake::UrlUnspecified { key, value: value.to_owned(), host });
+    }
+    Ok(url)
+}
+
+/// Checks where to listen, `quic://ADDRESS[:PORT]`.
+pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
+    value.parse().map_err(|fault| url_mistake(key, value, fault))
+}
+
+fn url_mistake(key: &'static str, value: &str, fault: UrlError) -> Mistake {
+    let value = value.to_owned();
+    match fault {
+        UrlError::SchemePlanned(_) => {
+            Mistake::PlannedValue { key, value, what: "this transport is", instead: "use quic://" }
+        }
+        fault => Mistake::Url { key, value, fault },
+    }
+}

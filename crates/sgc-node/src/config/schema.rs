@@ -1,0 +1,193 @@
+//! Which tables and keys a configuration has, which are planned, and which one a misspelt key was meant to be.
+//!
+//! This table is the one place where a key becomes known; `docs/configuration.md` is tested against it.
+//! What the values may be is the business of `resolve`.
+
+/// A table of the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Table {
+    /// Keys before the first header.
+    Top,
+    /// `[node]`
+    Node,
+    /// `[ros]`
+    Ros,
+    /// `[[share]]`
+    Share,
+    /// `[[use]]`
+    Use,
+    /// `[router]`
+    Router,
+    /// `[admin]`
+    Admin,
+}
+
+impl Table {
+    /// All of them, in the order in which the reference lists them.
+    pub const ALL: [Self; 7] =
+        [Self::Top, Self::Node, Self::Ros, Self::Share, Self::Use, Self::Router, Self::Admin];
+
+    /// How the table is written, brackets included.
+    pub fn header(self) -> &'static str {
+        match self {
+            Self::Top => "the top level",
+            Self::Node => "[node]",
+            Self::Ros => "[ros]",
+            Self::Share => "[[share]]",
+            Self::Use => "[[use]]",
+            Self::Router => "[router]",
+            Self::Admin => "[admin]",
+        }
+    }
+
+    /// The keys that this version implements.
+    pub fn keys(self) -> &'static [&'static str] {
+        match self {
+            Self::Top => &["identity", "node", "ros", "share", "use", "router", "admin"],
+            Self::Node => &["name", "routers", "identity"],
+            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers"],
+            Self::Share => &[
+                "topic",
+                "to",
+                "type",
+                "priority",
+                "suite",
+                "description",
+                "author",
+                "maintainer",
+                "interface",
+                "unique",
+                "node",
+            ],
+            Self::Use => &["from", "topic", "type", "priority"],
+            Self::Router => &["listen"],
+            Self::Admin => &["socket"],
+        }
+    }
+
+    /// The keys that the design names and a later version brings.
+    pub fn planned_keys(self) -> &'static [&'static str] {
+        match self {
+            Self::Top => &["gateway", "profile"],
+            Self::Node | Self::Ros | Self::Router | Self::Admin => &[],
+            Self::Share => &[
+                "service",
+                "action",
+                "max_rate",
+                "max_bandwidth",
+                "max_age",
+                "compress",
+                "encoding",
+                "link",
+                "as",
+                "namespace",
+                "except",
+            ],
+            Self::Use => &[
+                "service",
+                "action",
+                "max_rate",
+                "max_bandwidth",
+                "max_age",
+                "link",
+                "as",
+                "namespace",
+                "except",
+            ],
+        }
+    }
+
+    /// The tables in which `key` is known, and the key. Tables within tables do not count: a `router` in `[node]`
+    /// is not a misplaced `[router]`.
+    pub(super) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
+        let has = |table: &&Self| table.keys().contains(&key) && (**table != Self::Top || key == "identity");
+        let homes: Vec<Self> = Self::ALL.iter().filter(has).copied().collect();
+        let known = homes.first()?.keys().iter().find(|known| **known == key)?;
+        Some((known, homes.into_iter().map(Self::header).collect()))
+    }
+}
+
+/// The candidate that `word` was most likely meant to be: at most one edit in three characters away, or with the
+/// word as a part of it. Upper and lower case are alike.
+pub(super) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
+    const PART_CHARS_MIN: usize = 4;
+    let word = word.to_lowercase();
+    let chars = word.chars().count();
+    let edits_max = (chars / 3).clamp(1, 3);
+    let close = candidates
+        .iter()
+        .map(|candidate| (edits(&word, &candidate.to_lowercase()), *candidate))
+        .filter(|(edits, candidate)| *edits <= edits_max && *edits < candidate.len())
+        .min_by_key(|(edits, _)| *edits)
+        .map(|(_, candidate)| candidate);
+    let has_part =
+        |candidate: &&&str| chars >= PART_CHARS_MIN && candidate.to_lowercase().contains(word.as_str());
+    close.or_else(|| candidates.iter().find(has_part).copied())
+}
+
+/// Insertions, deletions, substitutions and swaps of neighbours that turn `a` into `b` (optimal string
+/// alignment). Long words are not compared, so the cost is bounded.
+fn edits(a: &str, b: &str) -> usize {
+    const WORD_CHARS_MAX: usize = 64;
+    let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
+    if a.len().max(b.len()) > WORD_CHARS_MAX {
+        return usize::MAX;
+    }
+    let mut rows = vec![vec![0; b.len() + 1]; a.len() + 1];
+    for i in 0..=a.len() {
+        for j in 0..=b.len() {
+            rows[i][j] = if i == 0 || j == 0 {
+                i + j
+            } else {
+                let substitute = rows[i - 1][j - 1] + usize::from(a[i - 1] != b[j - 1]);
+                let best = substitute.min(rows[i - 1][j] + 1).min(rows[i][j - 1] + 1);
+                let swapped = i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1];
+                if swapped { best.min(rows[i - 2][j - 2] + 1) } else { best }
+            };
+        }
+    }
+    rows[a.len()][b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn edits_counts_each_kind_once() {
+        for (a, b, expected) in [
+            ("topic", "topic", 0),
+            ("tpoic", "topic", 1),
+            ("topc", "topic", 1),
+            ("topicc", "topic", 1),
+            ("tobic", "topic", 1),
+            ("", "to", 2),
+            ("listen", "use", 4),
+        ] {
+            assert_eq!(edits(a, b), expected, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn only_a_likely_word_is_suggested() {
+        let keys = Table::Share.keys();
+        assert_eq!(nearest("tpoic", keys), Some("topic"));
+        assert_eq!(nearest("Topics", keys), Some("topic"));
+        assert_eq!(nearest("maintaner", keys), Some("maintainer"));
+        assert_eq!(nearest("name", keys), None);
+        assert_eq!(nearest("colour", keys), None);
+        assert_eq!(nearest("domain", Table::Ros.keys()), Some("domain_id"));
+        assert_eq!(nearest("localhost", &["OFF", "LOCALHOST"]), Some("LOCALHOST"));
+        assert_eq!(nearest("x", keys), None);
+        assert_eq!(nearest(&"x".repeat(1000), keys), None);
+    }
+
+    #[test]
+    fn no_key_is_both_here_and_planned() {
+        for table in Table::ALL {
+            for key in table.planned_keys() {
+                assert!(!table.keys().contains(key), "{} {key}", table.header());
+            }
+        }
+    }
+}

@@ -1,0 +1,726 @@
+//! The control task: owns the three machines, feeds them what happens, and carries out what they decide.
+//!
+//! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
+//! happens in tasks and threads of its own.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use rand_chacha::ChaCha20Rng;
+use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig};
+use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
+use sgc_router::{FibEntry, LinkClose, LinkId, Output as RouterOutput, Router};
+use sgc_transport::{AnyLink, CloseReason, Link};
+use sgc_trust::Identity;
+use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
+use tokio::sync::{Semaphore, mpsc, oneshot};
+use tracing::{debug, error, info, warn};
+
+use crate::dataplane::{DataPlane, Forward, Out};
+use crate::links::ControlTx;
+use crate::outflow::OutFlow;
+use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
+use crate::sources::{LocalShare, REPLAYS_MAX, SourceMap, SourceSlot};
+use crate::stats::{Drops, NameStats};
+use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+
+/// Events that may wait for the control task; who sends more waits.
+pub(crate) const INBOX_MAX: usize = 4096;
+/// Events handled before the timers are looked at again.
+const BATCH_MAX: usize = 256;
+/// How long a history may take before it is asked for again.
+const HISTORY_RETRY: Duration = Duration::from_secs(2);
+/// Bytes of history kept for late joiners of one publisher.
+const HISTORY_BYTES_MAX: usize = 64 << 20;
+/// Messages of history kept where the publisher keeps all.
+const HISTORY_KEEP_ALL_MAX: usize = 4096;
+
+/// What happens to the control task.
+pub(crate) enum CoreEvent {
+    /// A link was made.
+    LinkUp {
+        /// The link.
+        link: AnyLink,
+        /// The URL dialled, if this node dialled.
+        url: Option<String>,
+        /// Where its control frames go.
+        control: ControlTx,
+        /// Its number and the data path, or nothing if the node is stopping.
+        reply: oneshot::Sender<Option<(LinkId, Arc<DataPlane>)>>,
+    },
+    /// A link ended.
+    LinkDown {
+        /// Which.
+        id: LinkId,
+    },
+    /// A control frame came.
+    Frame {
+        /// Over which link.
+        link: LinkId,
+        /// What.
+        frame: Control,
+    },
+    /// A malformed control frame came.
+    Malformed {
+        /// Over which link.
+        link: LinkId,
+    },
+    /// The local graph changed.
+    Discovery(DiscoveryEvent),
+    /// A local writer was made, or not.
+    WriterReady {
+        /// The joined name.
+        name: Name,
+        /// The source that it is for.
+        source: Option<SourceId>,
+        /// As it was asked for.
+        spec: EndpointSpec,
+        /// Its queue.
+        writer: Option<Arc<WriterQueue>>,
+    },
+    /// A local reader was made.
+    ReaderReady {
+        /// The share.
+        name: Name,
+        /// As it was asked for.
+        spec: EndpointSpec,
+        /// Dropping it ends it.
+        reader: Box<dyn std::any::Any + Send>,
+    },
+    /// Somebody asks how things are.
+    Status(oneshot::Sender<Status>),
+    /// Take nothing in any more; answered with what still leaves.
+    Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
+    /// Take back what is shared and say goodbye; answered with the links, which the peers then close.
+    Stop(oneshot::Sender<Vec<AnyLink>>),
+}
+
+struct LinkEntry {
+    link: AnyLink,
+    url: Option<String>,
+    control: ControlTx,
+    flows: HashMap<Name, Arc<OutFlow>>,
+}
+
+/// The control task's state. `N` is the local network; a pure router has none.
+pub(crate) struct Core<N: RosNetwork> {
+    identity: Arc<Identity>,
+    router: Router,
+    endpoint: Endpoint,
+    routes: Option<Routes<ChaCha20Rng>>,
+    network: Option<Arc<N>>,
+    data: Arc<DataPlane>,
+    links: BTreeMap<LinkId, LinkEntry>,
+    next_link: u32,
+    entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
+    shares: HashMap<Name, Arc<LocalShare>>,
+    readers: HashMap<Name, (EndpointSpec, Option<Box<dyn std::any::Any + Send>>)>,
+    sinks: HashMap<Name, Arc<LocalSink>>,
+    writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
+    history_due: BTreeMap<(Name, SourceId), Instant>,
+    replays: Arc<Semaphore>,
+    requests: mpsc::Sender<SinkRequest>,
+    control_drops: Drops,
+    ros_failures: Arc<Drops>,
+    events: mpsc::WeakSender<CoreEvent>,
+    started: Instant,
+    superseded: BTreeSet<String>,
+    transport: Arc<sgc_transport::TransportMetrics>,
+    alive: mpsc::Sender<()>,
+}
+
+/// What a [`Core`] is made of.
+pub(crate) struct CoreParts<N> {
+    /// This node.
+    pub identity: Arc<Identity>,
+    /// The routing machine.
+    pub router: Router,
+    /// The endpoint machine.
+    pub endpoint: Endpoint,
+    /// The route machine, where there is a local network.
+    pub routes: Option<Routes<ChaCha20Rng>>,
+    /// The local network.
+    pub network: Option<Arc<N>>,
+    /// Its own inbox.
+    pub events: mpsc::WeakSender<CoreEvent>,
+    /// Held by every thread and blocking task, for as long as it uses the runtime.
+    pub(crate) alive: mpsc::Sender<()>,
+    /// Transport counters.
+    pub transport: Arc<sgc_transport::TransportMetrics>,
+}
+
+/// The present, by both clocks.
+pub(crate) fn now() -> Now {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// The control task and the inbox of its sinks.
+    pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
+        let (requests, requested) = mpsc::channel(INBOX_MAX);
+        let core = Self {
+            identity: parts.identity,
+            router: parts.router,
+            endpoint: parts.endpoint,
+            routes: parts.routes,
+            network: parts.network,
+            data: Arc::default(),
+            links: BTreeMap::new(),
+            next_link: 1,
+            entries: HashMap::new(),
+            shares: HashMap::new(),
+            readers: HashMap::new(),
+            sinks: HashMap::new(),
+            writers: HashMap::new(),
+            history_due: BTreeMap::new(),
+            replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
+            requests,
+            control_drops: Drops::default(),
+            ros_failures: Arc::default(),
+            events: parts.events,
+            started: Instant::now(),
+            superseded: BTreeSet::new(),
+            transport: parts.transport,
+            alive: parts.alive,
+        };
+        (core, requested)
+    }
+
+    /// Runs until stopped or until nobody can send events any more.
+    pub(crate) async fn run(
+        mut self,
+        mut inbox: mpsc::Receiver<CoreEvent>,
+        mut requested: mpsc::Receiver<SinkRequest>,
+    ) {
+        let mut batch = Vec::with_capacity(BATCH_MAX);
+        let mut deadline = self.drain();
+        loop {
+            let timer = async {
+                match deadline {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                n = inbox.recv_many(&mut batch, BATCH_MAX) => {
+                    if n == 0 {
+                        return;
+                    }
+                    for event in batch.drain(..) {
+                        if let CoreEvent::Stop(done) = event {
+                            let _ = done.send(self.stop());
+                            return;
+                        }
+                        self.handle(event);
+                        self.drain();
+                    }
+                }
+                Some(request) = requested.recv() => self.handle_sink(request),
+                () = timer => {}
+            }
+            self.handle_timeouts();
+            deadline = self.drain();
+        }
+    }
+
+    fn handle(&mut self, event: CoreEvent) {
+        match event {
+            CoreEvent::LinkUp { link, url, control, reply } => {
+                let id = LinkId(self.next_link);
+                self.next_link += 1;
+                let node = link.peer().node_id;
+                let remote = link.remote();
+                self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
+                if reply.send(Some((id, self.data.clone()))).is_err() {
+                    debug!(%remote, "the link's task is gone");
+                }
+                self.router.handle_link_up(id, node);
+            }
+            CoreEvent::LinkDown { id } => {
+                self.router.handle_link_down(id);
+                if let Some(entry) = self.links.remove(&id) {
+                    entry.flows.values().for_each(|f| f.close());
+                }
+            }
+            CoreEvent::Frame { link, frame } => self.router.handle_frame(now(), link, frame),
+            CoreEvent::Malformed { link } => {
+                self.control_drops.count(&format!("malformed/{link}"));
+            }
+            CoreEvent::Discovery(event) => {
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_discovery(Instant::now(), event);
+                }
+            }
+            CoreEvent::ReaderReady { name, spec, reader } => match self.readers.get_mut(&name) {
+                Some((wanted, slot)) if *wanted == spec => *slot = Some(reader),
+                _ => drop_elsewhere(reader),
+            },
+            CoreEvent::WriterReady { name, source, spec, writer } => {
+                let wanted = self.writers.get(&(name, source)) == Some(&spec);
+                match (self.sinks.get(&name), writer) {
+                    (Some(sink), Some(writer)) if wanted => {
+                        sink.set_writer(source, Some(writer));
+                        self.ask_histories(name);
+                    }
+                    (_, Some(writer)) => writer.close(),
+                    (_, None) => {}
+                }
+            }
+            CoreEvent::Status(reply) => {
+                let _ = reply.send(self.status());
+            }
+            CoreEvent::Quiesce(reply) => {
+                let _ = reply.send(self.quiesce());
+            }
+            CoreEvent::Stop(_) => {}
+        }
+    }
+
+    fn handle_sink(&mut self, request: SinkRequest) {
+        match request {
+            SinkRequest::History(name, source) => {
+                if self.writers.contains_key(&(name, Some(source))) {
+                    self.ask_history(name, source);
+                }
+            }
+            SinkRequest::Synced(name, source) => {
+                self.history_due.remove(&(name, source));
+            }
+        }
+    }
+
+    fn handle_timeouts(&mut self) {
+        let now = now();
+        self.router.handle_timeout(now);
+        self.endpoint.handle_timeout(now);
+        if let Some(routes) = &mut self.routes {
+            routes.handle_timeout(now.instant);
+        }
+        let due: Vec<_> =
+            self.history_due.iter().filter(|(_, at)| **at <= now.instant).map(|(key, _)| *key).collect();
+        for (name, source) in due {
+            self.history_due.remove(&(name, source));
+            if self.writers.contains_key(&(name, Some(source))) {
+                self.ask_history(name, source);
+            }
+        }
+    }
+
+    /// Carries out everything the machines want until they want nothing more; returns when to look again.
+    fn drain(&mut self) -> Option<Instant> {
+        loop {
+            let router = loop {
+                match self.router.poll_output() {
+                    RouterOutput::Timeout(at) => break at,
+                    output => self.router_output(output),
+                }
+            };
+            let mut progressed = false;
+            let endpoint = loop {
+                match self.endpoint.poll_output() {
+                    EndpointOutput::Timeout(at) => break at,
+                    output => {
+                        progressed = true;
+                        self.endpoint_output(output);
+                    }
+                }
+            };
+            while let Some(command) = self.routes.as_mut().and_then(Routes::poll_command) {
+                progressed = true;
+                self.carry_out(command);
+            }
+            if !progressed {
+                let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
+                let history = self.history_due.values().min().copied();
+                return [router, endpoint, routes, history].into_iter().flatten().min();
+            }
+        }
+    }
+
+    fn router_output(&mut self, output: RouterOutput) {
+        match output {
+            RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
+            RouterOutput::Send { link, frame } => {
+                let Some(entry) = self.links.get(&link) else { return };
+                if !entry.control.send(frame) {
+                    warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
+                    self.control_drops.count(&format!("control_queue_full/{link}"));
+                    entry.link.close(CloseReason::Overloaded);
+                }
+            }
+            RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
+            RouterOutput::Close { link, reason } => {
+                let Some(entry) = self.links.get(&link) else { return };
+                match &reason {
+                    LinkClose::Superseded => {
+                        let peer = entry.link.peer().node_id.to_string();
+                        if !self.superseded.insert(peer.clone()) && self.superseded.len() < 1024 {
+                            warn!(%peer, "connects again and again from new runs: do two processes use one identity?");
+                        }
+                        entry.link.close(CloseReason::Replaced);
+                    }
+                    LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
+                    LinkClose::Greeting | LinkClose::Loop => {
+                        warn!(%link, remote = %entry.link.remote(), "{reason}");
+                        entry.link.close(CloseReason::Protocol(reason.to_string()));
+                    }
+                }
+            }
+            RouterOutput::Dropped(dropped) => {
+                let key = format!("{}/{}", dropped.reason.key(), dropped.link);
+                if self.control_drops.count(&key) {
+                    let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
+                    warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
+                } else {
+                    debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
+                }
+            }
+            RouterOutput::Timeout(_) => {}
+        }
+    }
+
+    fn endpoint_output(&mut self, output: EndpointOutput) {
+        let now = now();
+        match output {
+            EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
+            EndpointOutput::Dropped(dropped) => {
+                if self.control_drops.count(&format!("endpoint_{}", dropped.key())) {
+                    warn!(reason = %dropped, "refused; counted from here on");
+                } else {
+                    debug!(reason = %dropped, "refused");
+                }
+            }
+            EndpointOutput::Event(event) => self.endpoint_event(now, event),
+            EndpointOutput::Timeout(_) => {}
+        }
+    }
+
+    fn endpoint_event(&mut self, now: Now, event: Event) {
+        let Some(routes) = &mut self.routes else { return };
+        match event {
+            Event::SinkJoined { name, sink, peer } => {
+                info!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
+                routes.handle_sink_joined(&name, sink);
+            }
+            Event::SinkLeft { name, sink } => {
+                debug!(name = %name.short(), "a subscriber is gone");
+                routes.handle_sink_left(now.instant, &name, &sink);
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                if self.control_drops.count(&format!("join_refused/{}", peer.short())) {
+                    warn!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                }
+            }
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name) {
+                    share.replay(recover, &self.replays);
+                }
+            }
+            Event::Granted { name, grant } => {
+                info!(name = %name.short(), "granted");
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.grant(grant);
+                }
+                routes.handle_granted(&name);
+                self.ask_histories(name);
+            }
+            Event::Refused { name, by } => {
+                warn!(name = %name.short(), reason = %by, "refused; asking again later");
+                routes.handle_refused(&name, by);
+            }
+            Event::Lost { name, reason } => {
+                info!(name = %name.short(), ?reason, "interrupted; waiting for the way to come back");
+                routes.handle_lost(now.instant, &name);
+            }
+            Event::Catalogue { owner, catalogue } => {
+                debug!(owner = %owner.short(), entries = catalogue.entries.len(), "catalogue");
+                routes.handle_catalogue(owner, catalogue);
+            }
+            Event::OwnerLost { owner, reason } => {
+                info!(owner = %owner.short(), ?reason, "owner out of reach");
+                routes.handle_owner_lost(now.instant, owner, reason);
+            }
+            Event::OwnerRefused { owner, by } => {
+                warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
+                routes.handle_owner_refused(owner, by);
+            }
+        }
+    }
+
+    fn carry_out(&mut self, command: Command) {
+        let now = now();
+        match command {
+            Command::Share(spec) => {
+                let topic = spec.metadata.ros_name.clone();
+                match self.endpoint.share(now, spec) {
+                    Ok(name) => {
+                        info!(%topic, %name, "shared");
+                        let share = LocalShare::new(name, self.data.clone(), self.alive.clone());
+                        self.shares.insert(name, Arc::new(share));
+                    }
+                    Err(why) => error!(%topic, "not shared: {why}"),
+                }
+            }
+            Command::UpdateShare { name, qos, sources } => {
+                self.endpoint.update_share(now, &name, qos, sources)
+            }
+            Command::Unshare { name } => {
+                self.endpoint.unshare(now, &name);
+                if let Some(share) = self.shares.remove(&name) {
+                    share.close();
+                }
+            }
+            Command::MapSources { name, qos, class, own } => self.map_sources(name, &qos, class, own),
+            Command::OpenReader { name, spec } => self.open_reader(name, spec),
+            Command::CloseReader { name } => {
+                if let Some((_, Some(reader))) = self.readers.remove(&name) {
+                    drop_elsewhere(reader);
+                }
+            }
+            Command::Join { name, owner, transient_local } => {
+                let sink = LocalSink::new(name, transient_local, self.requests.clone());
+                self.sinks.insert(name, Arc::new(sink));
+                self.endpoint.join(now, name, owner);
+            }
+            Command::Leave { name } => {
+                self.endpoint.leave(now, &name);
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
+                }
+                self.history_due.retain(|(n, _), _| *n != name);
+            }
+            Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
+            Command::CloseWriter { name, source } => {
+                self.writers.remove(&(name, source));
+                if let Some(source) = source {
+                    self.history_due.remove(&(name, source));
+                }
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.set_writer(source, None);
+                }
+            }
+            Command::Report(problem) => warn!("{problem}"),
+        }
+    }
+
+    fn map_sources(&mut self, name: Name, qos: &Qos, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
+        let (Some(share), Some(grant)) = (self.shares.get(&name), self.endpoint.share_grant(&name).cloned())
+        else {
+            return;
+        };
+        let old = share.map();
+        let slot = |id, qos: &Qos, keeps_history: bool| {
+            let depth = match qos.history {
+                _ if !keeps_history => 0,
+                History::KeepAll => HISTORY_KEEP_ALL_MAX,
+                History::KeepLast(n) => n as usize,
+            };
+            let config = SourceConfig {
+                name,
+                id,
+                class,
+                reliable: qos.is_reliable(),
+                history_depth: depth,
+                history_bytes_max: HISTORY_BYTES_MAX,
+            };
+            let source = Arc::new(Mutex::new(Source::new(config, &grant)?));
+            Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
+        };
+        // A source is never made twice under one id: its sequence numbers are nonces.
+        let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
+        for (guid, id, qos) in own {
+            let kept = map.slot(&id).or_else(|| old.slot(&id));
+            if let Some(slot) = kept.or_else(|| slot(id, &qos, true)) {
+                map.own.insert(guid, slot);
+            }
+        }
+        let kept = old.shared.clone().filter(|s| s.reliable == qos.is_reliable());
+        map.shared = kept.or_else(|| slot(self.endpoint.new_source_id(), qos, false));
+        share.set_map(map);
+    }
+
+    fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
+        let (Some(network), Some(share)) = (self.network.clone(), self.shares.get(&name).cloned()) else {
+            return;
+        };
+        let Some(events) = self.events.upgrade() else { return };
+        self.readers.insert(name, (spec.clone(), None));
+        let alive = self.alive.clone();
+        let failures = self.ros_failures.clone();
+        tokio::task::spawn_blocking(move || {
+            let handler: SampleHandler = Box::new(move |sample: Sample| share.publish(sample));
+            match network.create_reader(&spec, handler) {
+                Ok(reader) => {
+                    let _ = events.blocking_send(CoreEvent::ReaderReady {
+                        name,
+                        spec,
+                        reader: Box::new((reader, alive)),
+                    });
+                }
+                Err(why) => {
+                    failures.count("create_reader");
+                    error!("{why}");
+                }
+            }
+        });
+    }
+
+    fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
+        let Some(network) = self.network.clone() else { return };
+        let Some(events) = self.events.upgrade() else { return };
+        self.writers.insert((name, source), spec.clone());
+        let alive = self.alive.clone();
+        let failures = self.ros_failures.clone();
+        tokio::task::spawn_blocking(move || {
+            let writer = network.create_writer(&spec).map_err(|e| e.to_string()).and_then(|writer| {
+                WriterQueue::spawn(writer, spec.topic.clone(), failures.clone(), alive)
+                    .map_err(|e| e.to_string())
+            });
+            let writer = writer
+                .inspect_err(|why| {
+                    failures.count("create_writer");
+                    error!("{why}");
+                })
+                .ok();
+            let _ = events.blocking_send(CoreEvent::WriterReady { name, source, spec, writer });
+        });
+    }
+
+    /// Asks for every history that a sink's writers still lack.
+    fn ask_histories(&mut self, name: Name) {
+        let Some(sink) = self.sinks.get(&name) else { return };
+        for source in sink.unsynced() {
+            self.ask_history(name, source);
+        }
+    }
+
+    fn ask_history(&mut self, name: Name, source: SourceId) {
+        self.endpoint.recover(name, source, 1, u64::MAX);
+        self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
+    }
+
+    fn set_forward(&mut self, name: Name, entry: Option<FibEntry>) {
+        let Some(entry) = entry else {
+            self.entries.remove(&name);
+            self.data.set(name, None);
+            for link in self.links.values_mut() {
+                if let Some(flow) = link.flows.remove(&name) {
+                    flow.close();
+                }
+            }
+            return;
+        };
+        let stats = self.entries.get(&name).map(|(_, stats)| stats.clone()).unwrap_or_default();
+        let mut wanted: BTreeSet<LinkId> = entry.down.iter().copied().collect();
+        if !entry.publishers.is_empty() {
+            wanted.insert(entry.up);
+        }
+        let mut outs = Vec::new();
+        for id in &wanted {
+            if *id == LinkId::LOCAL {
+                if let Some(sink) = self.sinks.get(&name) {
+                    outs.push((*id, Out::Local(sink.clone())));
+                }
+            } else if let Some(link) = self.links.get_mut(id) {
+                let flow =
+                    link.flows.entry(name).or_insert_with(|| OutFlow::spawn(link.link.clone(), name)).clone();
+                outs.push((*id, Out::Link(flow)));
+            }
+        }
+        for (id, link) in &mut self.links {
+            if !wanted.contains(id)
+                && let Some(flow) = link.flows.remove(&name)
+            {
+                flow.close();
+            }
+        }
+        self.data.set(name, Some(Forward::new(entry.clone(), outs, stats.clone())));
+        self.entries.insert(name, (entry, stats));
+    }
+
+    /// Stops taking in; what is queued still leaves.
+    fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
+        self.routes = None;
+        for share in self.shares.values() {
+            share.close();
+        }
+        for (_, (_, reader)) in self.readers.drain() {
+            if let Some(reader) = reader {
+                drop_elsewhere(reader);
+            }
+        }
+        let flows: Vec<_> = self.links.values().flat_map(|l| l.flows.values().cloned()).collect();
+        flows.iter().for_each(|f| f.close());
+        flows
+    }
+
+    /// Takes back what was shared, and says goodbye.
+    fn stop(&mut self) -> Vec<AnyLink> {
+        self.endpoint.withdraw_all(now());
+        self.drain();
+        for entry in self.links.values() {
+            entry.control.send(Control::Goodbye);
+        }
+        for sink in self.sinks.values() {
+            sink.close();
+        }
+        self.links.values().map(|l| l.link.clone()).collect()
+    }
+
+    fn status(&self) -> Status {
+        let links = self.links.iter().map(|(id, entry)| {
+            let stats = entry.link.stats();
+            LinkStatus {
+                id: id.0,
+                peer: entry.link.peer().node_id.to_string(),
+                remote: entry.link.remote().to_string(),
+                url: entry.url.clone(),
+                rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                sent_bytes: stats.sent_bytes,
+                received_bytes: stats.received_bytes,
+            }
+        });
+        let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
+        let mut drops = self.control_drops.snapshot();
+        drops.extend(self.data.drops().snapshot());
+        drops.extend(self.ros_failures.snapshot());
+        let router = self.router.stats();
+        Status {
+            node: self.identity.node_name().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            uptime_s: self.started.elapsed().as_secs(),
+            links: links.collect(),
+            routes: self
+                .routes
+                .iter()
+                .flat_map(Routes::status)
+                .map(|route| {
+                    let messages = route.name.and_then(|n| {
+                        let published = self.shares.get(&n).map(|s| s.published());
+                        published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
+                    });
+                    RouteLine::new(route, messages)
+                })
+                .collect(),
+            names: names.collect(),
+            drops,
+            refused: sgc_transport::RefusalKind::ALL
+                .into_iter()
+                .map(|kind| (kind.label().to_owned(), self.transport.refused(kind)))
+                .filter(|(_, n)| *n > 0)
+                .collect(),
+            router: RouterLine {
+                names: router.names,
+                routed_names: router.routed_names,
+                branches: router.branches,
+            },
+        }
+    }
+}
+
+/// Drops something whose end may block, on a thread where it may.
+fn drop_elsewhere(thing: Box<dyn std::any::Any + Send>) {
+    tokio::task::spawn_blocking(move || drop(thing));
+}

@@ -1,0 +1,147 @@
+//! The data path: from the link or local reader that a packet came from to all that it goes to.
+//!
+//! Readers call [`DataPlane::forward`] themselves. The lookup is one atomic load of an immutable table;
+//! payloads are shared, not copied. The control task alone changes tables, by putting a new one in place of
+//! the old.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+
+use arc_swap::ArcSwap;
+use sgc_router::{FibEntry, LinkId};
+use sgc_wire::{Name, Packet};
+use tracing::{debug, warn};
+
+use crate::outflow::OutFlow;
+use crate::sinks::LocalSink;
+use crate::stats::{DataDrop, Drops, NameStats};
+
+/// Tables that the names are spread over, so that a change copies a part only.
+const SHARDS: usize = 64;
+
+/// Where packets of one name go.
+pub(crate) struct Forward {
+    entry: FibEntry,
+    outs: Vec<(LinkId, Out)>,
+    stats: Arc<NameStats>,
+}
+
+/// One way out.
+pub(crate) enum Out {
+    /// Over a link.
+    Link(Arc<OutFlow>),
+    /// To this node's own subscriber.
+    Local(Arc<LocalSink>),
+}
+
+impl Forward {
+    /// `outs` must hold a way for every link of `entry` that data can leave on.
+    pub(crate) fn new(entry: FibEntry, outs: Vec<(LinkId, Out)>, stats: Arc<NameStats>) -> Self {
+        Self { entry, outs, stats }
+    }
+
+    fn out(&self, link: LinkId) -> Option<&Out> {
+        self.outs.iter().find(|(l, _)| *l == link).map(|(_, out)| out)
+    }
+}
+
+/// The tables.
+pub(crate) struct DataPlane {
+    shards: [ArcSwap<HashMap<Name, Arc<Forward>>>; SHARDS],
+    drops: Drops,
+}
+
+impl Default for DataPlane {
+    fn default() -> Self {
+        Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops: Drops::default() }
+    }
+}
+
+impl DataPlane {
+    /// Puts the forwarding of a name in place, or ends it.
+    pub(crate) fn set(&self, name: Name, forward: Option<Forward>) {
+        let shard = self.shard(&name);
+        let mut table = HashMap::clone(&shard.load());
+        match forward {
+            Some(forward) => table.insert(name, Arc::new(forward)),
+            None => table.remove(&name),
+        };
+        shard.store(Arc::new(table));
+    }
+
+    /// True if anybody gets what is published under `name`.
+    pub(crate) fn is_wanted(&self, name: &Name) -> bool {
+        self.shard(name).load().contains_key(name)
+    }
+
+    /// Sends a packet on its ways. Waits while a reliable one is full; the others of the same name wait with it.
+    pub(crate) async fn forward(&self, ingress: LinkId, mut packet: Packet) {
+        let Some(forward) = self.shard(&packet.header.name).load().get(&packet.header.name).cloned() else {
+            return self.drop_packet(ingress, &packet, DataDrop::NoTree);
+        };
+        if !forward.entry.accepts_from(ingress) {
+            forward.stats.dropped.fetch_add(1, Relaxed);
+            return self.drop_packet(ingress, &packet, DataDrop::WrongWay);
+        }
+        if ingress != LinkId::LOCAL {
+            match packet.header.hops.checked_sub(1) {
+                Some(hops) if hops > 0 => packet.header.hops = hops,
+                _ => {
+                    forward.stats.dropped.fetch_add(1, Relaxed);
+                    return self.drop_packet(ingress, &packet, DataDrop::HopLimit);
+                }
+            }
+        }
+        forward.stats.count(packet.payload.len());
+        if let Some(sink) = packet.header.to {
+            return match forward.entry.egress_to(&sink).and_then(|link| forward.out(link)) {
+                Some(out) => self.send(ingress, &forward, out, packet).await,
+                None => self.drop_packet(ingress, &packet, DataDrop::NoSuchSink),
+            };
+        }
+        let mut rest = forward.entry.egress(ingress).filter_map(|link| forward.out(link)).peekable();
+        while let Some(out) = rest.next() {
+            if rest.peek().is_none() {
+                return self.send(ingress, &forward, out, packet).await;
+            }
+            self.send(ingress, &forward, out, packet.clone()).await;
+        }
+    }
+
+    /// Counts what could not be sent on, and says so the first time.
+    pub(crate) fn drop_packet(&self, ingress: LinkId, packet: &Packet, reason: DataDrop) {
+        self.count(ingress, &packet.header.name, reason);
+    }
+
+    /// Counts a drop of something of `name` that came over `ingress`.
+    pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
+        debug!(%ingress, name = %name.short(), ?reason, "dropped");
+        let suspicious = matches!(reason, DataDrop::WrongWay | DataDrop::HopLimit | DataDrop::Malformed);
+        if self.drops.count(&format!("{reason:?}/{ingress}")) && suspicious {
+            warn!(%ingress, ?reason, "a peer sends what it should not; dropped and counted from here on");
+        }
+    }
+
+    /// Drops by reason and link, and by reason of this node's sinks.
+    pub(crate) fn drops(&self) -> &Drops {
+        &self.drops
+    }
+
+    async fn send(&self, ingress: LinkId, forward: &Forward, out: &Out, packet: Packet) {
+        let name = packet.header.name;
+        let dropped = match out {
+            Out::Link(flow) => flow.push(packet).await,
+            Out::Local(sink) => sink.deliver(packet, &self.drops).await,
+        };
+        if let Some((reason, n)) = dropped {
+            forward.stats.dropped.fetch_add(n, Relaxed);
+            self.count(ingress, &name, reason);
+        }
+    }
+
+    fn shard(&self, name: &Name) -> &ArcSwap<HashMap<Name, Arc<Forward>>> {
+        // Names are hashes: any byte spreads them evenly.
+        &self.shards[usize::from(name.0[0]) % SHARDS]
+    }
+}

@@ -1,0 +1,23 @@
+//! The driver of SGC: the one place where machines, sockets, the local ROS 2 network, files and clocks meet.
+//!
+//! It decides nothing that a machine can decide. [`config`] makes a [`config::Config`] of what the user wrote;
+//! [`run`] runs it. Inside, one control task owns the machines (`core`), and the data path (`dataplane`) runs
+//! beside it, on the tasks and threads that receive.
+#![forbid(unsafe_code)]
+
+pub mod config;
+mod core;
+mod dataplane;
+mod links;
+mod node;
+mod outflow;
+mod queue;
+mod sinks;
+mod sources;
+mod stats;
+mod status;
+
+pub use node::{
+    NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
+};
+pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};

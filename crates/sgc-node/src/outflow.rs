@@ -1,0 +1,202 @@
+//! What leaves for one link under one name: a bounded queue and the task that empties it onto the link.
+//!
+//! Reliable packets share one flow of the link; a best-effort message goes as a datagram if it fits one, else as a
+//! flow of its own. Of best-effort messages in several packets only the newest complete one waits.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
+use sgc_wire::{Name, Packet};
+use tokio::sync::watch;
+use tracing::debug;
+
+use crate::queue::{PushError, Queue};
+use crate::stats::DataDrop;
+
+/// Packets that may wait for one link under one name.
+pub(crate) const OUTFLOW_PACKETS_MAX: usize = 4096;
+/// Bytes of reliable packets that may wait before the source is pushed back.
+pub(crate) const OUTFLOW_RELIABLE_BYTES_MAX: usize = 4 << 20;
+/// How long a reliable source is pushed back by a link that takes nothing at all.
+pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
+/// Bytes of best-effort packets that may wait: the largest message, and one more like it.
+pub(crate) const OUTFLOW_BYTES_MAX: usize = 64 << 20;
+
+/// The queue's end that the data path sees.
+pub(crate) struct OutFlow {
+    queue: Queue<Packet>,
+    /// Complete best-effort messages of several packets in the queue.
+    complete: AtomicUsize,
+    ended: watch::Sender<bool>,
+}
+
+impl OutFlow {
+    /// Starts the task that sends; it ends when the flow is closed and empty, or the link ends.
+    pub(crate) fn spawn(link: AnyLink, name: Name) -> Arc<Self> {
+        let flow = Arc::new(Self {
+            queue: Queue::new(OUTFLOW_PACKETS_MAX),
+            complete: AtomicUsize::new(0),
+            ended: watch::Sender::new(false),
+        });
+        let task = flow.clone();
+        tokio::spawn(async move {
+            let mut sender = Sender { link, reliable: None, message: None };
+            while let Some(packet) = task.queue.pop().await {
+                if task.is_superseded(&packet) {
+                    sender.abandon(&packet);
+                    continue;
+                }
+                if let Err(error) = sender.send(packet).await {
+                    debug!(name = %name.short(), %error, "no more is sent over this link");
+                    break;
+                }
+            }
+            task.close();
+            sender.finish().await;
+            task.ended.send_replace(true);
+        });
+        flow
+    }
+
+    /// Queues a packet; says what was dropped instead, and how many.
+    pub(crate) async fn push(&self, packet: Packet) -> Option<(DataDrop, u64)> {
+        let bytes = packet.encoded_bytes();
+        if packet.header.reliable {
+            return match self.queue.push(packet, bytes, OUTFLOW_RELIABLE_BYTES_MAX, OUTFLOW_PATIENCE).await {
+                Ok(()) => None,
+                Err(PushError::Stalled) => Some((DataDrop::Stalled, 1)),
+                Err(PushError::Closed) => Some((DataDrop::LinkClosed, 1)),
+            };
+        }
+        if self.queue.is_closed() {
+            return Some((DataDrop::LinkClosed, 1));
+        }
+        if ends_large_message(&packet) {
+            self.complete.fetch_add(1, Ordering::AcqRel);
+        }
+        let mut evicted = 0;
+        self.queue.push_evicting(packet, bytes, OUTFLOW_BYTES_MAX, |old| {
+            evicted += 1;
+            if ends_large_message(&old) {
+                self.complete.fetch_sub(1, Ordering::AcqRel);
+            }
+        });
+        (evicted > 0).then_some((DataDrop::Stale, evicted))
+    }
+
+    /// Ends it: what is queued is still sent.
+    pub(crate) fn close(&self) {
+        self.queue.close();
+    }
+
+    /// Waits until it has ended.
+    pub(crate) async fn ended(&self) {
+        // The sender is this very flow, so it is there.
+        let _ = self.ended.subscribe().wait_for(|ended| *ended).await;
+    }
+
+    /// True if a packet begins or continues a best-effort message that a complete newer one overtakes.
+    fn is_superseded(&self, packet: &Packet) -> bool {
+        if packet.header.reliable || packet.header.fragments() == 1 {
+            return false;
+        }
+        let behind = if ends_large_message(packet) {
+            self.complete.fetch_sub(1, Ordering::AcqRel) - 1
+        } else {
+            self.complete.load(Ordering::Acquire).saturating_sub(1)
+        };
+        packet.header.index == 0 && behind > 0
+    }
+}
+
+fn ends_large_message(packet: &Packet) -> bool {
+    !packet.header.reliable && packet.header.fragments() > 1 && packet.header.is_last()
+}
+
+/// The link's end.
+struct Sender {
+    link: AnyLink,
+    reliable: Option<FlowTx>,
+    /// The best-effort message in several packets that is being sent: its number, the next index, its flow.
+    message: Option<(u64, u16, FlowTx)>,
+}
+
+impl Sender {
+    async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
+        let header = &packet.header;
+        if header.reliable {
+            let flow = match &mut self.reliable {
+                Some(flow) => flow,
+                none => none.insert(self.link.open_flow(header.class).await?),
+            };
+            return match flow.send(&packet).await {
+                // The far side gave up this flow, not the link: begin another.
+                Err(LinkError::FlowStopped(_)) => {
+                    self.reliable = None;
+                    Ok(())
+                }
+                other => other,
+            };
+        }
+        if header.fragments() == 1
+            && self.link.datagram_max().is_some_and(|max| packet.encoded_bytes() <= max)
+        {
+            return match self.link.send_datagram(&packet).await {
+                // The path's limit sank in between.
+                Err(LinkError::DatagramTooLong { .. }) => self.send_alone(&packet).await,
+                other => other,
+            };
+        }
+        if header.fragments() == 1 {
+            return self.send_alone(&packet).await;
+        }
+        if header.index == 0 {
+            if let Some((.., old)) = self.message.take() {
+                old.reset(FlowEnd::Stale);
+            }
+            self.message = Some((header.seq, 0, self.link.open_flow(header.class).await?));
+        }
+        match self.message.take() {
+            Some((seq, next, mut flow)) if (seq, next) == (header.seq, header.index) => {
+                match flow.send(&packet).await {
+                    Ok(()) if header.is_last() => flow.finish().await,
+                    Ok(()) => {
+                        self.message = Some((seq, next + 1, flow));
+                        Ok(())
+                    }
+                    Err(LinkError::FlowStopped(_)) => Ok(()),
+                    Err(error) => Err(error),
+                }
+            }
+            // Its beginning was dropped: the rest is of no use to anyone.
+            other => {
+                self.message = other;
+                Ok(())
+            }
+        }
+    }
+
+    async fn send_alone(&mut self, packet: &Packet) -> Result<(), LinkError> {
+        let mut flow = self.link.open_flow(packet.header.class).await?;
+        flow.send(packet).await?;
+        flow.finish().await
+    }
+
+    /// A message that is not to be sent: its packets find no flow and go nowhere.
+    fn abandon(&mut self, packet: &Packet) {
+        if let Some((.., old)) = self.message.take_if(|(seq, ..)| *seq == packet.header.seq) {
+            old.reset(FlowEnd::Stale);
+        }
+    }
+
+    async fn finish(self) {
+        if let Some(flow) = self.reliable {
+            let _ = flow.finish().await;
+        }
+        if let Some((.., flow)) = self.message {
+            flow.reset(FlowEnd::Stale);
+        }
+    }
+}

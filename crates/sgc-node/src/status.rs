@@ -1,0 +1,121 @@
+//! How a node is doing, as its status socket tells it: one JSON document a connection.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering::Relaxed;
+
+use serde::Serialize;
+use sgc_ros::RouteStatus;
+use sgc_wire::Name;
+
+use crate::stats::NameStats;
+
+/// Everything.
+#[derive(Clone, Debug, Serialize)]
+pub struct Status {
+    /// The node's name.
+    pub node: String,
+    /// Version of the program.
+    pub version: String,
+    /// Seconds since it started.
+    pub uptime_s: u64,
+    /// Links that are up.
+    pub links: Vec<LinkStatus>,
+    /// Shares and uses, and where each stands.
+    pub routes: Vec<RouteLine>,
+    /// Names that carry data through this node.
+    pub names: Vec<NameStatus>,
+    /// What was dropped or refused, by kind.
+    pub drops: BTreeMap<String, u64>,
+    /// Peers refused at the door, by kind.
+    pub refused: BTreeMap<String, u64>,
+    /// How much the router knows.
+    pub router: RouterLine,
+}
+
+/// A link.
+#[derive(Clone, Debug, Serialize)]
+pub struct LinkStatus {
+    /// Its number.
+    pub id: u32,
+    /// Node id of the peer.
+    pub peer: String,
+    /// Its address.
+    pub remote: String,
+    /// The URL dialled, if this node dialled.
+    pub url: Option<String>,
+    /// Smoothed round-trip time, microseconds.
+    pub rtt_us: u64,
+    /// Bytes sent.
+    pub sent_bytes: u64,
+    /// Bytes received.
+    pub received_bytes: u64,
+}
+
+/// A share or a use.
+#[derive(Clone, Debug, Serialize)]
+pub struct RouteLine {
+    /// `"share"` or `"use"`.
+    pub direction: &'static str,
+    /// ROS topic.
+    pub topic: String,
+    /// ROS type, once known.
+    #[serde(rename = "type")]
+    pub type_name: Option<String>,
+    /// Name, once known.
+    pub name: Option<String>,
+    /// Owner's node name.
+    pub owner: String,
+    /// What it is doing, or waiting for.
+    pub state: String,
+    /// Messages published or delivered.
+    pub messages: u64,
+}
+
+impl RouteLine {
+    pub(crate) fn new(route: RouteStatus, messages: Option<u64>) -> Self {
+        Self {
+            direction: route.direction,
+            topic: route.topic,
+            type_name: route.type_name,
+            name: route.name.map(|n| n.to_string()),
+            owner: route.owner,
+            state: route.state,
+            messages: messages.unwrap_or(0),
+        }
+    }
+}
+
+/// Traffic of a name.
+#[derive(Clone, Debug, Serialize)]
+pub struct NameStatus {
+    /// The name.
+    pub name: String,
+    /// Packets taken in.
+    pub packets: u64,
+    /// Bytes of their payloads.
+    pub bytes: u64,
+    /// Packets dropped.
+    pub dropped: u64,
+}
+
+impl NameStatus {
+    pub(crate) fn new(name: &Name, stats: &NameStats) -> Self {
+        Self {
+            name: name.to_string(),
+            packets: stats.packets.load(Relaxed),
+            bytes: stats.bytes.load(Relaxed),
+            dropped: stats.dropped.load(Relaxed),
+        }
+    }
+}
+
+/// How much the router knows.
+#[derive(Clone, Debug, Serialize)]
+pub struct RouterLine {
+    /// Names in any state.
+    pub names: usize,
+    /// Names with a route.
+    pub routed_names: usize,
+    /// Branches.
+    pub branches: usize,
+}

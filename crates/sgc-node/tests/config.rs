@@ -1,0 +1,933 @@
+//! What a configuration becomes, and what is said about one that is wrong.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use sgc_node::config::{
+    ArgsConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Origin, Recipient, SHARES_MAX, Table, load,
+    load_args, parse,
+};
+use sgc_trust::Suite;
+use sgc_wire::Class;
+
+/// The least that every node needs.
+const NODE: &str = "identity = 'x'\nnode.routers = ['quic://r:7447']\n";
+
+fn no_env(_: &str) -> Option<String> {
+    None
+}
+
+fn parse_with(text: &str, vars: &[(&str, &str)]) -> Result<Config, ConfigErrors> {
+    let vars: BTreeMap<&str, &str> = vars.iter().copied().collect();
+    parse(text, "node.toml", Path::new("/etc/sgc"), &|name| vars.get(name).map(|value| (*value).to_owned()))
+}
+
+fn good(text: &str) -> Config {
+    parse_with(text, &[]).unwrap_or_else(|errors| panic!("{text}\n{errors}"))
+}
+
+/// All that is said about `text`, which has `NODE` in front: line 3 is its first.
+fn said_about(text: &str) -> Vec<String> {
+    let text = format!("{NODE}{text}");
+    match parse_with(&text, &[]) {
+        Ok(config) => panic!("accepted:\n{text}\n{config:?}"),
+        Err(errors) => errors.iter().map(ToString::to_string).collect(),
+    }
+}
+
+fn said_of_whole(text: &str) -> Vec<String> {
+    let errors = parse_with(text, &[]).expect_err(text);
+    errors.iter().map(ToString::to_string).collect()
+}
+
+fn check_all(cases: &[(&str, &[&str])]) {
+    for (text, expected) in cases {
+        assert_eq!(said_about(text), *expected, "\n{text}");
+    }
+}
+
+fn texts(values: &[impl ToString]) -> Vec<String> {
+    values.iter().map(ToString::to_string).collect()
+}
+
+#[test]
+fn the_example_of_the_design_is_valid() {
+    let config = good(
+        r#"
+        [node]
+        name = "arm-1"
+        routers = ["quic://router.lab.example:7447"]
+
+        [[share]]
+        topic = "/camera/image"
+        to = ["desk", "group:operators"]
+
+        [[use]]
+        from = "desk"
+        topic = "/cmd_vel"
+        priority = "realtime"
+        "#,
+    );
+    assert_eq!(config.node_name.map(|name| name.to_string()).as_deref(), Some("arm-1"));
+    assert_eq!(config.identity, Path::new("/etc/sgc/arm-1.identity"));
+    assert_eq!(texts(&config.routers), ["quic://router.lab.example:7447"]);
+    assert!(config.listen.is_empty());
+    assert_eq!(config.ros, Some(Default::default()));
+    assert_eq!(config.shares.len(), 1);
+    let share = &config.shares[0];
+    assert_eq!((share.topic.as_str(), share.type_name.as_deref()), ("/camera/image", None));
+    assert_eq!(
+        share.to,
+        [Recipient::Node("desk".parse().unwrap()), Recipient::Group("operators".parse().unwrap())]
+    );
+    assert_eq!((share.priority, share.suite), (Class::Default, Suite::Group));
+    assert_eq!(config.uses.len(), 1);
+    let one = &config.uses[0];
+    assert_eq!((one.from.as_str(), one.topic.as_str()), ("desk", "/cmd_vel"));
+    assert_eq!((one.type_name.as_deref(), one.priority), (None, Some(Class::Realtime)));
+    assert_eq!(config.admin_socket, None);
+}
+
+#[test]
+fn every_key_is_taken_over() {
+    let config = good(
+        r#"
+        identity = "keys/arm-1.identity"
+        [node]
+        name = "arm-1"
+        routers = ["quic://a:1", "quic://[2001:db8::1]:65535", "quic://10.0.0.1:7447"]
+        [ros]
+        domain_id = 232
+        discovery_range = "localhost"
+        localhost_only = false
+        static_peers = ["10.0.0.2", "arm-2.local", "fe80::1"]
+        [[share]]
+        topic = "/a__b/_c"
+        to = ["*"]
+        type = "sensor_msgs::msg::dds_::Image_"
+        priority = "bulk"
+        suite = "group"
+        description = "d"
+        author = "a"
+        maintainer = "m"
+        interface = "i"
+        unique = "u"
+        node = "/camera"
+        [[use]]
+        from = "desk"
+        topic = "/cmd_vel"
+        type = "geometry_msgs/msg/Twist"
+        [[use]]
+        from = "desk-2"
+        topic = "/cmd_vel"
+        [router]
+        listen = ["quic://0.0.0.0:0", "quic://[::]:7447"]
+        [admin]
+        socket = "/run/arm.sock"
+        "#,
+    );
+    assert_eq!(config.identity, Path::new("/etc/sgc/keys/arm-1.identity"));
+    assert_eq!(texts(&config.routers), ["quic://a:1", "quic://[2001:db8::1]:65535", "quic://10.0.0.1:7447"]);
+    let ros = config.ros.as_ref().unwrap();
+    assert_eq!((ros.domain_id, ros.discovery), (232, DiscoveryRange::Localhost));
+    assert_eq!(ros.static_peers, ["10.0.0.2", "arm-2.local", "fe80::1"]);
+    let share = &config.shares[0];
+    assert_eq!(texts(&share.to), ["*"]);
+    assert_eq!(share.type_name.as_deref(), Some("sensor_msgs/msg/Image"));
+    assert_eq!(share.priority, Class::Bulk);
+    let metadata = &share.metadata;
+    assert_eq!(
+        [
+            &metadata.description,
+            &metadata.author,
+            &metadata.maintainer,
+            &metadata.interface,
+            &metadata.unique,
+            &metadata.node
+        ],
+        ["d", "a", "m", "i", "u", "/camera"]
+    );
+    assert_eq!(config.uses.len(), 2);
+    assert_eq!(config.uses[0].type_name.as_deref(), Some("geometry_msgs/msg/Twist"));
+    assert_eq!(config.uses[1].priority, None);
+    assert_eq!(texts(&config.listen), ["quic://0.0.0.0:0", "quic://[::]:7447"]);
+    assert_eq!(config.admin_socket, Some(PathBuf::from("/run/arm.sock")));
+    assert!(!config.is_pure_router());
+}
+
+#[test]
+fn without_ros_it_is_a_pure_router() {
+    let text = "identity = '/r.identity'\nrouter.listen = ['quic://0.0.0.0:7447']";
+    // A router's environment may hold anything.
+    let config = parse_with(text, &[("ROS_DOMAIN_ID", "nonsense")]).unwrap();
+    assert!(config.is_pure_router());
+    assert_eq!((config.identity.as_path(), config.node_name), (Path::new("/r.identity"), None));
+    assert!(!good(&format!("{text}\n[ros]")).is_pure_router());
+}
+
+#[test]
+fn the_identity_may_stand_in_node() {
+    let config = good("[node]\nidentity = 'a.identity'\nrouters = ['quic://r:7447']");
+    assert_eq!(config.identity, Path::new("/etc/sgc/a.identity"));
+}
+
+#[test]
+fn unknown_keys_are_answered_with_the_nearest() {
+    check_all(&[
+        (
+            "[[share]]\ntpoic = '/a'\nto = ['b']",
+            &["node.toml:4: [[share]] has no key `tpoic`; did you mean `topic`?"],
+        ),
+        ("[ros]\ndomain = 3", &["node.toml:4: [ros] has no key `domain`; did you mean `domain_id`?"]),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
+            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `priority`"],
+        ),
+        ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
+        ("[[user]]", &["node.toml:3: the top level has no key `user`; did you mean `use`?"]),
+        (
+            "node.router = ['quic://s:1']",
+            &["node.toml:3: [node] has no key `router`; did you mean `routers`?"],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\nlisten = []",
+            &["node.toml:6: [[share]] has no key `listen`; it belongs in [router]"],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/a'\nto = ['c']",
+            &["node.toml:6: [[use]] has no key `to`; it belongs in [[share]]"],
+        ),
+        (
+            "[ros]\nidentity = 'y'",
+            &["node.toml:4: [ros] has no key `identity`; it belongs in the top level or [node]"],
+        ),
+    ]);
+    // What was only misspelt is not missed as well.
+    assert_eq!(
+        said_of_whole("[nod]\nname = 'a'"),
+        ["node.toml:1: the top level has no key `nod`; did you mean `node`?"]
+    );
+    assert_eq!(
+        said_of_whole("identiti = 'a'\n[node]\nroutes = []"),
+        [
+            "node.toml:1: the top level has no key `identiti`; did you mean `identity`?",
+            "node.toml:3: [node] has no key `routes`; did you mean `routers`?",
+        ]
+    );
+}
+
+#[test]
+fn planned_keys_are_called_planned() {
+    for table in Table::ALL {
+        for key in table.planned_keys() {
+            let text = match table {
+                Table::Share => format!("[[share]]\ntopic = '/a'\nto = ['b']\n{key} = 1"),
+                Table::Use => format!("[[use]]\nfrom = 'b'\ntopic = '/a'\n{key} = 1"),
+                _ => format!("\n\n\n[{key}]"),
+            };
+            let expected = format!("node.toml:6: `{key}` is planned but not in this version; take it out");
+            assert_eq!(said_about(&text), [expected]);
+        }
+    }
+    check_all(&[(
+        "[[share]]\nservice = '/add'\nto = ['b']",
+        &["node.toml:4: `service` is planned but not in this version; take it out"],
+    )]);
+}
+
+#[test]
+fn planned_values_are_called_planned() {
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/camera/**'\nto = ['b']",
+            &[
+                "node.toml:4: `topic` is \"/camera/**\"; wildcards are planned but not in this version: name one topic",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\nsuite = 'standard'",
+            &[
+                "node.toml:6: `suite` is \"standard\"; this suite is planned but not in this version: use \"group\"",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\ntype = 'std_srvs/srv/Empty'",
+            &[
+                "node.toml:6: `type` is \"std_srvs/srv/Empty\"; services are planned but not in this version: name a \
+               message type, such as \"std_msgs/msg/String\"",
+            ],
+        ),
+        (
+            "[router]\nlisten = ['tls://0.0.0.0:443']",
+            &[
+                "node.toml:4: `listen` is \"tls://0.0.0.0:443\"; this transport is planned but not in this version: use \
+                 quic://",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn tables_and_values_of_the_wrong_type_are_told() {
+    check_all(&[
+        (
+            "[share]\ntopic = '/a'",
+            &["node.toml:3: `share` is one table but may occur many times; write [[share]]"],
+        ),
+        ("[[ros]]", &["node.toml:3: `ros` is an array of tables but may occur only once; write [ros]"]),
+        ("admin = 5", &["node.toml:3: `admin` is an integer (5) but may occur only once; write [admin]"]),
+        (
+            "use = ['a']",
+            &[
+                "node.toml:3: `use` is a string ('a'); it takes tables: [[share]] or [[use]], and the keys below",
+            ],
+        ),
+        (
+            "[ros]\ndomain_id = '0'",
+            &["node.toml:4: `domain_id` is a string ('0'); it takes a number from 0 to 232"],
+        ),
+        (
+            "[ros]\nlocalhost_only = 1",
+            &["node.toml:4: `localhost_only` is an integer (1); it takes true or false"],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = 'desk'",
+            &["node.toml:5: `to` is a string ('desk'); it takes an array of strings, such as [\"desk\", \
+               \"group:operators\"]"],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = [\n  'desk',\n  7,\n]",
+            &[
+                "node.toml:7: `to` is an integer (7); it takes an array of strings, such as [\"desk\", \"group:operators\"]",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn what_is_required_is_asked_for() {
+    check_all(&[
+        (
+            "[[share]]",
+            &[
+                "node.toml:3: [[share]] has no `topic`; add one, such as topic = \"/camera/image\"",
+                "node.toml:3: [[share]] has no `to`; add one, such as to = [\"desk\", \"group:operators\"]",
+            ],
+        ),
+        (
+            "\n[[use]]",
+            &[
+                "node.toml:4: [[use]] has no `from`; add one, such as from = \"arm-1\"",
+                "node.toml:4: [[use]] has no `topic`; add one, such as topic = \"/camera/image\"",
+            ],
+        ),
+    ]);
+    assert_eq!(
+        said_of_whole(""),
+        [
+            "node.toml: neither `identity` nor `name` in [node] is given: every link is authenticated, so a node needs an \
+             identity file",
+            "node.toml: neither `routers` in [node] nor `listen` in [router] is given, so this node connects to nobody: \
+             name a router (\"quic://router.lab.example:7447\") or listen as one (\"quic://0.0.0.0:7447\")",
+        ]
+    );
+    assert_eq!(
+        said_of_whole("identity = ''\nrouter.listen = ['quic://0.0.0.0:1']"),
+        ["node.toml:1: `identity` is empty; give it a value, such as \"arm-1.identity\""]
+    );
+    assert_eq!(
+        said_about("node.identity = 'y'"),
+        ["node.toml:3: `identity` is given on line 1 already; keep one"]
+    );
+}
+
+#[test]
+fn topics_follow_the_rules_of_ros() {
+    for (topic, said) in [
+        ("chatter", "a topic name starts with '/': \"/chatter\""),
+        ("camera/image", "a topic name starts with '/': \"/camera/image\""),
+        ("rt/chatter", "a topic name starts with '/': \"/chatter\""),
+        ("", "a topic name has at least one word after a '/'"),
+        ("/", "a topic name has at least one word after a '/'"),
+        ("/a/", "a topic name does not end with '/': \"/a\""),
+        ("/a//b", "a topic name has no '//': \"/a/b\""),
+        ("/a-b", "a topic name has letters, digits, '_' and '/', not '-': \"/a_b\""),
+        ("/ä", "a topic name has letters, digits, '_' and '/', not 'ä'"),
+        ("/a\\u0000", "a topic name has letters, digits, '_' and '/', not '\\0'"),
+        ("/2d/scan", "no word of a topic name starts with a digit"),
+        ("~/a", "'~' stands for the name of a ROS node, which is not known here: write the name in full"),
+    ] {
+        let text = format!("[[share]]\ntopic = \"{topic}\"\nto = ['b']");
+        let shown = topic.replace("\\u0000", "\\0");
+        assert_eq!(said_about(&text), [format!("node.toml:4: `topic` is \"{shown}\"; {said}")], "{topic}");
+    }
+    let longest = format!("/{}", "a".repeat(246));
+    good(&format!("{NODE}[[share]]\ntopic = '{longest}'\nto = ['b']"));
+    let said = said_about(&format!("[[use]]\nfrom = 'b'\ntopic = '{longest}a'"));
+    assert!(said[0].ends_with("a topic name has at most 247 bytes"), "{said:?}");
+}
+
+#[test]
+fn types_have_the_form_of_ros() {
+    for (name, right) in [
+        ("String", "\"std_msgs/msg/String\", for example"),
+        ("sensor_msgs/Image", "\"sensor_msgs/msg/Image\""),
+        ("sensor_msgs.msg.Image", "\"sensor_msgs/msg/Image\""),
+        ("sensor_msgs::msg::Image", "\"sensor_msgs/msg/Image\""),
+        ("sensor_msgs::msg::dds_::Image", "\"std_msgs/msg/String\", for example"),
+        ("a/msg/", "\"std_msgs/msg/String\", for example"),
+    ] {
+        let text = format!("[[use]]\nfrom = 'b'\ntopic = '/a'\ntype = '{name}'");
+        let said = format!("node.toml:6: `type` is \"{name}\"; a message type is PACKAGE/msg/NAME: {right}");
+        assert_eq!(said_about(&text), [said]);
+    }
+}
+
+#[test]
+fn addresses_are_checked() {
+    for (url, said) in [
+        ("router:7447", "\"router:7447\" has no transport in front: write quic://HOST or quic://HOST:PORT"),
+        ("quic://router:0", "\"0\" is not a port number"),
+        ("quic://router:65536", "\"65536\" is not a port number"),
+        (
+            "quic://10.0.0.256:1",
+            "\"10.0.0.256\" is neither a host name nor an IP address (IPv6 is written in brackets)",
+        ),
+        ("quic://::1", "\"::1\" is neither a host name nor an IP address (IPv6 is written in brackets)"),
+        ("quic://0.0.0.0:7447", "0.0.0.0 can be listened at but not dialled: name the router's host"),
+        ("dtls://router:1", "this transport is planned but not in this version: use quic://"),
+        ("http://router/x", "http:// is not known: quic:// is"),
+    ] {
+        let said = format!("node.toml:1: `routers` is {url:?}; {said}");
+        assert_eq!(said_of_whole(&format!("node = {{ name = 'a', routers = ['{url}'] }}")), [said]);
+    }
+    check_all(&[(
+        "[router]\nlisten = ['quic://router.lab.example:7447']",
+        &[
+            "node.toml:4: `listen` is \"quic://router.lab.example:7447\"; \"router.lab.example\" is no IP address to listen \
+             on: [::] and 0.0.0.0 stand for every interface",
+        ],
+    )]);
+    assert_eq!(
+        said_of_whole("node = { name = 'a', routers = ['quic://r:7447', 'quic://r'] }"),
+        ["node.toml:1: `routers` names \"quic://r\" twice; once is enough"]
+    );
+}
+
+#[test]
+fn recipients_and_nodes_are_checked() {
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = []",
+            &[
+                "node.toml:5: `to` is empty, so nobody may subscribe: name nodes (\"desk\"), groups (\"group:operators\") or \
+               \"*\"",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['grp:ops', 'group:']",
+            &[
+                "node.toml:5: `to` names \"grp:ops\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
+               to 64 of a-z, 0-9, '-', '_' and '.'",
+                "node.toml:5: `to` names \"group:\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
+               to 64 of a-z, 0-9, '-', '_' and '.'",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b', 'c', 'b']",
+            &["node.toml:5: `to` names \"b\" twice; once is enough"],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['*', 'group:ops']",
+            &[
+                "node.toml:5: `to` names \"*\", which is every member of the fleet, and \"group:ops\" beside it: keep one of \
+               them",
+            ],
+        ),
+        (
+            "node.name = 'me'\n[[share]]\ntopic = '/a'\nto = ['me']",
+            &[
+                "node.toml:6: `to` names only \"me\", which is this node: name those who may subscribe from elsewhere",
+            ],
+        ),
+        (
+            "node.name = 'me'\n[[use]]\ntopic = '/a'\nfrom = 'me'",
+            &["node.toml:6: `from` is \"me\", which is this node: name the node that shares the topic"],
+        ),
+        (
+            "node.name = 'Arm 1'",
+            &[
+                "node.toml:3: `name` is \"Arm 1\"; a node's name is 1 to 64 of a-z, 0-9, '-', '_' and '.', the first a \
+               letter or digit: \"arm-1\"",
+            ],
+        ),
+        (
+            "[[use]]\ntopic = '/a'\nfrom = '*'",
+            &[
+                "node.toml:5: `from` is \"*\"; a node's name is 1 to 64 of a-z, 0-9, '-', '_' and '.', the first a letter \
+               or digit: \"arm-1\"",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn words_are_checked() {
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\npriority = 'realtme'\nsuite = 'none'",
+            &[
+                "node.toml:6: `priority` is \"realtme\"; did you mean \"realtime\"? It takes \"realtime\", \"default\", \
+               \"bulk\"",
+                "node.toml:7: `suite` is \"none\"; it takes \"group\"",
+            ],
+        ),
+        (
+            "[ros]\ndiscovery_range = 'SUBNET'",
+            &[
+                "node.toml:4: `discovery_range` is \"SUBNET\"; did you mean \"subnet\"? It takes \"off\", \"localhost\", \
+               \"subnet\", \"system_default\"",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn one_topic_has_one_place() {
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\n[[share]]\ntopic = '/a'\nto = ['c']",
+            &[
+                "node.toml:7: `topic` is \"/a\", which line 4 shares already: make it one share and join the recipients",
+            ],
+        ),
+        (
+            "[[use]]\ntopic = '/a'\nfrom = 'b'\n[[use]]\ntopic = '/a'\nfrom = 'b'",
+            &["node.toml:7: `topic` is \"/a\" from \"b\", which line 4 uses already: take one of them out"],
+        ),
+        (
+            "[[use]]\ntopic = '/a'\nfrom = 'b'\n[[share]]\ntopic = '/a'\nto = ['b']",
+            &[
+                "node.toml:4: `topic` is \"/a\", which line 7 shares: what is used here would be shared again, in a loop; \
+               keep one",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn the_ros_network_is_checked() {
+    check_all(&[
+        (
+            "[ros]\ndomain_id = 233",
+            &["node.toml:4: `domain_id` is 233; a ROS domain id is a number from 0 to 232"],
+        ),
+        (
+            "[ros]\ndomain_id = -1",
+            &["node.toml:4: `domain_id` is -1; a ROS domain id is a number from 0 to 232"],
+        ),
+        (
+            "[ros]\nstatic_peers = ['a b', '10.0.0.2', '10.0.0.2', '10.0.0.2:7400', '10.0.0']",
+            &[
+                "node.toml:4: `static_peers` names \"a b\"; a peer is a host name or an IP address: \"10.0.0.2\", for example",
+                "node.toml:4: `static_peers` names \"10.0.0.2\" twice; once is enough",
+                "node.toml:4: `static_peers` names \"10.0.0.2:7400\"; a peer is a host name or an IP address: \"10.0.0.2\", \
+               for example",
+                "node.toml:4: `static_peers` names \"10.0.0\"; a peer is a host name or an IP address: \"10.0.0.2\", for \
+               example",
+            ],
+        ),
+        (
+            "[ros]\nlocalhost_only = true\ndiscovery_range = 'subnet'",
+            &[
+                "node.toml:4: `localhost_only` is true, but `discovery_range` is \"subnet\": keep `discovery_range`, which has \
+               replaced the other",
+            ],
+        ),
+        (
+            "[ros]\ndiscovery_range = 'off'\nstatic_peers = ['a']",
+            &[
+                "node.toml:5: `static_peers` is not empty, but `discovery_range` is \"off\": no peer would be contacted; set \
+               `discovery_range` to \"localhost\" or \"subnet\", or take the peers out",
+            ],
+        ),
+        (
+            "[ros]\nlocalhost_only = true\nstatic_peers = ['a']",
+            &[
+                "node.toml:5: `static_peers` is not empty, but `localhost_only` is true: no peer would be contacted; set \
+               `discovery_range` to \"localhost\" or \"subnet\", or take the peers out",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn the_environment_says_what_the_file_does_not() {
+    use DiscoveryRange::{Localhost, Off, Subnet, SystemDefault};
+    const RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
+    const PEERS: (&str, &str) = ("ROS_STATIC_PEERS", "10.0.0.2; b.local;;10.0.0.2");
+    const ONLY: (&str, &str) = ("ROS_LOCALHOST_ONLY", "1");
+    let two: &[&str] = &["10.0.0.2", "b.local"];
+    type Case<'c> = (&'c str, &'c [(&'c str, &'c str)], u32, DiscoveryRange, &'c [&'c str]);
+    let cases: &[Case<'_>] = &[
+        ("", &[], 0, Subnet, &[]),
+        (
+            "",
+            &[("ROS_DOMAIN_ID", ""), (RANGE, ""), ("ROS_LOCALHOST_ONLY", ""), ("ROS_STATIC_PEERS", "")],
+            0,
+            Subnet,
+            &[],
+        ),
+        ("", &[("ROS_DOMAIN_ID", "42"), PEERS], 42, Subnet, two),
+        ("", &[("ROS_DOMAIN_ID", " 0x10")], 16, Subnet, &[]),
+        ("domain_id = 7", &[("ROS_DOMAIN_ID", "999")], 7, Subnet, &[]),
+        ("", &[(RANGE, "LOCALHOST"), PEERS], 0, Localhost, two),
+        ("", &[(RANGE, "OFF"), PEERS], 0, Off, &[]),
+        ("", &[(RANGE, "SYSTEM_DEFAULT"), PEERS], 0, SystemDefault, &[]),
+        // The deprecated switch stands above the newer variables, but only when it is on.
+        ("", &[ONLY, (RANGE, "SUBNET"), PEERS], 0, Localhost, &[]),
+        ("", &[("ROS_LOCALHOST_ONLY", "0"), (RANGE, "OFF")], 0, Off, &[]),
+        // The file stands above all of them.
+        ("discovery_range = 'subnet'", &[ONLY, PEERS], 0, Subnet, two),
+        ("localhost_only = false", &[ONLY, PEERS], 0, Subnet, two),
+        ("localhost_only = true", &[(RANGE, "SUBNET"), PEERS], 0, Localhost, &[]),
+        ("static_peers = ['c']", &[ONLY, PEERS], 0, Localhost, &["c"]),
+        ("static_peers = []", &[PEERS], 0, Subnet, &[]),
+        ("discovery_range = 'off'", &[(RANGE, "nonsense"), PEERS], 0, Off, &[]),
+    ];
+    for (ros, vars, domain_id, discovery, peers) in cases {
+        let config = parse_with(&format!("{NODE}[ros]\n{ros}"), vars).unwrap();
+        let found = config.ros.unwrap();
+        assert_eq!((found.domain_id, found.discovery), (*domain_id, *discovery), "{ros} {vars:?}");
+        assert_eq!(found.static_peers, *peers, "{ros} {vars:?}");
+    }
+    let config = parse_with(&format!("{NODE}[ros]"), &[("CYCLONEDDS_URI", "<Tracing/>")]).unwrap();
+    assert_eq!(config.ros.unwrap().cyclonedds_uri.as_deref(), Some("<Tracing/>"));
+}
+
+#[test]
+fn mistakes_in_the_environment_name_the_variable() {
+    for (var, value, said) in [
+        ("ROS_DOMAIN_ID", "300", "`ROS_DOMAIN_ID` is \"300\"; a ROS domain id is a number from 0 to 232"),
+        ("ROS_DOMAIN_ID", "lab", "`ROS_DOMAIN_ID` is \"lab\"; a ROS domain id is a number from 0 to 232"),
+        (
+            "ROS_LOCALHOST_ONLY",
+            "true",
+            "`ROS_LOCALHOST_ONLY` is \"true\"; ROS 2 reads \"1\" as on and anything else as off: set \"1\" or \"0\", or \
+             unset it",
+        ),
+        (
+            "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            "localhost",
+            "`ROS_AUTOMATIC_DISCOVERY_RANGE` is \"localhost\"; did you mean \"LOCALHOST\"? It takes \"OFF\", \
+             \"LOCALHOST\", \"SUBNET\", \"SYSTEM_DEFAULT\"",
+        ),
+        (
+            "ROS_STATIC_PEERS",
+            "a;b c",
+            "`ROS_STATIC_PEERS` names \"b c\"; a peer is a host name or an IP address: \"10.0.0.2\", for example",
+        ),
+    ] {
+        let errors = parse_with(&format!("{NODE}[ros]"), &[(var, value)]).unwrap_err();
+        assert_eq!(errors.to_string(), format!("environment: {said}"));
+    }
+    let errors = parse_with(
+        &format!("{NODE}[ros]\nstatic_peers = ['a']"),
+        &[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")],
+    );
+    assert!(errors.unwrap_err().to_string().starts_with(
+        "node.toml:4: `static_peers` is not empty, but `ROS_AUTOMATIC_DISCOVERY_RANGE` is \"OFF\": no peer"
+    ));
+}
+
+#[test]
+fn syntax_errors_have_their_lines() {
+    assert_eq!(
+        said_of_whole("a = 'x'\na = 'y'\n[node\nb ==\n"),
+        [
+            "node.toml:2: not TOML: duplicate key",
+            "node.toml:3: not TOML: unclosed table, expected `]`",
+            "node.toml:4: not TOML: extra `=`, expected nothing",
+        ]
+    );
+    assert_eq!(said_of_whole("a = 1\r\na = 2\r\n"), ["node.toml:2: not TOML: duplicate key"]);
+}
+
+#[test]
+fn all_mistakes_are_told_in_the_order_of_the_file() {
+    let errors = parse_with(
+        "[[use]]\nfrom = 'Desk'\ntopic = 'cmd_vel'\n[[share]]\ntopic = '/a'\nto = []\n[ros]\ndomian_id = 1\n[gateway]\n",
+        &[("ROS_DOMAIN_ID", "x")],
+    )
+    .unwrap_err();
+    let places: Vec<String> = errors.iter().map(|error| error.origin.to_string()).collect();
+    assert_eq!(
+        places,
+        [
+            "node.toml:2",
+            "node.toml:3",
+            "node.toml:6",
+            "node.toml:8",
+            "node.toml:9",
+            "node.toml",
+            "node.toml",
+            "environment"
+        ]
+    );
+    assert_eq!(errors.to_string().lines().count(), errors.iter().count());
+}
+
+#[test]
+fn limits_hold() {
+    let share = |i: usize| format!("[[share]]\ntopic = '/t{i}'\nto = ['b']\n");
+    let shares = |count: usize| (0..count).map(share).collect::<String>();
+    assert_eq!(good(&format!("{NODE}{}", shares(SHARES_MAX))).shares.len(), SHARES_MAX);
+    assert_eq!(
+        said_about(&shares(SHARES_MAX + 1)),
+        ["node.toml: [[share]] occurs 1025 times; it may occur at most 1024 times"]
+    );
+    let many =
+        |count: usize, one: &dyn Fn(usize) -> String| (0..count).map(one).collect::<Vec<_>>().join(", ");
+    let to = many(1025, &|i| format!("'n{i}'"));
+    assert_eq!(
+        said_about(&format!("[[share]]\ntopic = '/a'\nto = [{to}]")),
+        ["node.toml:5: `to` has 1025 entries; it may have at most 1024"]
+    );
+    let listen = many(17, &|i| format!("'quic://0.0.0.0:{}'", i + 1));
+    assert_eq!(
+        said_about(&format!("[router]\nlisten = [{listen}]")),
+        ["node.toml:4: `listen` has 17 entries; it may have at most 16"]
+    );
+    let peers = many(65, &|i| format!("'10.0.0.{i}'"));
+    assert_eq!(
+        said_about(&format!("[ros]\nstatic_peers = [{peers}]")),
+        ["node.toml:4: `static_peers` has 65 entries; it may have at most 64"]
+    );
+    let text = "x".repeat(1025);
+    assert_eq!(
+        said_about(&format!("[[share]]\ntopic = '/a'\nto = ['b']\nauthor = '{text}'")),
+        ["node.toml:6: `author` has 1025 bytes; it has at most 1024"]
+    );
+    let path = "x".repeat(99);
+    assert_eq!(
+        said_about(&format!("[admin]\nsocket = '{path}'")),
+        ["node.toml:4: `socket` has 108 bytes; it has at most 107"]
+    );
+}
+
+fn args(args: &[(&str, &str)]) -> ArgsConfig {
+    let all = |name| {
+        args.iter().filter(|(n, _)| *n == name).map(|(_, value)| (*value).to_owned()).collect::<Vec<_>>()
+    };
+    ArgsConfig {
+        identity: all("identity").first().map(PathBuf::from),
+        routers: all("router"),
+        shares: all("share"),
+        to: all("to"),
+        uses: all("use"),
+        listen: all("listen"),
+    }
+}
+
+#[test]
+fn arguments_say_the_same_as_a_file() {
+    let from_args = Config::from_args(
+        &args(&[
+            ("identity", "/etc/sgc/arm-1.identity"),
+            ("router", "quic://r:7447"),
+            ("listen", "quic://0.0.0.0:7447"),
+            ("share", "/chatter"),
+            ("share", "/image=group:vision, desk"),
+            ("to", "desk"),
+            ("to", "group:ops"),
+            ("use", "desk:/cmd_vel"),
+        ]),
+        &no_env,
+    )
+    .unwrap();
+    let from_file = good(
+        "identity = 'arm-1.identity'\nnode.routers = ['quic://r:7447']\nrouter.listen = ['quic://0.0.0.0:7447']\n\
+         [[share]]\ntopic = '/chatter'\nto = ['desk', 'group:ops']\n[[share]]\ntopic = '/image'\n\
+         to = ['group:vision', 'desk']\n[[use]]\nfrom = 'desk'\ntopic = '/cmd_vel'",
+    );
+    assert_eq!(from_args, from_file);
+    let router = args(&[("identity", "r"), ("listen", "quic://0.0.0.0:7447")]);
+    assert!(Config::from_args(&router, &no_env).unwrap().is_pure_router());
+    let env = |name: &str| (name == "ROS_DOMAIN_ID").then(|| "5".to_owned());
+    let robot = args(&[("identity", "r"), ("router", "quic://r:1"), ("use", "b:/a")]);
+    assert_eq!(Config::from_args(&robot, &env).unwrap().ros.unwrap().domain_id, 5);
+}
+
+#[test]
+fn mistakes_in_arguments_name_the_argument() {
+    type Case<'c> = (&'c [(&'c str, &'c str)], &'c [&'c str]);
+    let cases: &[Case<'_>] = &[
+        (
+            &[("share", "/chatter")],
+            &[
+                "`--share` \"/chatter\" does not say with whom: add --to NODE (or --to group:NAME, or --to '*'), or write \
+               --share /chatter=NODE",
+            ],
+        ),
+        (
+            &[("share", "/chatter=")],
+            &[
+                "`--share` is empty, so nobody may subscribe: name nodes (\"desk\"), groups (\"group:operators\") or \"*\"",
+            ],
+        ),
+        (&[("to", "desk")], &["`--to` is given, but no `--share` takes it: add --share /TOPIC"]),
+        (
+            &[("share", "chatter=desk")],
+            &["`--share` is \"chatter\"; a topic name starts with '/': \"/chatter\""],
+        ),
+        (
+            &[("use", "/cmd_vel")],
+            &["`--use` is \"/cmd_vel\"; write NODE:/TOPIC: \"arm-1:/camera/image\", for example"],
+        ),
+        (
+            &[("share", "/a"), ("share", "/a=c"), ("to", "b"), ("use", "b:/a")],
+            &[
+                "`--share` is \"/a\", which a `--share` shares already: make it one share and join the recipients",
+                "`--use` is \"/a\", which a `--share` shares: what is used here would be shared again, in a loop; keep \
+               one",
+            ],
+        ),
+        (
+            &[("router", "r:1")],
+            &[
+                "`--router` is \"r:1\"; \"r:1\" has no transport in front: write quic://HOST or quic://HOST:PORT",
+            ],
+        ),
+    ];
+    for (extra, expected) in cases {
+        let mut all = vec![("identity", "x"), ("listen", "quic://0.0.0.0:7447")];
+        all.extend_from_slice(extra);
+        let errors = Config::from_args(&args(&all), &no_env).unwrap_err();
+        let expected: Vec<String> = expected.iter().map(|one| format!("command line: {one}")).collect();
+        assert_eq!(errors.iter().map(ToString::to_string).collect::<Vec<_>>(), expected);
+    }
+    assert_eq!(
+        Config::from_args(&ArgsConfig::default(), &no_env).unwrap_err().to_string(),
+        "command line: no `--identity` is given: every link is authenticated, so a node needs an identity file\n\
+         command line: neither `--router` nor `--listen` is given, so this node connects to nobody: name a router \
+         (\"quic://router.lab.example:7447\") or listen as one (\"quic://0.0.0.0:7447\")"
+    );
+}
+
+#[test]
+fn the_identity_file_is_checked_when_loading() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("node.toml");
+    let identity = dir.path().join("arm-1.identity");
+    let write = |text: &str| fs::write(&file, text).unwrap();
+    let chmod = |mode| fs::set_permissions(&identity, fs::Permissions::from_mode(mode)).unwrap();
+    let said = |result: Result<Config, ConfigErrors>| {
+        result.unwrap_err().to_string().replace(&dir.path().display().to_string(), "DIR")
+    };
+
+    write("node.routers = ['quic://r:7447']\nnode.name = 'arm-1'");
+    assert_eq!(
+        said(load(&file, &no_env)),
+        "DIR/node.toml:2: `identity` is DIR/arm-1.identity (after the node's name): no such file; `sgc fleet enroll \
+         arm-1 --out DIR/arm-1.identity` makes one"
+    );
+    write("identity = 'arm-1.identity'\nnode.routers = ['quic://r:7447']");
+    assert_eq!(
+        said(load(&file, &no_env)),
+        "DIR/node.toml:1: `identity` is DIR/arm-1.identity: no such file; `sgc fleet enroll NODE --out \
+         DIR/arm-1.identity` makes one"
+    );
+    fs::create_dir(&identity).unwrap();
+    assert_eq!(
+        said(load(&file, &no_env)),
+        "DIR/node.toml:1: `identity` is DIR/arm-1.identity: not a file; it must be a file that this user may read"
+    );
+    fs::remove_dir(&identity).unwrap();
+    fs::write(&identity, "secret").unwrap();
+    for mode in [0o644, 0o640, 0o602, 0o601] {
+        chmod(mode);
+        assert_eq!(
+            said(load(&file, &no_env)),
+            format!(
+                "DIR/node.toml:1: `identity` is DIR/arm-1.identity: its mode {mode:04o} lets others at the private key; \
+                 `chmod 600 DIR/arm-1.identity` and, if others had access, enrol again"
+            )
+        );
+    }
+    for mode in [0o600, 0o400] {
+        chmod(mode);
+        assert_eq!(load(&file, &no_env).unwrap().identity, identity);
+    }
+    let identity_arg = identity.display().to_string();
+    let from_args = args(&[("identity", &identity_arg), ("router", "quic://r:7447")]);
+    assert_eq!(load_args(&from_args, &no_env).unwrap().identity, identity);
+    chmod(0o666);
+    assert!(
+        said(load_args(&from_args, &no_env))
+            .starts_with("command line: `--identity` is DIR/arm-1.identity: its mode 0666")
+    );
+}
+
+#[test]
+fn a_file_that_cannot_be_read_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("node.toml");
+    let mistake =
+        || load(&file, &no_env).unwrap_err().iter().map(|error| (*error.mistake).clone()).next().unwrap();
+    assert!(matches!(mistake(), Mistake::Unreadable { reason } if reason.contains("No such file")));
+    fs::write(&file, b"a = 1\n\xff").unwrap();
+    assert_eq!(mistake(), Mistake::Unreadable { reason: "line 2 is not UTF-8 text".to_owned() });
+    fs::write(&file, vec![b'#'; 5 * 1024 * 1024]).unwrap();
+    assert_eq!(mistake(), Mistake::TooLarge { bytes: 5 * 1024 * 1024, max: 4 * 1024 * 1024 });
+    let errors = load(dir.path(), &no_env).unwrap_err();
+    assert!(matches!(errors.iter().next().unwrap().origin, Origin::File { line: None, .. }));
+}
+
+#[test]
+fn a_file_of_nothing_but_mistakes_is_answered_in_time() {
+    let text = "a.b=1\n[[share]]\nto=['','']\n".repeat(20_000);
+    let begin = std::time::Instant::now();
+    assert!(parse_with(&text, &[]).is_err());
+    let text = format!("{NODE}[[share]]\ntopic = '/a'\nto = [{}]", "'b',\n".repeat(400_000));
+    assert!(parse_with(&text, &[]).is_err());
+    assert!(begin.elapsed().as_secs() < 30, "{:?}", begin.elapsed());
+}
+
+fn reference() -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/configuration.md");
+    fs::read_to_string(path).expect("the reference is in docs/")
+}
+
+#[test]
+fn the_reference_lists_every_key_and_no_other() {
+    let reference = reference();
+    let sections: BTreeMap<&str, &str> =
+        reference.split("\n## ").skip(1).filter_map(|section| section.split_once('\n')).collect();
+    for table in Table::ALL {
+        let heading =
+            if table == Table::Top { "The top level".to_owned() } else { format!("`{}`", table.header()) };
+        let section = sections.get(heading.as_str()).unwrap_or_else(|| panic!("no section {heading}"));
+        let rows = section.lines().filter_map(|line| line.strip_prefix("| `")?.split_once('`'));
+        let listed: Vec<&str> = rows.map(|(key, _)| key).collect();
+        assert_eq!(listed, table.keys(), "{heading}");
+
+        let place = if table == Table::Top { "the top level".to_owned() } else { heading };
+        let row = sections["Planned"].lines().find_map(|line| line.strip_prefix(&format!("| {place} | ")));
+        let planned: Vec<&str> =
+            row.map(|row| row.split('`').skip(1).step_by(2).collect()).unwrap_or_default();
+        assert_eq!(planned, table.planned_keys(), "planned in {place}");
+    }
+}
+
+#[test]
+fn the_examples_of_the_reference_are_valid() {
+    let text = reference();
+    let examples: Vec<&str> =
+        text.split("```toml\n").skip(1).filter_map(|rest| Some(rest.split_once("```")?.0)).collect();
+    assert!(examples.len() >= 4);
+    for example in examples {
+        good(example);
+    }
+}

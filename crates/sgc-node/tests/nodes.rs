@@ -1,0 +1,468 @@
+//! Whole nodes over real QUIC on the loopback interface, with local networks in memory: topology in, samples out.
+
+#![allow(clippy::unwrap_used)]
+
+use std::net::SocketAddr;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use rand_core::{OsRng, TryRngCore as _};
+use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::{RunOptions, Status, run_on};
+use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
+use sgc_transport::{ListenAddr, Scheme};
+use sgc_trust::{EnrollRequest, Fleet, FleetName, Identity, NodeName, Suite};
+use sgc_wire::{Class, Durability, History, Qos, UnixMillis};
+use tokio::sync::oneshot;
+
+/// Longer than anything takes that works.
+const PATIENCE: Duration = Duration::from_secs(40);
+
+fn fleet() -> &'static Fleet {
+    static FLEET: OnceLock<Fleet> = OnceLock::new();
+    FLEET.get_or_init(|| {
+        let name: FleetName = "lab".parse().unwrap();
+        Fleet::create(name, unix_now(), &mut OsRng.unwrap_err()).unwrap()
+    })
+}
+
+fn unix_now() -> UnixMillis {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    UnixMillis(now.as_millis() as u64)
+}
+
+fn identity(name: &str, router: bool) -> Arc<Identity> {
+    let mut request = EnrollRequest::new(name.parse::<NodeName>().unwrap(), unix_now());
+    request.router = router;
+    Arc::new(fleet().enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+}
+
+/// A node in a runtime of its own.
+struct Node {
+    runtime: Option<tokio::runtime::Runtime>,
+    stop: Option<oneshot::Sender<()>>,
+    ended: Receiver<()>,
+    addr: Option<SocketAddr>,
+    socket: std::path::PathBuf,
+}
+
+impl Node {
+    fn start(config: Config, identity: Arc<Identity>, domain: Option<&FakeDomain>) -> Self {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let (stop, stopped) = oneshot::channel::<()>();
+        let (ready, is_ready) = oneshot::channel();
+        let (done, ended) = channel();
+        let network = domain.map(|d| Arc::new(d.join(true)));
+        let socket = config.admin_socket.clone().unwrap();
+        runtime.spawn(async move {
+            let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
+            let stopped = async {
+                let _ = stopped.await;
+            };
+            run_on::<FakeRos>(config, identity, network, options, stopped).await.unwrap();
+            let _ = done.send(());
+        });
+        let listening = runtime.block_on(is_ready).unwrap();
+        let addr = listening.first().map(|l| l.addr);
+        Self { runtime: Some(runtime), stop: Some(stop), ended, addr, socket }
+    }
+
+    /// As SIGTERM does.
+    fn stop(mut self) {
+        let _ = self.stop.take().unwrap().send(());
+        self.ended.recv_timeout(PATIENCE).expect("the node stops");
+    }
+
+    /// As SIGKILL does, as far as the others can tell.
+    fn kill(mut self) {
+        // Waits until the sockets are closed, which the system does for a killed process.
+        self.runtime.take().unwrap().shutdown_timeout(PATIENCE);
+    }
+
+    fn status(&self) -> serde_json::Value {
+        use std::io::Read;
+        let mut text = String::new();
+        std::os::unix::net::UnixStream::connect(&self.socket).unwrap().read_to_string(&mut text).unwrap();
+        serde_json::from_str(&text).unwrap()
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+/// The three of the demo: a robot, a cloud router, an operator, each network its own.
+struct Trio {
+    robot_net: FakeDomain,
+    desk_net: FakeDomain,
+    dir: tempfile::TempDir,
+    port: u16,
+    starts: std::cell::Cell<u32>,
+}
+
+impl Trio {
+    fn new() -> Self {
+        // `SGC_LOG=debug cargo test …` shows what the nodes say.
+        let filter = tracing_subscriber::EnvFilter::from_env("SGC_LOG");
+        let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
+        let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let port = socket.local_addr().unwrap().port();
+        Self {
+            robot_net: FakeDomain::default(),
+            desk_net: FakeDomain::default(),
+            dir: tempfile::tempdir().unwrap(),
+            port,
+            starts: std::cell::Cell::new(0),
+        }
+    }
+
+    fn config(&self) -> Config {
+        self.starts.set(self.starts.get() + 1);
+        Config {
+            node_name: None,
+            identity: "unused".into(),
+            routers: vec![format!("quic://127.0.0.1:{}", self.port).parse().unwrap()],
+            listen: vec![],
+            ros: None,
+            shares: vec![],
+            uses: vec![],
+            admin_socket: Some(self.dir.path().join(format!("{}.sock", self.starts.get()))),
+        }
+    }
+
+    fn cloud(&self) -> Node {
+        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
+        let config = Config { routers: vec![], listen: vec![addr], ..self.config() };
+        let node = Node::start(config, identity("cloud", true), None);
+        assert_eq!(node.addr.unwrap().port(), self.port);
+        node
+    }
+
+    fn robot(&self, topics: &[&str], to: &str) -> Node {
+        let shares = topics
+            .iter()
+            .map(|topic| ShareConfig {
+                topic: (*topic).into(),
+                type_name: None,
+                to: vec![Recipient::Node(to.parse().unwrap())],
+                priority: Class::Default,
+                suite: Suite::Group,
+                metadata: ShareMetadata::default(),
+            })
+            .collect();
+        let config = Config { shares, ..self.config() };
+        Node::start(config, identity("robot", false), Some(&self.robot_net))
+    }
+
+    fn desk(&self, topics: &[&str]) -> Node {
+        self.desk_on(topics, &self.desk_net)
+    }
+
+    fn desk_on(&self, topics: &[&str], net: &FakeDomain) -> Node {
+        let uses = topics
+            .iter()
+            .map(|topic| UseConfig {
+                from: "robot".parse().unwrap(),
+                topic: (*topic).into(),
+                type_name: None,
+                priority: None,
+            })
+            .collect();
+        let config = Config { uses, ..self.config() };
+        Node::start(config, identity("desk", false), Some(net))
+    }
+}
+
+fn spec(topic: &str, qos: Qos) -> EndpointSpec {
+    EndpointSpec {
+        topic: dds_topic(topic),
+        type_name: dds_type("std_msgs/msg/String"),
+        keyless: true,
+        type_hash: None,
+        qos,
+    }
+}
+
+fn latched() -> Qos {
+    Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() }
+}
+
+/// An application that publishes.
+struct Talker {
+    writer: FakeWriter,
+    _net: FakeRos,
+}
+
+impl Talker {
+    fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        let net = domain.join(false);
+        Self { writer: net.create_writer(&spec(topic, qos)).unwrap(), _net: net }
+    }
+
+    fn say(&self, payload: impl Into<Bytes>) {
+        self.writer.write(SampleKind::Write, 1, payload.into()).unwrap();
+    }
+
+    fn wait_for_readers(&self, n: u32) {
+        wait(&format!("{n} readers"), || self.writer.matched_readers() == n);
+    }
+}
+
+/// An application that subscribes.
+struct Listener {
+    samples: Receiver<Bytes>,
+    _reader: FakeReader,
+    _net: FakeRos,
+}
+
+impl Listener {
+    fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        let net = domain.join(false);
+        let (sender, samples) = channel();
+        let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));
+        let reader = net.create_reader(&spec(topic, qos), handler).unwrap();
+        Self { samples, _reader: reader, _net: net }
+    }
+
+    fn hears(&self, payload: impl Into<Bytes>) {
+        let payload = payload.into();
+        let heard = self.samples.recv_timeout(PATIENCE).expect("a sample arrives");
+        assert!(heard == payload, "{} bytes instead of {}", heard.len(), payload.len());
+    }
+
+    /// Nothing, for as long as something that is known to come takes: `until` makes and awaits it.
+    fn hears_nothing(&self) {
+        match self.samples.try_recv() {
+            Err(std::sync::mpsc::TryRecvError::Empty) => {}
+            other => panic!("heard {other:?}"),
+        }
+    }
+
+    /// Skips what comes until `payload` does; fails if anything comes twice.
+    fn hears_at_last(&self, say: impl Fn(u32)) {
+        let deadline = Instant::now() + PATIENCE;
+        for n in 0.. {
+            say(n);
+            match self.samples.recv_timeout(Duration::from_millis(20)) {
+                Ok(_) => return,
+                Err(RecvTimeoutError::Timeout) => assert!(Instant::now() < deadline, "nothing arrives"),
+                Err(error) => panic!("{error}"),
+            }
+        }
+    }
+
+    fn drain(&self) -> Vec<Bytes> {
+        self.samples.try_iter().collect()
+    }
+}
+
+fn wait(what: &str, until: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !until() {
+        assert!(Instant::now() < deadline, "never: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn writers(net: &FakeDomain, topic: &str) -> usize {
+    net.count(&dds_topic(topic), EndpointKind::Writer)
+}
+
+#[test]
+fn a_topic_crosses_a_router_and_leaves_no_loop() {
+    let trio = Trio::new();
+    let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "desk"), trio.desk(&["/chatter"]));
+    let talker = Talker::new(&trio.robot_net, "/chatter", Qos::default());
+    let listener = Listener::new(&trio.desk_net, "/chatter", Qos::default());
+    talker.wait_for_readers(1);
+    wait("a writer at the desk", || writers(&trio.desk_net, "/chatter") == 1);
+    listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+    talker.say("last");
+    wait("the last message", || listener.drain().last().is_some_and(|b| b == "last"));
+    listener.hears_nothing();
+    // The desk's own writer is not shared back, nor is there a reader for it.
+    assert_eq!((writers(&trio.robot_net, "/chatter"), writers(&trio.desk_net, "/chatter")), (1, 1));
+    assert_eq!(trio.desk_net.count("rt/chatter", EndpointKind::Reader), 1);
+}
+
+#[test]
+fn large_messages_cross_whole() {
+    let trio = Trio::new();
+    let _nodes = (trio.cloud(), trio.robot(&["/image"], "desk"), trio.desk(&["/image"]));
+    let talker = Talker::new(&trio.robot_net, "/image", Qos::default());
+    let listener = Listener::new(&trio.desk_net, "/image", Qos::default());
+    talker.wait_for_readers(1);
+    listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+    talker.say("mark");
+    wait("the mark", || listener.drain().last().is_some_and(|b| b == "mark"));
+    for bytes in [1_000_000usize, 13_000_001] {
+        let payload: Bytes =
+            (0..bytes).map(|i| ((i as u64 * 0x9e37_79b9) >> 13) as u8).collect::<Vec<_>>().into();
+        talker.say(payload.clone());
+        listener.hears(payload);
+    }
+}
+
+#[test]
+fn whoever_is_killed_and_restarted_the_flow_resumes_without_duplicates() {
+    let trio = Trio::new();
+    let mut cloud = trio.cloud();
+    let mut robot = trio.robot(&["/chatter"], "desk");
+    let mut desk = trio.desk(&["/chatter"]);
+    let talker = Talker::new(&trio.robot_net, "/chatter", Qos::default());
+    let listener = Listener::new(&trio.desk_net, "/chatter", Qos::default());
+    let mut said = 0u32;
+    let mut heard = Vec::new();
+    for round in 0..6 {
+        match round {
+            0 => {}
+            1 | 4 => {
+                cloud.kill();
+                cloud = trio.cloud();
+            }
+            2 => {
+                robot.kill();
+                robot = trio.robot(&["/chatter"], "desk");
+            }
+            3 => {
+                desk.kill();
+                desk = trio.desk(&["/chatter"]);
+            }
+            _ => {
+                robot.kill();
+                cloud.kill();
+                cloud = trio.cloud();
+                robot = trio.robot(&["/chatter"], "desk");
+            }
+        }
+        let before = said;
+        let deadline = Instant::now() + PATIENCE;
+        // Until one that was said after the restart arrives.
+        while heard.last().is_none_or(|last| *last <= before) {
+            assert!(Instant::now() < deadline, "round {round}: the flow does not resume");
+            said += 1;
+            talker.say(said.to_string());
+            if let Ok(b) = listener.samples.recv_timeout(Duration::from_millis(20)) {
+                heard.push(std::str::from_utf8(&b).unwrap().parse::<u32>().unwrap());
+            }
+        }
+    }
+    heard.extend(listener.drain().iter().map(|b| std::str::from_utf8(b).unwrap().parse::<u32>().unwrap()));
+    assert!(heard.windows(2).all(|w| w[0] < w[1]), "twice or out of order: {heard:?}");
+    drop((cloud, robot, desk));
+}
+
+#[test]
+fn late_joiners_get_each_latched_publisher_once() {
+    let trio = Trio::new();
+    let cloud = trio.cloud();
+    let _robot = trio.robot(&["/tf_static"], "desk");
+    let talkers: Vec<_> = (0..5).map(|_| Talker::new(&trio.robot_net, "/tf_static", latched())).collect();
+    for (n, talker) in talkers.iter().enumerate() {
+        talker.say(format!("old {n}"));
+        talker.say(format!("frame {n}"));
+    }
+    let _desk = trio.desk(&["/tf_static"]);
+    wait("five writers", || writers(&trio.desk_net, "/tf_static") == 5);
+    let expected: Vec<_> = (0..5).map(|n| format!("frame {n}")).collect();
+    let hears_all = |listener: &Listener| {
+        let mut heard: Vec<_> = (0..5)
+            .map(|_| listener.samples.recv_timeout(PATIENCE).expect("all five"))
+            .map(|b| String::from_utf8(b.to_vec()).unwrap())
+            .collect();
+        heard.sort();
+        assert_eq!(heard, expected);
+    };
+    let early = Listener::new(&trio.desk_net, "/tf_static", latched());
+    hears_all(&early);
+    let late = Listener::new(&trio.desk_net, "/tf_static", latched());
+    hears_all(&late);
+    // The router comes back: nothing is heard again, and news still is, once.
+    cloud.kill();
+    let _cloud = trio.cloud();
+    talkers[0].say("news");
+    early.hears("news");
+    late.hears("news");
+    early.hears_nothing();
+}
+
+#[test]
+fn a_clean_stop_withdraws_at_once_and_a_new_share_appears() {
+    let trio = Trio::new();
+    let cloud = trio.cloud();
+    let robot = trio.robot(&["/a", "/b"], "desk");
+    let desk = trio.desk(&["/a", "/b"]);
+    let _a = Talker::new(&trio.robot_net, "/a", Qos::default());
+    wait("/a at the desk", || writers(&trio.desk_net, "/a") == 1);
+    assert_eq!(writers(&trio.desk_net, "/b"), 0);
+    let b = Talker::new(&trio.robot_net, "/b", Qos::default());
+    wait("/b at the desk", || writers(&trio.desk_net, "/b") == 1);
+    drop(b);
+    wait("/b gone", || writers(&trio.desk_net, "/b") == 0);
+    let begun = Instant::now();
+    robot.stop();
+    wait("/a gone", || writers(&trio.desk_net, "/a") == 0);
+    // Without the withdrawal it would be the hold of ten seconds after the link is lost.
+    assert!(begun.elapsed() < sgc_ros::UNREACHABLE_HOLD, "it was not withdrawn, it expired");
+    wait("nothing left in the router", || {
+        let router = &cloud.status()["router"];
+        router["branches"] == 0 && router["routed_names"] == 1
+    });
+    desk.stop();
+    wait("nothing left in the router", || cloud.status()["router"]["names"] == 0);
+}
+
+#[test]
+fn who_is_not_permitted_gets_nothing_and_is_told() {
+    let trio = Trio::new();
+    let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "somebody-else"));
+    let desk = trio.desk(&["/chatter"]);
+    let _talker = Talker::new(&trio.robot_net, "/chatter", Qos::default());
+    let state = || desk.status()["routes"][0]["state"].as_str().unwrap_or_default().to_owned();
+    wait("the reason in the status", || state().contains("does not share it with this node"));
+    assert_eq!(writers(&trio.desk_net, "/chatter"), 0);
+}
+
+#[test]
+fn two_proxies_on_one_network_make_no_loop() {
+    let trio = Trio::new();
+    // Robot and desk stand on the same local network: what the desk writes must not be shared again.
+    let net = &trio.robot_net;
+    let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "desk"), trio.desk_on(&["/chatter"], net));
+    let talker = Talker::new(net, "/chatter", Qos::default());
+    wait("the desk's writer", || writers(net, "/chatter") == 2);
+    let listener = Listener::new(net, "/chatter", Qos::default());
+    for n in 0..50 {
+        talker.say(format!("{n}"));
+    }
+    // Each comes once from the talker and once through the router, never more.
+    let mut count = 0;
+    while listener.samples.recv_timeout(Duration::from_millis(500)).is_ok() {
+        count += 1;
+    }
+    assert!((50..=100).contains(&count), "{count} samples of 50");
+}
+
+#[test]
+fn status_names_links_and_routes() {
+    let trio = Trio::new();
+    let cloud = trio.cloud();
+    let robot = trio.robot(&["/chatter", "/never"], "desk");
+    let _talker = Talker::new(&trio.robot_net, "/chatter", Qos::default());
+    wait("the link", || robot.status()["links"].as_array().is_some_and(|l| l.len() == 1));
+    let status = robot.status();
+    assert_eq!(status["node"], "robot");
+    let never = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == "/never").unwrap();
+    assert_eq!(never["state"], "waits for a local publisher");
+    wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 2);
+    // The document is what `Status` says.
+    let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
+}
