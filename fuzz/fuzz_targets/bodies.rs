@@ -1,0 +1,23 @@
+//! Signed bodies, grants and metadata: no input panics, and what decodes encodes to the same bytes.
+#![no_main]
+
+use libfuzzer_sys::fuzz_target;
+use sgc_wire::{AdvertBody, AnswerBody, Decode, Encode, GrantContent, JoinBody, MessageHead, Metadata};
+
+fn check<T: Decode + Encode>(input: &[u8]) {
+    if let Ok(value) = T::from_slice(input) {
+        assert_eq!(value.to_vec(), input);
+    }
+}
+
+fuzz_target!(|input: &[u8]| {
+    let Some((which, input)) = input.split_first() else { return };
+    match which % 6 {
+        0 => check::<AdvertBody>(input),
+        1 => check::<JoinBody>(input),
+        2 => check::<AnswerBody>(input),
+        3 => check::<GrantContent>(input),
+        4 => check::<Metadata>(input),
+        _ => check::<MessageHead>(input),
+    }
+});
