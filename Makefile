@@ -1,0 +1,69 @@
+# The two commands: `make demo` and `make test`. The rest are their parts.
+# ARGS goes to `sgc demo` (or to the tests, in `make unit`): make demo ARGS="--seconds 10 --json"
+
+CARGO ?= cargo
+ARGS ?=
+
+.PHONY: help demo test build deps-build deps-test peers fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
+
+help:
+	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
+	@echo 'make test        the whole suite, as CI runs it'
+	@echo 'its parts:       lint (fmt, clippy), peers, peers-check, unit (ARGS goes to cargo test), docs, deny'
+	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
+
+demo: build
+	./target/release/sgc demo $(ARGS)
+
+build: deps-build
+	$(CARGO) build --release --locked -p sgc
+
+# One after the other, the quick ones first, whatever -j says.
+test: deps-test
+	$(MAKE) fmt
+	$(MAKE) deny
+	$(MAKE) peers
+	$(MAKE) clippy
+	$(MAKE) peers-check
+	$(MAKE) unit
+	$(MAKE) docs
+
+deps-build:
+	@scripts/install-deps.sh build
+
+deps-test:
+	@scripts/install-deps.sh test
+
+peers:
+	@scripts/build-peers.sh
+
+lint: fmt clippy
+
+fmt:
+	$(CARGO) fmt --all --check
+
+clippy:
+	$(CARGO) clippy --workspace --all-targets --locked -- -D warnings
+
+# Includes the tests against the peers, so they must have been built.
+unit: peers
+	$(CARGO) test --workspace --locked $(ARGS)
+
+docs:
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace --locked
+
+deny:
+	@scripts/deny.sh
+
+advisories:
+	@scripts/deny.sh advisories
+
+# The peers against each other, with no sgc between them.
+peers-check: peers
+	.venv/bin/python -B tests/peers/check.py
+
+peers-check-long: peers
+	.venv/bin/python -B tests/peers/check.py --long
+
+clean-tools:
+	rm -rf .venv .tools .peers

@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Builds the test peers that are not ours to test against: .peers/cyclone (Python) and .peers/fastdds (C++).
+# Does nothing for what is there and newer than its sources.
+set -euo pipefail
+# shellcheck source=scripts/lib.sh
+. "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
+cd "$root"
+
+mkdir -p .peers
+requirements=tests/peers/py/requirements.txt
+installed=.venv/installed.txt
+if ! cmp -s "$requirements" "$installed"; then
+    say "Python environment in .venv: $(grep -m1 '^cyclonedds' "$requirements")"
+    python3 -m venv --clear .venv
+    .venv/bin/pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"
+    cp "$requirements" "$installed"
+fi
+
+cat >.peers/cyclone <<'SCRIPT'
+#!/bin/sh
+here=$(cd "$(dirname "$0")/.." && pwd)
+exec "$here/.venv/bin/python" -B "$here/tests/peers/py/peer.py" "$@"
+SCRIPT
+chmod +x .peers/cyclone
+
+source=tests/peers/fastdds/peer.cpp
+if [ ! -x .peers/fastdds ] || [ "$source" -nt .peers/fastdds ] || [ tests/peers/fastdds/messages.hpp -nt .peers/fastdds ]; then
+    say "Fast DDS peer"
+    "${CXX:-g++}" -std=c++17 -O2 -Wall -Wextra -Werror -o .peers/fastdds.new "$source" -lfastrtps -lfastcdr -lpthread
+    mv .peers/fastdds.new .peers/fastdds
+fi

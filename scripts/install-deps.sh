@@ -1,0 +1,75 @@
+#!/usr/bin/env bash
+# Installs the Debian or Ubuntu packages that are missing, and nothing else.
+#   install-deps.sh build   what compiling the workspace needs
+#   install-deps.sh test    that, and what the test suite needs
+# A need is met when its probe succeeds, however it came here; only then unmet ones are installed, and it says which and why.
+set -euo pipefail
+# shellcheck source=scripts/lib.sh
+. "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
+
+what=${1:-build}
+packages=()
+
+# need PROBE PACKAGES… -- WHY…
+need() {
+    local probe=$1 wanted=()
+    shift
+    while [ "$1" != -- ]; do
+        wanted+=("$1")
+        shift
+    done
+    shift
+    if ! eval "$probe" >/dev/null 2>&1; then
+        say "missing: ${wanted[*]} ($*)"
+        packages+=("${wanted[@]}")
+    fi
+}
+
+# bindgen loads libclang.so and needs the compiler headers that come with the -dev package.
+has_libclang() {
+    [ -n "${LIBCLANG_PATH:-}" ] || dpkg -s libclang-dev || compgen -G '/usr/lib/llvm-*/lib/libclang.so'
+}
+
+# compiles LANGUAGE HEADER: whether a program that includes it compiles.
+compiles() {
+    local compiler=cc
+    [ "$1" = c++ ] && compiler=c++
+    printf '#include <%s>\nint main() { return 0; }\n' "$2" | "$compiler" -x "$1" -fsyntax-only -
+}
+
+have_rust() {
+    command -v cargo >/dev/null || die "cargo is not in PATH: install Rust first (rustup), then run this again"
+    [ "$what" = build ] || for tool in rustfmt clippy; do
+        cargo "${tool/rustfmt/fmt}" --version >/dev/null 2>&1 || die "missing: rustup component add $tool"
+    done
+}
+
+case $what in build | test) ;; *) die "usage: install-deps.sh build|test" ;; esac
+have_rust
+need 'compiles c stdlib.h' gcc libc6-dev -- "C compiler: Cyclone DDS and AWS-LC are built from source"
+need 'compiles c++ vector' g++ -- "C++ compiler: Cyclone DDS's build asks for one"
+need 'command -v make' make -- "CMake drives it"
+need 'command -v cmake' cmake -- "builds Cyclone DDS (crate cyclors)"
+need has_libclang libclang-dev -- "makes the Rust bindings of Cyclone DDS (bindgen)"
+if [ "$what" = test ]; then
+    need 'compiles c++ fastcdr/Cdr.h' libfastcdr-dev -- "the Fast DDS test peer"
+    need 'compiles c++ fastdds/dds/domain/DomainParticipant.hpp' libfastrtps-dev -- "the Fast DDS test peer"
+    need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "the Cyclone DDS test peer runs in a virtual environment"
+    need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
+fi
+[ ${#packages[@]} -gt 0 ] || exit 0
+
+command -v apt-get >/dev/null || die "no apt-get here: install the like of these yourself: ${packages[*]}"
+sudo=()
+if [ "$(id -u)" != 0 ]; then
+    command -v sudo >/dev/null || die "not root and no sudo: ask an administrator for: apt-get install ${packages[*]}"
+    sudo=(sudo)
+    say "installing needs root, so sudo may ask for your password"
+fi
+say "installing from Debian's packages: ${packages[*]}"
+"${sudo[@]}" apt-get update -qq
+for package in "${packages[@]}"; do
+    apt-cache show "$package" >/dev/null 2>&1 || die "this release has no package $package (tested on Debian 12)"
+done
+"${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" >/dev/null
+say "installed: ${packages[*]}"
