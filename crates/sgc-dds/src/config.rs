@@ -1,6 +1,6 @@
 //! What to join and how: [`DdsConfig`], and its translation into Cyclone's XML.
 //!
-//! Pure: reads no environment and no file. [`crate::env`] reads ROS's variables; [`crate::CycloneNetwork`] hands
+//! Pure: reads no environment and no file. ROS's variables are the node's to read; [`crate::CycloneNetwork`] hands
 //! the XML to Cyclone.
 
 use std::fmt::Write as _;
@@ -8,7 +8,6 @@ use std::net::{IpAddr, Ipv4Addr};
 
 use sgc_ros::RosError;
 
-use crate::env::RosEnv;
 use crate::payload::PAYLOAD_BYTES_MAX;
 use crate::user_data;
 
@@ -77,17 +76,6 @@ pub const HOST_ADDRESSES_MAX: usize = 8;
 const PARTICIPANT_INDEX_MAX: u32 = 99;
 
 impl DdsConfig {
-    /// The configuration that the ROS environment asks for, for a node with this tag.
-    pub fn from_ros_env(env: &RosEnv, tag: Option<String>) -> Self {
-        Self {
-            domain: env.domain,
-            discovery: env.discovery,
-            static_peers: env.static_peers.clone(),
-            tag,
-            cyclonedds_uri: env.cyclonedds_uri.clone(),
-        }
-    }
-
     /// Checks every field.
     ///
     /// # Errors

@@ -21,7 +21,6 @@
 pub mod config;
 mod discovery;
 mod entity;
-pub mod env;
 mod log;
 mod network;
 pub mod payload;
@@ -33,7 +32,6 @@ mod wait;
 mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
-pub use env::{EnvError, RosEnv, from_env_vars};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
 pub use writer::CycloneWriter;

@@ -164,10 +164,10 @@ impl Dropped {
     /// A short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
-            Self::NotVerified { .. } => "not_verified",
-            Self::Grant(_) => "grant",
-            Self::Unexpected { .. } => "unexpected",
-            Self::CatalogueTooLarge { .. } => "catalogue_too_large",
+            Self::NotVerified { .. } => "endpoint_not_verified",
+            Self::Grant(_) => "endpoint_grant",
+            Self::Unexpected { .. } => "endpoint_unexpected",
+            Self::CatalogueTooLarge { .. } => "endpoint_catalogue_too_large",
         }
     }
 }

@@ -83,16 +83,16 @@ impl SinkDrop {
     /// A short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
-            Self::Open(OpenError::Suite { .. }) => "suite",
-            Self::Open(OpenError::Epoch { .. }) => "epoch",
-            Self::Open(OpenError::Length) => "length",
-            Self::Open(OpenError::Forged) => "forged",
-            Self::Replayed => "replayed",
-            Self::DuplicateFragment => "duplicate_fragment",
-            Self::Inconsistent => "inconsistent",
-            Self::Head => "head",
-            Self::AwaitingHistory => "awaiting_history",
-            Self::PartialsFull => "partials_full",
+            Self::Open(OpenError::Suite { .. }) => "sink_suite",
+            Self::Open(OpenError::Epoch { .. }) => "sink_epoch",
+            Self::Open(OpenError::Length) => "sink_length",
+            Self::Open(OpenError::Forged) => "sink_forged",
+            Self::Replayed => "sink_replayed",
+            Self::DuplicateFragment => "sink_duplicate_fragment",
+            Self::Inconsistent => "sink_inconsistent",
+            Self::Head => "sink_head",
+            Self::AwaitingHistory => "sink_awaiting_history",
+            Self::PartialsFull => "sink_partials_full",
         }
     }
 }

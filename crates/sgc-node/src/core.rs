@@ -27,6 +27,8 @@ use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 
 /// Events that may wait for the control task; who sends more waits.
 pub(crate) const INBOX_MAX: usize = 4096;
+/// Nodes remembered that connected from a new run.
+const SUPERSEDED_MAX: usize = 1024;
 /// Events handled before the timers are looked at again.
 const BATCH_MAX: usize = 256;
 /// How long a history may take before it is asked for again.
@@ -246,7 +248,7 @@ impl<N: RosNetwork> Core<N> {
             }
             CoreEvent::Frame { link, frame } => self.router.handle_frame(now(), link, frame),
             CoreEvent::Malformed { link } => {
-                self.control_drops.count(&format!("malformed/{link}"));
+                self.control_drops.count_from("malformed_control", link);
             }
             CoreEvent::Discovery(event) => {
                 if let Some(routes) = &mut self.routes {
@@ -346,7 +348,7 @@ impl<N: RosNetwork> Core<N> {
                 let Some(entry) = self.links.get(&link) else { return };
                 if !entry.control.send(frame) {
                     warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
-                    self.control_drops.count(&format!("control_queue_full/{link}"));
+                    self.control_drops.count_from("control_queue_full", link);
                     entry.link.close(CloseReason::Overloaded);
                 }
             }
@@ -356,7 +358,10 @@ impl<N: RosNetwork> Core<N> {
                 match &reason {
                     LinkClose::Superseded => {
                         let peer = entry.link.peer().node_id.to_string();
-                        if !self.superseded.insert(peer.clone()) && self.superseded.len() < 1024 {
+                        if self.superseded.len() >= SUPERSEDED_MAX {
+                            self.superseded.clear();
+                        }
+                        if !self.superseded.insert(peer.clone()) {
                             warn!(%peer, "connects again and again from new runs: do two processes use one identity?");
                         }
                         entry.link.close(CloseReason::Replaced);
@@ -369,8 +374,8 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             RouterOutput::Dropped(dropped) => {
-                let key = format!("{}/{}", dropped.reason.key(), dropped.link);
-                if self.control_drops.count(&key) {
+                let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
+                if first && dropped.reason.is_suspicious() {
                     let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
                     warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
                 } else {
@@ -386,7 +391,7 @@ impl<N: RosNetwork> Core<N> {
         match output {
             EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
             EndpointOutput::Dropped(dropped) => {
-                if self.control_drops.count(&format!("endpoint_{}", dropped.key())) {
+                if self.control_drops.count(dropped.key()) {
                     warn!(reason = %dropped, "refused; counted from here on");
                 } else {
                     debug!(reason = %dropped, "refused");
@@ -401,7 +406,8 @@ impl<N: RosNetwork> Core<N> {
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer } => {
-                info!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
+                info!(peer = %peer.short(), "granted a subscriber");
+                debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
                 routes.handle_sink_joined(&name, sink);
             }
             Event::SinkLeft { name, sink } => {
@@ -409,8 +415,9 @@ impl<N: RosNetwork> Core<N> {
                 routes.handle_sink_left(now.instant, &name, &sink);
             }
             Event::SinkRefused { name, peer, reason } => {
-                if self.control_drops.count(&format!("join_refused/{}", peer.short())) {
-                    warn!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                if self.control_drops.count_from("join_refused", peer.short()) {
+                    warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
             }
             Event::Recover(recover) => {
@@ -419,7 +426,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Event::Granted { name, grant } => {
-                info!(name = %name.short(), "granted");
+                debug!(name = %name.short(), "granted");
                 if let Some(sink) = self.sinks.get(&name) {
                     sink.grant(grant);
                 }
@@ -427,11 +434,12 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_histories(name);
             }
             Event::Refused { name, by } => {
-                warn!(name = %name.short(), reason = %by, "refused; asking again later");
+                warn!(reason = %by, "a topic is refused to this node; asking again later");
+                debug!(name = %name.short(), reason = %by, "refused");
                 routes.handle_refused(&name, by);
             }
             Event::Lost { name, reason } => {
-                info!(name = %name.short(), ?reason, "interrupted; waiting for the way to come back");
+                debug!(name = %name.short(), ?reason, "interrupted; waiting for the way to come back");
                 routes.handle_lost(now.instant, &name);
             }
             Event::Catalogue { owner, catalogue } => {
@@ -456,11 +464,11 @@ impl<N: RosNetwork> Core<N> {
                 let topic = spec.metadata.ros_name.clone();
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
-                        info!(%topic, %name, "shared");
+                        debug!(%topic, %name, "shared");
                         let share = LocalShare::new(name, self.data.clone(), self.alive.clone());
                         self.shares.insert(name, Arc::new(share));
                     }
-                    Err(why) => error!(%topic, "not shared: {why}"),
+                    Err(why) => error!("{topic} is not shared: {why}"),
                 }
             }
             Command::UpdateShare { name, qos, sources } => {

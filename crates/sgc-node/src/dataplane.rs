@@ -118,7 +118,7 @@ impl DataPlane {
     pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
         debug!(%ingress, name = %name.short(), ?reason, "dropped");
         let suspicious = matches!(reason, DataDrop::WrongWay | DataDrop::HopLimit | DataDrop::Malformed);
-        if self.drops.count(&format!("{reason:?}/{ingress}")) && suspicious {
+        if self.drops.count_from(reason.key(), ingress) && suspicious {
             warn!(%ingress, ?reason, "a peer sends what it should not; dropped and counted from here on");
         }
     }

@@ -161,7 +161,7 @@ async fn receive_flows(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
                     Err(FlowError::Link(_)) => return,
                     Err(error) => {
                         debug!(link = id.0, %remote, %error, "flow ended early");
-                        data.drops().count(&format!("flow/{}", id));
+                        data.drops().count_from("flow", id);
                         return;
                     }
                 }
@@ -176,7 +176,7 @@ async fn receive_datagrams(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
             Ok(packet) => data.forward(id, packet).await,
             Err(error) => {
                 debug!(link = id.0, %error, "malformed datagram");
-                if data.drops().count(&format!("{:?}/{id}", DataDrop::Malformed)) {
+                if data.drops().count_from(DataDrop::Malformed.key(), id) {
                     warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
                 }
             }

@@ -123,7 +123,7 @@ impl LocalSink {
             }
             Err(error) => {
                 debug!(name = %self.name.short(), %error, "packet refused");
-                drops.count(&format!("sink_{}", error.key()));
+                drops.count(error.key());
                 Some((DataDrop::Sink, 1))
             }
         }

@@ -1,10 +1,9 @@
 //! Counters of the data path, and the drops that they count.
 
 use std::collections::BTreeMap;
-use std::sync::Mutex;
+use std::fmt::Display;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-
-use serde::Serialize;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Traffic of one name at this node.
 #[derive(Debug, Default)]
@@ -26,8 +25,7 @@ impl NameStats {
 }
 
 /// Why the data path dropped something.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum DataDrop {
     /// No tree for the name: nobody asked.
     NoTree,
@@ -55,28 +53,87 @@ pub(crate) enum DataDrop {
     TooLarge,
 }
 
-/// Counts by key. Written on the rare path only.
+impl DataDrop {
+    /// A short, stable name for counters.
+    pub(crate) fn key(self) -> &'static str {
+        match self {
+            Self::NoTree => "no_subscriber",
+            Self::WrongWay => "wrong_way",
+            Self::HopLimit => "hop_limit",
+            Self::NoSuchSink => "no_such_sink",
+            Self::Stalled => "stalled",
+            Self::Stale => "stale",
+            Self::LinkClosed => "link_closed",
+            Self::Malformed => "malformed",
+            Self::NotGranted => "not_granted",
+            Self::Sink => "sink",
+            Self::NoWriter => "no_writer",
+            Self::TooLarge => "too_large",
+        }
+    }
+}
+
+/// Kinds of drops by culprit that are remembered; beyond it all are forgotten and begin anew.
+const CULPRITS_MAX: usize = 512;
+
+/// Counts by kind, and by kind and culprit. Written on the rare path only.
 #[derive(Debug, Default)]
-pub(crate) struct Drops(Mutex<BTreeMap<String, u64>>);
+pub(crate) struct Drops(Mutex<Counts>);
+
+#[derive(Debug, Default)]
+struct Counts {
+    kinds: BTreeMap<&'static str, u64>,
+    culprits: BTreeMap<String, u64>,
+}
 
 impl Drops {
     /// Counts one; true if it is the first of its kind.
-    pub(crate) fn count(&self, key: &str) -> bool {
-        let mut counts = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        match counts.get_mut(key) {
-            Some(n) => {
-                *n += 1;
-                false
-            }
-            None => {
-                counts.insert(key.to_owned(), 1);
-                true
-            }
+    pub(crate) fn count(&self, kind: &'static str) -> bool {
+        let mut counts = self.lock();
+        let n = counts.kinds.entry(kind).or_default();
+        *n += 1;
+        *n == 1
+    }
+
+    /// Counts one of somebody's; true if it is the first of its kind from there.
+    pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Display) -> bool {
+        let mut counts = self.lock();
+        *counts.kinds.entry(kind).or_default() += 1;
+        let key = format!("{kind} from {culprit}");
+        if counts.culprits.len() >= CULPRITS_MAX && !counts.culprits.contains_key(&key) {
+            counts.culprits.clear();
         }
+        let n = counts.culprits.entry(key).or_default();
+        *n += 1;
+        *n == 1
     }
 
     /// All counts.
     pub(crate) fn snapshot(&self) -> BTreeMap<String, u64> {
-        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner).clone()
+        let counts = self.lock();
+        let kinds = counts.kinds.iter().map(|(kind, n)| ((*kind).to_owned(), *n));
+        kinds.chain(counts.culprits.clone()).collect()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Counts> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn culprits_are_bounded_and_totals_are_not_lost() {
+        let drops = Drops::default();
+        assert!(drops.count_from("stale", 1));
+        assert!(!drops.count_from("stale", 1));
+        for link in 0..10_000 {
+            drops.count_from("stale", link);
+        }
+        let snapshot = drops.snapshot();
+        assert!(snapshot.len() <= CULPRITS_MAX + 1);
+        assert_eq!(snapshot["stale"], 10_002);
     }
 }

@@ -67,7 +67,6 @@ fn the_example_of_the_design_is_valid() {
         [[use]]
         from = "desk"
         topic = "/cmd_vel"
-        priority = "realtime"
         "#,
     );
     assert_eq!(config.node_name.map(|name| name.to_string()).as_deref(), Some("arm-1"));
@@ -86,7 +85,7 @@ fn the_example_of_the_design_is_valid() {
     assert_eq!(config.uses.len(), 1);
     let one = &config.uses[0];
     assert_eq!((one.from.as_str(), one.topic.as_str()), ("desk", "/cmd_vel"));
-    assert_eq!((one.type_name.as_deref(), one.priority), (None, Some(Class::Realtime)));
+    assert_eq!(one.type_name.as_deref(), None);
     assert_eq!(config.admin_socket, None);
 }
 
@@ -151,7 +150,6 @@ fn every_key_is_taken_over() {
     );
     assert_eq!(config.uses.len(), 2);
     assert_eq!(config.uses[0].type_name.as_deref(), Some("geometry_msgs/msg/Twist"));
-    assert_eq!(config.uses[1].priority, None);
     assert_eq!(texts(&config.listen), ["quic://0.0.0.0:0", "quic://[::]:7447"]);
     assert_eq!(config.admin_socket, Some(PathBuf::from("/run/arm.sock")));
     assert!(!config.is_pure_router());
@@ -183,7 +181,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ("[ros]\ndomain = 3", &["node.toml:4: [ros] has no key `domain`; did you mean `domain_id`?"]),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
-            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `priority`"],
+            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`"],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
         ("[[user]]", &["node.toml:3: the top level has no key `user`; did you mean `use`?"]),
@@ -764,13 +762,6 @@ fn arguments_say_the_same_as_a_file() {
 fn mistakes_in_arguments_name_the_argument() {
     type Case<'c> = (&'c [(&'c str, &'c str)], &'c [&'c str]);
     let cases: &[Case<'_>] = &[
-        (
-            &[("share", "/chatter")],
-            &[
-                "`--share` \"/chatter\" does not say with whom: add --to NODE (or --to group:NAME, or --to '*'), or write \
-               --share /chatter=NODE",
-            ],
-        ),
         (
             &[("share", "/chatter=")],
             &[

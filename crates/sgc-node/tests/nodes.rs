@@ -59,7 +59,7 @@ impl Node {
         let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
         runtime.spawn(async move {
-            let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
+            let options = RunOptions { ready: Some(ready) };
             let stopped = async {
                 let _ = stopped.await;
             };
@@ -173,7 +173,6 @@ impl Trio {
                 from: "robot".parse().unwrap(),
                 topic: (*topic).into(),
                 type_name: None,
-                priority: None,
             })
             .collect();
         let config = Config { uses, ..self.config() };

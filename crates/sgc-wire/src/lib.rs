@@ -21,8 +21,8 @@ pub use catalogue::{
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX,
-    CONTROL_FRAME_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX,
-    Recover, RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
+    CONTROL_FRAME_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover,
+    RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
 };
 pub use ids::{Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SinkId, SourceId, UnixMillis};
 pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};

@@ -5,9 +5,9 @@ use bytes::Bytes;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control, Decode,
-    Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Qos, Recover, RefuseReason,
-    RejectReason, Role, Signed, SinkId, SourceId, TopicGrant, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
+    Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Qos, Recover,
+    RefuseReason, RejectReason, Role, Signed, SinkId, SourceId, TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;

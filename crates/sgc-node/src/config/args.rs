@@ -1,8 +1,8 @@
 //! Command line → draft: `sgc run --identity … --router … --share … --to … --use …` without a file.
 //!
 //! `--share /topic --to desk --to group:operators` shares with all that `--to` names;
-//! `--share /topic=desk,group:operators` says it for one topic. A share for nobody in particular is refused: access is
-//! closed until someone is named, and `--to '*'` is how one says everyone.
+//! `--share /topic=desk,group:operators` says it for one topic. Where nobody is named, every member of the fleet may
+//! subscribe, nobody else; `sgc run` says so.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -29,7 +29,7 @@ pub struct ArgsConfig {
     /// `--share /TOPIC` or `--share /TOPIC=NODE,group:GROUP`, any number.
     pub shares: Vec<String>,
     /// `--to NODE`, `--to group:GROUP` or `--to '*'`, any number: who may subscribe to the shares that do not say it
-    /// themselves.
+    /// themselves. None is the whole fleet.
     pub to: Vec<String>,
     /// `--use NODE:/TOPIC`, any number.
     pub uses: Vec<String>,
@@ -50,8 +50,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
                 (topic, Some(located("--share", to.map(|one| located("--share", one.to_owned())).collect())))
             }
             None if args.to.is_empty() => {
-                record(Mistake::ShareWithNobody { topic: share.clone() });
-                (share.as_str(), None)
+                (share.as_str(), Some(located("--share", vec![located("--share", "*".to_owned())])))
             }
             None => {
                 to_taken = true;

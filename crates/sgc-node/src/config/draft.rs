@@ -99,5 +99,4 @@ pub(super) struct UseDraft {
     pub(super) from: Option<Located<String>>,
     pub(super) topic: Option<Located<String>>,
     pub(super) type_name: Option<Located<String>>,
-    pub(super) priority: Option<Located<String>>,
 }

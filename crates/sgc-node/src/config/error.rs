@@ -389,15 +389,6 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// `--share` without saying with whom.
-    #[error(
-        "`--share` {topic:?} does not say with whom: add --to NODE (or --to group:NAME, or --to '*'), or write \
-         --share {topic}=NODE"
-    )]
-    ShareWithNobody {
-        /// The topic.
-        topic: String,
-    },
     /// `--to` that no `--share` takes.
     #[error("`--to` is given, but no `--share` takes it: add --share /TOPIC")]
     ToWithoutShare,

@@ -168,7 +168,6 @@ impl FileReader<'_> {
             from: self.string(one, "from", "a string, such as \"arm-1\""),
             topic: self.string(one, "topic", "a string, such as \"/camera/image\""),
             type_name: self.string(one, "type", "a string, such as \"sensor_msgs/msg/Image\""),
-            priority: self.string(one, "priority", "a string, such as \"realtime\""),
         }
     }
 

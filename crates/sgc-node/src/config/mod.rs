@@ -132,8 +132,6 @@ pub struct UseConfig {
     pub topic: String,
     /// `pkg/msg/Name`, if the user insists on one; otherwise the owner's catalogue says.
     pub type_name: Option<String>,
-    /// What overtakes it, if not as the owner says.
-    pub priority: Option<Class>,
 }
 
 impl DiscoveryRange {

@@ -295,8 +295,7 @@ impl Resolver {
         });
         let topic = one.topic.as_ref().and_then(|topic| self.keep(topic, names::topic));
         let type_name = one.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
-        let priority = one.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
-        Some(UseConfig { from: from?, topic: topic?, type_name, priority })
+        Some(UseConfig { from: from?, topic: topic?, type_name })
     }
 
     fn socket(&mut self, socket: &Located<PathBuf>, base_dir: &Path) -> Option<PathBuf> {

@@ -59,7 +59,7 @@ impl Table {
                 "unique",
                 "node",
             ],
-            Self::Use => &["from", "topic", "type", "priority"],
+            Self::Use => &["from", "topic", "type"],
             Self::Router => &["listen"],
             Self::Admin => &["socket"],
         }
@@ -84,6 +84,7 @@ impl Table {
                 "except",
             ],
             Self::Use => &[
+                "priority",
                 "service",
                 "action",
                 "max_rate",
