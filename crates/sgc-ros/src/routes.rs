@@ -202,6 +202,11 @@ pub enum Problem {
         /// What is offered.
         offered: String,
     },
+    /// More local endpoints than are looked at.
+    #[error(
+        "the local network has more than {LOCAL_ENDPOINTS_MAX} endpoints; those beyond are not looked at"
+    )]
+    TooManyEndpoints,
     /// More transient-local writers than can be told apart.
     #[error("{topic}: more than {ENTRY_SOURCES_MAX} transient-local publishers; the rest share one history")]
     TooManySources {
@@ -297,7 +302,7 @@ impl<R: RngCore> Routes<R> {
         match event {
             DiscoveryEvent::Appeared(endpoint) => {
                 if self.endpoints.len() >= LOCAL_ENDPOINTS_MAX {
-                    return;
+                    return self.report(Problem::TooManyEndpoints);
                 }
                 let guid = endpoint.guid;
                 if let Some(old) = self.endpoints.insert(guid, endpoint.clone()) {
@@ -565,17 +570,19 @@ impl<R: RngCore> Routes<R> {
         share.own.retain(|guid, _| share.writers.contains_key(guid));
         let mut problem = None;
         if offer.is_transient_local() {
-            for guid in share.writers.keys().copied().collect::<Vec<_>>() {
-                let known: BTreeSet<_> = share.own.values().copied().collect();
-                let source = match (share.own.get(&guid), known.last()) {
-                    (Some(source), _) => *source,
-                    (None, Some(last)) if known.len() >= ENTRY_SOURCES_MAX => {
+            let mut known: BTreeSet<_> = share.own.values().copied().collect();
+            for guid in
+                share.writers.keys().filter(|guid| !share.own.contains_key(guid)).copied().collect::<Vec<_>>()
+            {
+                let source = match known.last() {
+                    Some(last) if known.len() >= ENTRY_SOURCES_MAX => {
                         let topic = self.share_rules[share.rule].metadata.ros_name.clone();
                         problem = Some(Problem::TooManySources { topic });
                         *last
                     }
                     _ => random_source(&mut self.rng),
                 };
+                known.insert(source);
                 share.own.insert(guid, source);
             }
         } else {
@@ -590,10 +597,9 @@ impl<R: RngCore> Routes<R> {
             problem = Some(Problem::MixedQos { topic, offered: describe(&offer) });
         }
         let own: Vec<_> = share.own.iter().map(|(g, s)| (*g, *s, share.writers[g].qos.clone())).collect();
-        let sources = own
-            .iter()
-            .map(|(_, source, qos)| CatalogueSource { source: *source, qos: qos.clone() })
-            .collect();
+        let listed: BTreeMap<_, _> = own.iter().map(|(_, source, qos)| (*source, qos)).collect();
+        let sources =
+            listed.into_iter().map(|(source, qos)| CatalogueSource { source, qos: qos.clone() }).collect();
         self.commands.push_back(Command::UpdateShare { name, qos: offer.clone(), sources });
         let class = self.share_rules[share.rule].class;
         self.commands.push_back(Command::MapSources { name, qos: offer.clone(), class, own });
