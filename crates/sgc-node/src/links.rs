@@ -158,10 +158,14 @@ async fn receive_flows(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
                 match flow.recv().await {
                     Ok(Some(packet)) => data.forward(id, packet).await,
                     Ok(None) => return,
-                    Err(FlowError::Link(_)) => return,
+                    Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
                     Err(error) => {
+                        // Cut short is what a lost link looks like; anything else is the peer's doing.
+                        let broken = !matches!(error, FlowError::Truncated);
+                        if broken && data.drops().count_from(DataDrop::Malformed.key(), id) {
+                            warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
+                        }
                         debug!(link = id.0, %remote, %error, "flow ended early");
-                        data.drops().count_from("flow", id);
                         return;
                     }
                 }

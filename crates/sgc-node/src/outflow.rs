@@ -21,8 +21,8 @@ pub(crate) const OUTFLOW_PACKETS_MAX: usize = 4096;
 pub(crate) const OUTFLOW_RELIABLE_BYTES_MAX: usize = 4 << 20;
 /// How long a reliable source is pushed back by a link that takes nothing at all.
 pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
-/// Bytes of best-effort packets that may wait: the largest message, and one more like it.
-pub(crate) const OUTFLOW_BYTES_MAX: usize = 64 << 20;
+/// Bytes of best-effort packets that may wait; of larger messages only what fits is kept, and they are lost.
+pub(crate) const OUTFLOW_BYTES_MAX: usize = 32 << 20;
 
 /// The queue's end that the data path sees.
 pub(crate) struct OutFlow {
