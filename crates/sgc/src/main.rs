@@ -1,1 +1,77 @@
-fn main(){}
+//! `sgc`: the command line of SGC, secure global connectivity for ROS 2.
+//!
+//! It parses arguments, reads and writes files, prints, and hands everything else to `sgc-node` and
+//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by [`demo`], whose talkers and
+//! listeners are plain DDS participants.
+//!
+//! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
+//! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
+#![forbid(unsafe_code)]
+
+mod check;
+mod demo;
+mod error;
+mod files;
+mod fleet;
+mod name;
+mod output;
+mod run;
+mod status;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use crate::error::CliError;
+
+/// Secure global connectivity for ROS 2: share exactly the topics you name with exactly the nodes you trust,
+/// between ROS 2 networks anywhere.
+#[derive(Debug, Parser)]
+#[command(name = "sgc", version, max_term_width = 100)]
+#[command(after_help = "A first use:
+  sgc demo                                  see it work on this machine
+  sgc fleet create lab                      make a fleet: lab.fleet
+  sgc fleet enroll arm-1                    make a node's identity: arm-1.identity
+  sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk")]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(demo::DemoArgs),
+    Fleet(fleet::FleetArgs),
+    Run(run::RunArgs),
+    Router(run::RouterArgs),
+    Check(check::CheckArgs),
+    Status(status::StatusArgs),
+    Name(name::NameArgs),
+    #[command(hide = true)]
+    DemoPeer(demo::PeerArgs),
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::try_parse() {
+        Ok(cli) => run(cli.command),
+        Err(error) => return error::usage(&error),
+    };
+    match result {
+        Ok(code) => code,
+        Err(error) => error.report(),
+    }
+}
+
+fn run(command: Command) -> Result<ExitCode, CliError> {
+    match command {
+        Command::Demo(args) => return demo::demo(args),
+        Command::Fleet(args) => fleet::fleet(args),
+        Command::Run(args) => run::run(args),
+        Command::Router(args) => run::router(args),
+        Command::Check(args) => check::check(&args),
+        Command::Status(args) => status::status(&args),
+        Command::Name(args) => name::name(&args),
+        Command::DemoPeer(args) => demo::peer(args),
+    }
+    .map(|()| ExitCode::SUCCESS)
+}

@@ -1,0 +1,92 @@
+//! `sgc check`: everything that is wrong with a configuration, or what a node with it would do.
+//!
+//! It looks at the configuration and the identity that it names and binds nothing. Whether routers and nodes of
+//! these names exist is not known here.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use sgc_node::config::{self, Config, DiscoveryRange, ShareConfig};
+use sgc_trust::Identity;
+
+use crate::error::CliError;
+use crate::{name, output, run};
+
+/// Say everything that is wrong with a configuration, or what a node with it would do. Binds nothing.
+///
+/// Mistakes go to standard error as FILE:LINE: MISTAKE, with exit code 2. The identity is checked as well: whether it can
+/// be read by its owner alone, belongs to this node, and holds today.
+#[derive(Debug, Args)]
+pub(crate) struct CheckArgs {
+    /// The configuration
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+}
+
+/// Runs `sgc check`.
+pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
+    let what = args.config.display().to_string();
+    let config = config::load(&args.config, &run::environment)
+        .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
+    let identity = sgc_node::check_identity(&config)
+        .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
+    output::line(format!("{what}: no mistakes"))?;
+    for line in output::columns(&summary(&config, &identity)?) {
+        output::line(line)?;
+    }
+    Ok(())
+}
+
+fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, CliError> {
+    let mut rows = Vec::new();
+    let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
+    row("node", format!("{} of fleet {}", identity.node_name(), identity.fleet_name()));
+    row("identity", format!("{}, holds until {}", config.identity.display(), identity.not_after()));
+    for url in &config.routers {
+        row("dials", url.to_string());
+    }
+    for addr in &config.listen {
+        row("listens", addr.to_string());
+    }
+    match &config.ros {
+        Some(ros) => {
+            let range = match ros.discovery {
+                DiscoveryRange::Off => "nobody is discovered",
+                DiscoveryRange::Localhost => "this host",
+                DiscoveryRange::Subnet => "the local subnet",
+                DiscoveryRange::SystemDefault => "as the middleware is configured",
+            };
+            let peers = match &ros.static_peers[..] {
+                [] => String::new(),
+                peers => format!(", and {}", peers.join(", ")),
+            };
+            row("ROS 2", format!("domain {}, {range}{peers}", ros.domain_id));
+        }
+        None => row("ROS 2", "none: a router only".to_owned()),
+    }
+    for share in &config.shares {
+        let to: Vec<_> = share.to.iter().map(ToString::to_string).collect();
+        let to = if to == ["*"] { "everyone in the fleet".to_owned() } else { to.join(", ") };
+        row("shares", format!("{}{} with {to}", share.topic, type_of(share.type_name.as_deref())));
+        if let Some(name) = name_of(config, identity, share)? {
+            row("", format!("named {name}"));
+        }
+    }
+    for one in &config.uses {
+        row("uses", format!("{}{} from {}", one.topic, type_of(one.type_name.as_deref()), one.from));
+    }
+    Ok(rows)
+}
+
+fn type_of(type_name: Option<&str>) -> String {
+    type_name.map(|name| format!(" [{name}]")).unwrap_or_default()
+}
+
+/// The share's name, if it can be known yet: without a type it waits for a publisher.
+fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<Option<String>, CliError> {
+    if share.type_name.is_none() {
+        return Ok(None);
+    }
+    let name = name::name_of(identity, &config.identity, identity.node_name(), share)?;
+    Ok(Some(name.to_string()))
+}

@@ -1,0 +1,182 @@
+//! The demo's processes: started from this very program, watched, and ended whatever happens.
+//!
+//! Each child reads a pipe whose other end is held here alone: when this process ends, in whatever way, the pipe
+//! closes and the child ends itself. Children are in process groups of their own, so that a Ctrl-C reaches this
+//! process only, which ends them in order.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::Path;
+use std::process::{ExitStatus, Stdio};
+
+use serde::Serialize;
+use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::process::{Child, ChildStdin, Command};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+
+use crate::error::CliError;
+
+/// Variables that would change which network the children join.
+const ROS_VARIABLES: [&str; 5] = [
+    "ROS_DOMAIN_ID",
+    "ROS_LOCALHOST_ONLY",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "CYCLONEDDS_URI",
+];
+/// Events of children that wait to be read.
+const EVENTS_MAX: usize = 1024;
+/// Lines at the end of a log that are shown when something went wrong.
+const LOG_LINES_SHOWN: usize = 5;
+
+/// Which process.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Who(pub(crate) &'static str);
+
+/// What a child did.
+#[derive(Debug)]
+pub(crate) enum ChildEvent {
+    /// It printed a line.
+    Line(Who, String),
+    /// It ended.
+    Ended(Who, io::Result<ExitStatus>),
+}
+
+impl ChildEvent {
+    /// How a child ended, if not well.
+    fn failure(self) -> Option<(Who, String)> {
+        match self {
+            Self::Ended(_, Ok(status)) if status.success() => None,
+            Self::Ended(who, Ok(status)) => Some((who, status.to_string())),
+            Self::Ended(who, Err(error)) => Some((who, error.to_string())),
+            Self::Line(..) => None,
+        }
+    }
+}
+
+/// All children of a demo. Dropping it ends them.
+pub(crate) struct Processes {
+    children: Vec<Running>,
+    events: mpsc::Sender<ChildEvent>,
+    inbox: mpsc::Receiver<ChildEvent>,
+}
+
+struct Running {
+    who: Who,
+    stdin: Option<ChildStdin>,
+    kill: Option<oneshot::Sender<()>>,
+    watcher: JoinHandle<()>,
+}
+
+impl Processes {
+    /// None yet.
+    pub(crate) fn new() -> Self {
+        let (events, inbox) = mpsc::channel(EVENTS_MAX);
+        Self { children: Vec::new(), events, inbox }
+    }
+
+    /// Starts `sgc` with these arguments, its standard error going to a file.
+    pub(crate) fn start(&mut self, who: Who, args: &[&str], log: &Path) -> Result<(), CliError> {
+        let failed = |source| CliError::System { what: "cannot start a process of the demo", source };
+        let log = File::create(log).map_err(|source| CliError::Write { path: log.to_owned(), source })?;
+        let mut command = Command::new(std::env::current_exe().map_err(failed)?);
+        command
+            .args(args)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(log)
+            .process_group(0)
+            .kill_on_drop(true);
+        for variable in ROS_VARIABLES {
+            command.env_remove(variable);
+        }
+        let mut child = command.spawn().map_err(failed)?;
+        let stdin = child.stdin.take();
+        let (kill, killed) = oneshot::channel();
+        let watcher = tokio::spawn(watch(who, child, self.events.clone(), killed));
+        self.children.push(Running { who, stdin, kill: Some(kill), watcher });
+        Ok(())
+    }
+
+    /// Sends a child a line of JSON.
+    pub(crate) async fn tell(&mut self, who: Who, message: &impl Serialize) -> Result<(), CliError> {
+        let failed = |source| CliError::System { what: "cannot speak to a process of the demo", source };
+        let mut line = serde_json::to_vec(message).map_err(|e| failed(e.into()))?;
+        line.push(b'\n');
+        let stdin = self.children.iter_mut().find(|c| c.who == who).and_then(|c| c.stdin.as_mut());
+        match stdin {
+            Some(stdin) => stdin.write_all(&line).await.map_err(failed),
+            None => Err(failed(io::ErrorKind::NotConnected.into())),
+        }
+    }
+
+    /// The next thing that a child does. Cancelling loses nothing.
+    pub(crate) async fn next(&mut self) -> ChildEvent {
+        // Never `None`: a sender is held here.
+        match self.inbox.recv().await {
+            Some(event) => event,
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Asks these to end, by closing their standard input, and waits until they have; to be bounded by the caller.
+    /// Those that ended badly go to `failures`.
+    pub(crate) async fn end(&mut self, those: &[Who], failures: &mut Vec<(Who, String)>) {
+        for child in self.children.iter_mut().filter(|c| those.contains(&c.who)) {
+            child.stdin = None;
+        }
+        for child in self.children.iter_mut().filter(|c| those.contains(&c.who)) {
+            // One that is through must not be waited for again.
+            while !child.watcher.is_finished() {
+                tokio::select! {
+                    // A watcher that panicked has dropped its child, which kills it.
+                    _ = &mut child.watcher => break,
+                    // Last words are read as they come, for the channel is bounded.
+                    Some(event) = self.inbox.recv() => failures.extend(event.failure()),
+                }
+            }
+        }
+        while let Ok(event) = self.inbox.try_recv() {
+            failures.extend(event.failure());
+        }
+        self.children.retain(|c| !those.contains(&c.who));
+    }
+
+    /// Kills what is left.
+    pub(crate) async fn kill(&mut self) {
+        for child in &mut self.children {
+            child.kill = None;
+        }
+        let left: Vec<Who> = self.children.iter().map(|c| c.who).collect();
+        self.end(&left, &mut Vec::new()).await;
+    }
+}
+
+/// Waits for a child and passes on what it prints. When the other end of `killed` is gone, so is the child.
+async fn watch(who: Who, mut child: Child, events: mpsc::Sender<ChildEvent>, killed: oneshot::Receiver<()>) {
+    let lines = child.stdout.take().map(|out| BufReader::new(out).lines());
+    let printed = async {
+        let Some(mut lines) = lines else { return };
+        while let Ok(Some(line)) = lines.next_line().await {
+            let _ = events.send(ChildEvent::Line(who, line)).await;
+        }
+    };
+    let status = tokio::select! {
+        // Reading ends with the child; what it has printed comes before its end.
+        status = async { printed.await; child.wait().await } => status,
+        _ = killed => match child.start_kill() {
+            Ok(()) => child.wait().await,
+            Err(error) => Err(error),
+        },
+    };
+    let _ = events.send(ChildEvent::Ended(who, status)).await;
+}
+
+/// The last lines of a log, if there are any.
+pub(crate) fn last_lines(log: &Path) -> Vec<String> {
+    let Ok(bytes) = fs::read(log) else { return Vec::new() };
+    let text = String::from_utf8_lossy(&bytes);
+    let lines: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
+    lines[lines.len().saturating_sub(LOG_LINES_SHOWN)..].iter().map(|line| (*line).to_owned()).collect()
+}

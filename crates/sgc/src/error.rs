@@ -1,0 +1,311 @@
+//! Everything that ends a command: one variant per cause, with the culprit and what would be right.
+//!
+//! It knows exit codes and the shape of an error line; what went wrong is found elsewhere.
+
+use std::error::Error;
+use std::fmt::Write as _;
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::error::ErrorKind;
+use sgc_node::NodeError;
+use sgc_node::config::ConfigErrors;
+use sgc_trust::{FleetError, LabelError};
+
+use crate::output;
+
+/// Exit code for a failure while running.
+pub(crate) const EXIT_FAILURE: u8 = 1;
+/// Exit code for what cannot be right: arguments, configuration, identity.
+pub(crate) const EXIT_USAGE: u8 = 2;
+
+/// Why a command ends early.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum CliError {
+    /// Mistakes in the configuration; each is printed by itself.
+    #[error("{what}: {}", count(errors))]
+    Config {
+        /// A file, or the command line.
+        what: String,
+        /// The mistakes.
+        errors: ConfigErrors,
+    },
+    /// Mistakes in the arguments that a configuration would have, too.
+    #[error("{}", errors.iter().map(|e| e.mistake.to_string()).collect::<Vec<_>>().join("; "))]
+    Arguments {
+        /// The mistakes.
+        errors: ConfigErrors,
+    },
+    /// A name of a node, group or fleet that is none.
+    #[error(transparent)]
+    Label(#[from] LabelError),
+    /// A file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file cannot be written.
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file that would be overwritten.
+    #[error("{} exists already{hint}", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+        /// What can be done about it, with its separator.
+        hint: &'static str,
+    },
+    /// A file of secrets that others may read.
+    #[error(
+        "{}: its mode {mode:04o} lets others at the CA's private key: chmod 600 {}",
+        path.display(),
+        path.display()
+    )]
+    FleetExposed {
+        /// The file.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// A fleet file that is broken, or a fleet that cannot enrol.
+    #[error("{}: {source}", path.display())]
+    Fleet {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: FleetError,
+    },
+    /// No fleet file was named and none is here.
+    #[error("no fleet file here: name one with --fleet FILE, or make a fleet with `sgc fleet create NAME`")]
+    NoFleetHere,
+    /// No fleet file was named and several are here.
+    #[error("which fleet? Name one with --fleet: {}", files.join(", "))]
+    SeveralFleets {
+        /// Their names.
+        files: Vec<String>,
+    },
+    /// The node refused or failed.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// A configuration whose identity will not do.
+    #[error("{what}: {source}")]
+    CheckIdentity {
+        /// The configuration file.
+        what: String,
+        /// What is wrong.
+        source: NodeError,
+    },
+    /// A router's identity where names are to be derived.
+    #[error(
+        "{} is a router's identity: it holds no fleet secret, so that a router can derive no name; use a member's \
+         identity",
+        path.display()
+    )]
+    RouterCannotName {
+        /// The identity file.
+        path: PathBuf,
+    },
+    /// A log filter that is none.
+    #[error("{from} is {value:?}: {reason}; \"info\", \"debug\" or \"sgc_node=debug,info\", for example")]
+    LogFilter {
+        /// The argument or variable.
+        from: &'static str,
+        /// Its value.
+        value: String,
+        /// What the parser said.
+        reason: String,
+    },
+    /// Nobody answers at a status socket.
+    #[error("no node runs at {}: {reason}", path.display())]
+    NoNode {
+        /// The socket.
+        path: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
+    /// No status socket was named and none is in the usual place.
+    #[error("no node of this user runs here (no socket in {}); name one with -c or --socket", dir.display())]
+    NoNodeHere {
+        /// The usual place.
+        dir: PathBuf,
+    },
+    /// No status socket was named and several are in the usual place.
+    #[error("which node? Name one with --socket: {}", sockets.join(", "))]
+    SeveralNodes {
+        /// Their sockets.
+        sockets: Vec<String>,
+    },
+    /// What came from a status socket is no status.
+    #[error("what answers at {} is not a node's status: {reason}", path.display())]
+    NotAStatus {
+        /// The socket.
+        path: PathBuf,
+        /// What the parser said.
+        reason: String,
+    },
+    /// The demo cannot go on.
+    #[error("demo: {reason}")]
+    Demo {
+        /// Why, with the culprit.
+        reason: String,
+        /// What is known beyond it, to be printed below.
+        facts: Vec<String>,
+    },
+    /// The system refused something without which nothing works.
+    #[error("{what}: {source}")]
+    System {
+        /// What was attempted.
+        what: &'static str,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Standard output cannot be written.
+    #[error("cannot write to standard output: {0}")]
+    Output(io::Error),
+}
+
+impl CliError {
+    /// Prints it and says how the process ends.
+    pub(crate) fn report(&self) -> ExitCode {
+        match self {
+            // Whoever reads has enough, as with `sgc status | head -1`.
+            Self::Output(error) if error.kind() == io::ErrorKind::BrokenPipe => return ExitCode::SUCCESS,
+            Self::Config { errors, .. } => {
+                for error in errors {
+                    output::diagnostic(&error.to_string());
+                }
+            }
+            _ => {}
+        }
+        output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
+        if let Self::Demo { facts, .. } = self {
+            for fact in facts {
+                output::diagnostic(&format!("  {fact}"));
+            }
+        }
+        ExitCode::from(self.exit_code())
+    }
+
+    fn exit_code(&self) -> u8 {
+        match self {
+            Self::Config { .. }
+            | Self::Arguments { .. }
+            | Self::Label(_)
+            | Self::Exists { .. }
+            | Self::FleetExposed { .. }
+            | Self::Fleet { .. }
+            | Self::NoFleetHere
+            | Self::SeveralFleets { .. }
+            | Self::CheckIdentity { .. }
+            | Self::RouterCannotName { .. }
+            | Self::LogFilter { .. }
+            | Self::SeveralNodes { .. } => EXIT_USAGE,
+            Self::Node(NodeError::Listen { .. } | NodeError::Ros(_) | NodeError::Randomness(_)) => {
+                EXIT_FAILURE
+            }
+            Self::Node(_) => EXIT_USAGE,
+            Self::Read { .. }
+            | Self::Write { .. }
+            | Self::NoNode { .. }
+            | Self::NoNodeHere { .. }
+            | Self::NotAStatus { .. }
+            | Self::Demo { .. }
+            | Self::System { .. }
+            | Self::Output(_) => EXIT_FAILURE,
+        }
+    }
+}
+
+/// Prints what clap has to say, help included, and says how the process ends.
+pub(crate) fn usage(error: &clap::Error) -> ExitCode {
+    match error.kind() {
+        ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => {
+            // Nobody is there to be told that the help could not be printed.
+            let _ = error.print();
+            ExitCode::SUCCESS
+        }
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            let _ = error.print();
+            ExitCode::from(EXIT_USAGE)
+        }
+        _ => {
+            output::diagnostic(&format!("sgc: {}", usage_line(&error.render().to_string())));
+            ExitCode::from(EXIT_USAGE)
+        }
+    }
+}
+
+/// One line of clap's paragraphs: what is wrong and its tip, then where to read more.
+fn usage_line(text: &str) -> String {
+    let (about, rest) = text.split_once("Usage:").unwrap_or((text, ""));
+    let about = about.split("For more information").next().unwrap_or_default();
+    let line = about.split_whitespace().collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
+    let line = line.strip_prefix("error: ").unwrap_or(&line);
+    let is_command = |word: &&str| word.chars().all(|c| c.is_ascii_lowercase() || c == '-');
+    let command: Vec<_> =
+        rest.split_whitespace().take_while(is_command).take_while(|word| !word.starts_with('-')).collect();
+    let command = if command.is_empty() { "sgc".to_owned() } else { command.join(" ") };
+    format!("{line}; see `{command} --help`")
+}
+
+/// An error and its sources, each said once.
+fn chain(error: &dyn Error) -> String {
+    let mut text = error.to_string();
+    let mut next = error.source();
+    while let Some(source) = next {
+        let said = source.to_string();
+        if !text.contains(&said) {
+            let _ = write!(text, ": {said}");
+        }
+        next = source.source();
+    }
+    text
+}
+
+fn one_line(text: &str) -> String {
+    text.lines().map(str::trim).collect::<Vec<_>>().join(" ")
+}
+
+fn count(errors: &ConfigErrors) -> String {
+    match errors.iter().count() {
+        1 => "1 mistake".to_owned(),
+        n => format!("{n} mistakes"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clap_is_brought_to_one_line() {
+        let text = "error: unrecognized subcommand 'flet'\n\n  tip: a similar subcommand exists: 'fleet'\n\n\
+                    Usage: sgc <COMMAND>\n\nFor more information, try '--help'.\n";
+        assert_eq!(
+            usage_line(text),
+            "unrecognized subcommand 'flet'; a similar subcommand exists: 'fleet'; see `sgc --help`"
+        );
+        let text = "error: invalid value 'x' for '--days <N>': invalid digit\n\nFor more information, try '--help'.\n";
+        assert_eq!(usage_line(text), "invalid value 'x' for '--days <N>': invalid digit; see `sgc --help`");
+        let text = "error: the following required arguments were not provided:\n  --owner <NODE>\n\n\
+                    Usage: sgc fleet enroll --owner <NODE>\n\nFor more information, try '--help'.\n";
+        let said = "the following required arguments were not provided: --owner <NODE>";
+        assert_eq!(usage_line(text), format!("{said}; see `sgc fleet enroll --help`"));
+    }
+
+    #[test]
+    fn a_source_is_not_said_twice() {
+        let inner = || io::Error::other("disk on fire");
+        let outer = CliError::Read { path: "/x".into(), source: inner() };
+        assert_eq!(chain(&outer), "cannot read /x: disk on fire");
+    }
+}

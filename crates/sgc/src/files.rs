@@ -1,0 +1,72 @@
+//! Files that hold secrets: written whole or not at all, for their owner alone, and never over another by
+//! accident.
+//!
+//! What is in them is the business of `sgc-trust`.
+
+use std::fs;
+use std::io::{self, Write};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use zeroize::Zeroizing;
+
+use crate::error::CliError;
+
+/// The largest file that is read as one of secrets.
+const SECRET_FILE_BYTES_MAX: u64 = 1024 * 1024;
+const PERMISSION_BITS: u32 = 0o7777;
+const OTHERS_BITS: u32 = 0o077;
+
+/// Whether a file that is there may be replaced.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Existing {
+    /// It stays, and writing fails with this hint.
+    Keep(&'static str),
+    /// It is replaced.
+    Replace,
+}
+
+/// Writes a file of mode 0600: complete under its name, or not there.
+pub(crate) fn write_secret(path: &Path, text: &str, existing: Existing) -> Result<(), CliError> {
+    let failed = |source| CliError::Write { path: path.to_owned(), source };
+    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // 0600 from the beginning: that is how `tempfile` creates.
+    let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
+    file.write_all(text.as_bytes()).map_err(failed)?;
+    file.as_file().sync_all().map_err(failed)?;
+    match existing {
+        Existing::Replace => file.persist(path).map_err(|e| failed(e.error))?,
+        Existing::Keep(hint) => file.persist_noclobber(path).map_err(|e| match e.error.kind() {
+            io::ErrorKind::AlreadyExists => CliError::Exists { path: path.to_owned(), hint },
+            _ => failed(e.error),
+        })?,
+    };
+    Ok(())
+}
+
+/// Reads a fleet file, which must be its owner's alone.
+pub(crate) fn read_fleet(path: &Path) -> Result<Zeroizing<String>, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    let metadata = fs::metadata(path).map_err(failed)?;
+    let mode = metadata.permissions().mode() & PERMISSION_BITS;
+    if mode & OTHERS_BITS != 0 {
+        return Err(CliError::FleetExposed { path: path.to_owned(), mode });
+    }
+    if metadata.len() > SECRET_FILE_BYTES_MAX {
+        return Err(failed(io::Error::other("it is far too large for a fleet file")));
+    }
+    fs::read_to_string(path).map(Zeroizing::new).map_err(failed)
+}
+
+/// The files of a directory with this extension, in order.
+pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir)? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|e| e == extension) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}

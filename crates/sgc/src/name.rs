@@ -1,0 +1,154 @@
+//! `sgc name`: the 256-bit name of a topic, by the derivation that the nodes use.
+//!
+//! The arguments are judged by the rules of the configuration, so that what is refused there has no name here.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use sgc_node::config::{self, ConfigErrors, ShareConfig};
+use sgc_trust::{Identity, NodeName, derive_name};
+use sgc_wire::{Metadata, Name};
+
+use crate::error::CliError;
+use crate::output;
+
+/// Print the 256-bit name of a topic.
+///
+/// The name follows from the fleet's secret, the owner, and the topic with its type and other metadata; each of these
+/// changes it. It does not depend on where the owner is, nor on its key.
+#[derive(Debug, Args)]
+pub(crate) struct NameArgs {
+    /// The node that shares the topic
+    #[arg(long, value_name = "NODE")]
+    owner: String,
+    /// Its full ROS 2 name, such as /camera/image
+    #[arg(long)]
+    topic: String,
+    /// Its type, such as sensor_msgs/msg/Image
+    #[arg(long = "type", value_name = "TYPE")]
+    type_name: String,
+    /// The identity of a member of the fleet
+    #[arg(long, value_name = "FILE")]
+    identity: PathBuf,
+    /// `node` of the share: the ROS node that provides it
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    node: String,
+    /// `author` of the share
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    author: String,
+    /// `maintainer` of the share
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    maintainer: String,
+    /// `interface` of the share
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    interface: String,
+    /// `description` of the share
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    description: String,
+    /// `unique` of the share
+    #[arg(long, value_name = "TEXT", default_value = "", hide_default_value = true)]
+    unique: String,
+}
+
+/// Runs `sgc name`.
+pub(crate) fn name(args: &NameArgs) -> Result<(), CliError> {
+    let owner: NodeName = args.owner.parse()?;
+    let share = args.share().map_err(|errors| CliError::Arguments { errors })?;
+    let identity = sgc_node::load_identity(&args.identity)?;
+    output::line(name_of(&identity, &args.identity, &owner, &share)?)
+}
+
+/// The name of a share of `owner`, by a member of its fleet. The share has to have a type.
+pub(crate) fn name_of(
+    identity: &Identity,
+    identity_path: &Path,
+    owner: &NodeName,
+    share: &ShareConfig,
+) -> Result<Name, CliError> {
+    let (Some(secret), Some(owner_id)) = (identity.fleet_secret(), identity.node_id_of(owner.as_str()))
+    else {
+        return Err(CliError::RouterCannotName { path: identity_path.to_owned() });
+    };
+    let extra = share.metadata.clone();
+    let type_name = share.type_name.as_deref().unwrap_or_default();
+    let metadata = Metadata {
+        node: extra.node,
+        author: extra.author,
+        maintainer: extra.maintainer,
+        interface: extra.interface,
+        description: extra.description,
+        unique: extra.unique,
+        ..Metadata::topic(owner.as_str(), &share.topic, type_name)
+    };
+    Ok(derive_name(secret, &owner_id, &metadata))
+}
+
+impl NameArgs {
+    /// The share that the arguments describe, judged as one of a configuration.
+    fn share(&self) -> Result<ShareConfig, ConfigErrors> {
+        let fields = [
+            ("topic", &self.topic),
+            ("type", &self.type_name),
+            ("node", &self.node),
+            ("author", &self.author),
+            ("maintainer", &self.maintainer),
+            ("interface", &self.interface),
+            ("description", &self.description),
+            ("unique", &self.unique),
+        ];
+        let mut text = String::from(
+            "identity = \"-\"\n[node]\nrouters = [\"quic://localhost\"]\n[[share]]\nto = [\"*\"]\n",
+        );
+        for (key, value) in fields {
+            text.push_str(&format!("{key} = {}\n", toml_string(value)));
+        }
+        let mut config = config::parse(&text, "arguments", Path::new(""), &|_| None)?;
+        Ok(config.shares.swap_remove(0))
+    }
+}
+
+/// A basic string of TOML: what is not printable ASCII or could end it is escaped.
+fn toml_string(text: &str) -> String {
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            ' '..='~' => out.push(c),
+            c => out.push_str(&format!("\\U{:08X}", u32::from(c))),
+        }
+    }
+    out.push('"');
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn args(description: &str) -> NameArgs {
+        NameArgs {
+            owner: "arm-1".into(),
+            topic: "/t".into(),
+            type_name: "p::msg::dds_::T_".into(),
+            identity: "x".into(),
+            node: String::new(),
+            author: String::new(),
+            maintainer: String::new(),
+            interface: String::new(),
+            description: description.into(),
+            unique: String::new(),
+        }
+    }
+
+    #[test]
+    fn every_text_is_taken_as_it_is() {
+        for text in ["", "plain", "\"]\n[ros]", "back\\slash", "tab\tdel\u{7f}nul\0", "ü ☃ 🤖"] {
+            assert_eq!(args(text).share().unwrap().metadata.description, text);
+        }
+    }
+
+    #[test]
+    fn a_type_as_dds_spells_it_has_the_same_name() {
+        assert_eq!(args("").share().unwrap().type_name.as_deref(), Some("p/msg/T"));
+    }
+}

@@ -1,0 +1,257 @@
+//! `sgc run` and `sgc router`: from arguments to a running node, and from a signal to its clean end.
+//!
+//! The node is `sgc_node::run`, called in one place here. This file owns what surrounds it: the log, the signals, and
+//! the standard input that a parent may hold open.
+
+use std::io::{IsTerminal, Read};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use serde::{Deserialize, Serialize};
+use sgc_node::RunOptions;
+use sgc_node::config::{self, ArgsConfig, Config};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::oneshot;
+use tracing_subscriber::EnvFilter;
+
+use crate::error::{CliError, EXIT_FAILURE};
+use crate::output;
+
+const LOG_VARIABLE: &str = "SGC_LOG";
+const LOG_DEFAULT: &str = "info";
+/// How long a process may take to end by itself once the parent that holds its standard input is gone.
+const ORPHAN_GRACE: Duration = Duration::from_secs(5);
+/// How long threads that still work may delay the end of the process.
+const RUNTIME_GRACE: Duration = Duration::from_secs(1);
+
+/// Run a node: with a configuration file, or with arguments alone.
+///
+/// A node with shares or uses joins the local ROS 2 network as ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE say; one
+/// that listens is a router, and may be both. SIGINT and SIGTERM end it cleanly, a second one at once.
+#[derive(Debug, Args)]
+pub(crate) struct RunArgs {
+    /// The configuration
+    #[arg(short, long, value_name = "FILE",
+          conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen"])]
+    config: Option<PathBuf>,
+    /// The identity that `sgc fleet enroll` made
+    #[arg(long, value_name = "FILE")]
+    identity: Option<PathBuf>,
+    /// A router to connect to, such as quic://router.lab.example:7447; may be repeated
+    #[arg(long, value_name = "URL")]
+    router: Vec<String>,
+    /// A topic to share, /TOPIC or /TOPIC=NODE,group:GROUP; may be repeated
+    #[arg(long, value_name = "/TOPIC")]
+    share: Vec<String>,
+    /// Who may subscribe to what is shared: NODE, group:GROUP or '*', which is every member of the fleet and the default;
+    /// may be repeated
+    #[arg(long, value_name = "WHO")]
+    to: Vec<String>,
+    /// A topic of another node to bring here; may be repeated
+    #[arg(long = "use", value_name = "NODE:/TOPIC")]
+    uses: Vec<String>,
+    /// Listen as a router, such as quic://0.0.0.0:7447; may be repeated
+    #[arg(long, value_name = "URL")]
+    listen: Vec<String>,
+    #[command(flatten)]
+    process: ProcessArgs,
+}
+
+/// Run a router, which passes packets on and can read none of them: short for `sgc run` with `--listen` alone.
+#[derive(Debug, Args)]
+pub(crate) struct RouterArgs {
+    /// The identity that `sgc fleet enroll --router` made
+    #[arg(long, value_name = "FILE")]
+    identity: PathBuf,
+    /// Where to listen, such as quic://0.0.0.0:7447; may be repeated
+    #[arg(long, value_name = "URL", required = true)]
+    listen: Vec<String>,
+    /// Another router to connect to; may be repeated
+    #[arg(long, value_name = "URL")]
+    peer: Vec<String>,
+    #[command(flatten)]
+    process: ProcessArgs,
+}
+
+/// What a node's process is given besides its configuration.
+#[derive(Debug, Args)]
+struct ProcessArgs {
+    /// What to log: error, warn, info, debug, trace, or a filter such as sgc_node=debug,info [env: SGC_LOG]
+    #[arg(long, value_name = "LEVEL")]
+    log: Option<String>,
+    /// End when standard input does: a child that outlives no parent
+    #[arg(long, hide = true)]
+    until_stdin_closes: bool,
+    /// Print a line of JSON with the bound addresses once the node is up
+    #[arg(long, hide = true)]
+    print_ready: bool,
+}
+
+/// What `--print-ready` prints.
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct ReadyLine {
+    /// Addresses that are listened on, as URLs.
+    pub(crate) ready: Vec<String>,
+}
+
+/// Runs `sgc run`.
+pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
+    start_log(args.process.log.as_deref())?;
+    let is_open = args.to.is_empty() && args.share.iter().any(|share| !share.contains('='));
+    let config = match &args.config {
+        Some(path) => config::load(path, &environment)
+            .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?,
+        None => from_args(&ArgsConfig {
+            identity: args.identity,
+            routers: args.router,
+            shares: args.share,
+            to: args.to,
+            uses: args.uses,
+            listen: args.listen,
+        })?,
+    };
+    if is_open {
+        tracing::info!("--share without --to: every member of the fleet may subscribe, and nobody else");
+    }
+    run_node(config, &args.process)
+}
+
+/// Runs `sgc router`.
+pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
+    start_log(args.process.log.as_deref())?;
+    let config = from_args(&ArgsConfig {
+        identity: Some(args.identity),
+        routers: args.peer,
+        listen: args.listen,
+        ..ArgsConfig::default()
+    })?;
+    run_node(config, &args.process)
+}
+
+/// Looks a variable up for the configuration.
+pub(crate) fn environment(name: &str) -> Option<String> {
+    std::env::var(name).ok()
+}
+
+/// Starts logging to standard error.
+pub(crate) fn start_log(argument: Option<&str>) -> Result<(), CliError> {
+    let variable = std::env::var(LOG_VARIABLE).ok().filter(|v| !v.is_empty());
+    let (from, value) = match (argument, variable) {
+        (Some(value), _) => ("--log", value.to_owned()),
+        (None, Some(value)) => (LOG_VARIABLE, value),
+        (None, None) => ("--log", LOG_DEFAULT.to_owned()),
+    };
+    let filter = EnvFilter::builder().parse(&value).map_err(|e| CliError::LogFilter {
+        from,
+        value,
+        reason: e.to_string(),
+    })?;
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
+    Ok(())
+}
+
+/// Becomes ready when standard input ends, as it does when the parent that holds it dies by whatever means. Should
+/// the process be there long after, it is ended.
+pub(crate) fn stdin_closed() -> oneshot::Receiver<()> {
+    let (closed, when_closed) = oneshot::channel();
+    // A plain thread: a runtime would wait for one of its own.
+    std::thread::spawn(move || {
+        let mut buffer = [0; 256];
+        while !matches!(std::io::stdin().lock().read(&mut buffer), Ok(0) | Err(_)) {}
+        let _ = closed.send(());
+        exit_after_grace();
+    });
+    when_closed
+}
+
+/// Ends the process if it does not end by itself; blocks until then.
+pub(crate) fn exit_after_grace() {
+    std::thread::sleep(ORPHAN_GRACE);
+    std::process::exit(EXIT_FAILURE.into());
+}
+
+/// The signals that ask a process to end.
+pub(crate) struct EndSignals {
+    signals: [Signal; 3],
+}
+
+impl EndSignals {
+    /// Listens from now on; needs a runtime.
+    pub(crate) fn new() -> Result<Self, CliError> {
+        let listen = |kind| {
+            signal(kind).map_err(|source| CliError::System { what: "cannot listen for signals", source })
+        };
+        let kinds = [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()];
+        let [interrupt, terminate, hangup] = kinds.map(listen);
+        Ok(Self { signals: [interrupt?, terminate?, hangup?] })
+    }
+
+    /// Waits for the next one.
+    pub(crate) async fn next(&mut self) {
+        let [interrupt, terminate, hangup] = &mut self.signals;
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+            _ = hangup.recv() => {}
+        }
+    }
+
+    /// Ends the process at the next one.
+    pub(crate) fn end_at_once(mut self) {
+        tokio::spawn(async move {
+            self.next().await;
+            std::process::exit(EXIT_FAILURE.into());
+        });
+    }
+}
+
+fn from_args(args: &ArgsConfig) -> Result<Config, CliError> {
+    config::load_args(args, &environment)
+        .map_err(|errors| CliError::Config { what: "command line".to_owned(), errors })
+}
+
+fn run_node(config: Config, process: &ProcessArgs) -> Result<(), CliError> {
+    let stdin_closed = process.until_stdin_closes.then(stdin_closed);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|source| CliError::System { what: "cannot start threads", source })?;
+    let result = runtime.block_on(async {
+        let signals = EndSignals::new()?;
+        let mut options = RunOptions::default();
+        if process.print_ready {
+            let (ready, when_ready) = oneshot::channel::<Vec<_>>();
+            options.ready = Some(ready);
+            tokio::spawn(async move {
+                if let Ok(addresses) = when_ready.await {
+                    let ready = addresses.iter().map(ToString::to_string).collect();
+                    // If the parent is gone, standard input says so.
+                    let _ = serde_json::to_string(&ReadyLine { ready }).map(output::line);
+                }
+            });
+        }
+        sgc_node::run(config, options, shutdown(signals, stdin_closed)).await.map_err(CliError::Node)
+    });
+    runtime.shutdown_timeout(RUNTIME_GRACE);
+    result
+}
+
+/// Ready at the first signal or at the end of standard input; from then on a signal ends the process at once.
+async fn shutdown(mut signals: EndSignals, stdin_closed: Option<oneshot::Receiver<()>>) {
+    let orphaned = async {
+        match stdin_closed {
+            Some(closed) => drop(closed.await),
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        () = signals.next() => {}
+        () = orphaned => {}
+    }
+    signals.end_at_once();
+}

@@ -1,0 +1,286 @@
+//! `sgc status`: asks a running node how it is doing, and shows it.
+//!
+//! The document is made by `sgc-node`; this file reads what it needs of it and passes over what it does not know, so
+//! that it understands older and newer nodes.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use serde::Deserialize;
+use sgc_node::config::{self, Config};
+
+use crate::error::CliError;
+use crate::{files, output, run};
+
+/// How long a node may take to answer.
+const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// The largest answer that is read.
+const STATUS_BYTES_MAX: u64 = 64 * 1024 * 1024;
+const SOCKET_EXTENSION: &str = "sock";
+
+/// Show how a running node is doing: links, shares and uses, names, drops.
+#[derive(Debug, Args)]
+pub(crate) struct StatusArgs {
+    /// The node's configuration; without it, the one node that this user runs here
+    #[arg(short, long, value_name = "FILE", conflicts_with = "socket")]
+    config: Option<PathBuf>,
+    /// The node's status socket
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// Print the JSON document as the node gave it
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a node says of itself.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Status {
+    node: String,
+    version: String,
+    uptime_s: u64,
+    pub(crate) links: Vec<Link>,
+    pub(crate) routes: Vec<Route>,
+    names: Vec<NameTraffic>,
+    pub(crate) drops: BTreeMap<String, u64>,
+    pub(crate) refused: BTreeMap<String, u64>,
+    router: RouterSize,
+}
+
+/// A link of a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Link {
+    peer: String,
+    pub(crate) remote: String,
+    url: Option<String>,
+    rtt_us: u64,
+    sent_bytes: u64,
+    received_bytes: u64,
+}
+
+/// A share or use of a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Route {
+    pub(crate) direction: String,
+    pub(crate) topic: String,
+    #[serde(rename = "type")]
+    type_name: Option<String>,
+    pub(crate) name: Option<String>,
+    owner: String,
+    pub(crate) state: String,
+    messages: u64,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct NameTraffic {
+    name: String,
+    packets: u64,
+    bytes: u64,
+    dropped: u64,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct RouterSize {
+    names: u64,
+    routed_names: u64,
+    branches: u64,
+}
+
+/// Runs `sgc status`.
+pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
+    let socket = socket(args)?;
+    let text = ask(&socket)?;
+    let status = parse(&socket, &text)?;
+    if args.json {
+        return output::line(text.trim_end());
+    }
+    for line in status.lines() {
+        output::line(line)?;
+    }
+    Ok(())
+}
+
+/// Asks the node at a socket; for programs that show a status in another way.
+pub(crate) fn of_node_at(socket: &Path) -> Result<Status, CliError> {
+    parse(socket, &ask(socket)?)
+}
+
+fn socket(args: &StatusArgs) -> Result<PathBuf, CliError> {
+    if let Some(socket) = &args.socket {
+        return Ok(socket.clone());
+    }
+    let Some(path) = &args.config else { return only_socket() };
+    let config = config::load(path, &run::environment)
+        .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
+    Ok(sgc_node::admin_socket_path(&config, &node_name(&config)?))
+}
+
+fn node_name(config: &Config) -> Result<String, CliError> {
+    match &config.node_name {
+        Some(name) => Ok(name.to_string()),
+        None => Ok(sgc_node::load_identity(&config.identity)?.node_name().to_string()),
+    }
+}
+
+/// The socket of the one node that this user runs with nothing said about its socket.
+fn only_socket() -> Result<PathBuf, CliError> {
+    let usual = sgc_node::default_socket_path("node");
+    let dir = usual.parent().unwrap_or(Path::new("/"));
+    let mut found = files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default();
+    match found.len() {
+        0 => Err(CliError::NoNodeHere { dir: dir.to_owned() }),
+        1 => Ok(found.swap_remove(0)),
+        _ => Err(CliError::SeveralNodes { sockets: found.iter().map(|p| p.display().to_string()).collect() }),
+    }
+}
+
+fn ask(socket: &Path) -> Result<String, CliError> {
+    let no_node = |error: std::io::Error| CliError::NoNode {
+        path: socket.to_owned(),
+        reason: match error.kind() {
+            std::io::ErrorKind::NotFound => "there is no such socket".to_owned(),
+            std::io::ErrorKind::ConnectionRefused => "its socket is left over".to_owned(),
+            std::io::ErrorKind::WouldBlock => format!("it did not answer within {} s", ANSWER_MAX.as_secs()),
+            _ => error.to_string(),
+        },
+    };
+    let stream = UnixStream::connect(socket).map_err(no_node)?;
+    stream.set_read_timeout(Some(ANSWER_MAX)).map_err(no_node)?;
+    let mut text = String::new();
+    stream.take(STATUS_BYTES_MAX).read_to_string(&mut text).map_err(no_node)?;
+    Ok(text)
+}
+
+fn parse(socket: &Path, text: &str) -> Result<Status, CliError> {
+    serde_json::from_str(text)
+        .map_err(|e| CliError::NotAStatus { path: socket.to_owned(), reason: e.to_string() })
+}
+
+impl Status {
+    fn lines(&self) -> Vec<String> {
+        let mut lines =
+            vec![format!("{}: sgc {}, up for {}", self.node, self.version, duration(self.uptime_s))];
+        let mut section = |title: &str, head: &[&str], rows: Vec<Vec<String>>| {
+            lines.push(String::new());
+            if rows.is_empty() {
+                lines.push(format!("{title}: none"));
+                return;
+            }
+            lines.push(format!("{title}:"));
+            let head = head.iter().map(|h| (*h).to_owned()).collect();
+            let table: Vec<_> = std::iter::once(head).chain(rows).collect();
+            lines.extend(output::columns(&table).into_iter().map(|line| format!("  {line}")));
+        };
+        section(
+            "Links",
+            &["peer", "remote", "round trip", "sent", "received", "dialled"],
+            self.links.iter().map(Link::row).collect(),
+        );
+        section(
+            "Topics",
+            &["", "topic", "type", "owner", "messages", "state"],
+            self.routes.iter().map(Route::row).collect(),
+        );
+        section(
+            "Names",
+            &["name", "packets", "bytes", "dropped"],
+            self.names.iter().map(NameTraffic::row).collect(),
+        );
+        let counts = |counts: &BTreeMap<String, u64>| {
+            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string()]).collect()
+        };
+        section("Drops", &["reason", "count"], counts(&self.drops));
+        section("Refused peers", &["reason", "count"], counts(&self.refused));
+        let RouterSize { names, routed_names, branches } = self.router;
+        lines.push(String::new());
+        lines.push(format!("Router: {names} names known, {routed_names} with a route, {branches} branches"));
+        lines
+    }
+}
+
+impl Link {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.peer.chars().take(8).collect(),
+            self.remote.clone(),
+            output::millis(self.rtt_us),
+            output::bytes(self.sent_bytes),
+            output::bytes(self.received_bytes),
+            self.url.clone().unwrap_or_default(),
+        ]
+    }
+}
+
+impl Route {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.direction.clone(),
+            self.topic.clone(),
+            self.type_name.clone().unwrap_or_else(|| "?".into()),
+            self.owner.clone(),
+            self.messages.to_string(),
+            self.state.clone(),
+        ]
+    }
+}
+
+impl NameTraffic {
+    fn row(&self) -> Vec<String> {
+        vec![self.name.clone(), self.packets.to_string(), output::bytes(self.bytes), self.dropped.to_string()]
+    }
+}
+
+fn duration(seconds: u64) -> String {
+    match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
+        (0, 0, 0, s) => format!("{s} s"),
+        (0, 0, m, s) => format!("{m} min {s} s"),
+        (0, h, m, _) => format!("{h} h {m} min"),
+        (d, h, _, _) => format!("{d} d {h} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_is_shown_in_tables() {
+        let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
+            "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
+                      "rtt_us":420,"sent_bytes":1500,"received_bytes":7}],
+            "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
+                       "state":"waiting for a publisher"}],
+            "names":[],"drops":{"no_tree":3},"refused":{},"router":{"names":1,"routed_names":0,"branches":2}}"#;
+        let lines = parse(Path::new("x"), text).unwrap().lines();
+        let expected = [
+            "arm-1: sgc 0.1.0, up for 1 min 15 s",
+            "",
+            "Links:",
+            "  peer      remote          round trip  sent    received  dialled",
+            "  01234567  127.0.0.1:7447  0.42 ms     1.5 kB  7 B       quic://localhost:7447",
+            "",
+            "Topics:",
+            "         topic     type  owner  messages  state",
+            "  share  /chatter  ?     arm-1  0         waiting for a publisher",
+            "",
+            "Names: none",
+            "",
+            "Drops:",
+            "  reason   count",
+            "  no_tree  3",
+            "",
+            "Refused peers: none",
+            "",
+            "Router: 1 names known, 0 with a route, 2 branches",
+        ];
+        assert_eq!(lines, expected);
+    }
+}

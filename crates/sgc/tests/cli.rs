@@ -1,0 +1,522 @@
+//! What the program does for its user: files, output, and exit codes, of the real binary.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use sgc_trust::{EnrollRequest, Fleet, Identity, derive_name};
+use sgc_wire::{Metadata, UnixMillis};
+use tempfile::TempDir;
+
+const NAME_ARGS: [&str; 7] =
+    ["name", "--topic", "/camera/image", "--type", "sensor_msgs/msg/Image", "--identity", "arm-1.identity"];
+
+/// A directory with `sgc` run in it, away from the user's environment.
+struct Place {
+    dir: TempDir,
+}
+
+/// What a run came to.
+#[derive(Debug)]
+struct Ran {
+    code: Option<i32>,
+    stdout: String,
+    stderr: String,
+}
+
+impl Place {
+    fn new() -> Self {
+        Self { dir: tempfile::tempdir().unwrap() }
+    }
+
+    /// With the fleet `lab`, the nodes `arm-1` and `desk`, and the router `cloud`.
+    fn with_fleet() -> Self {
+        let place = Self::new();
+        place.good(&["fleet", "create", "lab"]);
+        place.good(&["fleet", "enroll", "arm-1", "--group", "arms"]);
+        place.good(&["fleet", "enroll", "desk"]);
+        place.good(&["fleet", "enroll", "cloud", "--router"]);
+        place
+    }
+
+    fn path(&self) -> &Path {
+        self.dir.path()
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sgc"));
+        command
+            .args(args)
+            .current_dir(self.path())
+            .env_clear()
+            .env("XDG_RUNTIME_DIR", self.path())
+            .stdin(Stdio::null());
+        command
+    }
+
+    fn run(&self, args: &[&str]) -> Ran {
+        Ran::from(self.command(args).output().unwrap())
+    }
+
+    /// Standard output of a run that must succeed, and say nothing else.
+    fn good(&self, args: &[&str]) -> String {
+        let ran = self.run(args);
+        assert_eq!((ran.code, ran.stderr.as_str()), (Some(0), ""), "{args:?}");
+        ran.stdout
+    }
+
+    /// Standard error of a run that must fail with this code, and print nothing else.
+    fn bad(&self, code: i32, args: &[&str]) -> String {
+        let ran = self.run(args);
+        assert_eq!((ran.code, ran.stdout.as_str()), (Some(code), ""), "{args:?}: {}", ran.stderr);
+        ran.stderr
+    }
+
+    /// The one line, with its newline, that a run must fail with.
+    fn says(&self, code: i32, args: &[&str], line: &str) {
+        assert_eq!(self.bad(code, args), format!("sgc: {line}\n"), "{args:?}");
+    }
+
+    fn write(&self, file: &str, text: &str) {
+        fs::write(self.path().join(file), text).unwrap();
+    }
+
+    fn read(&self, file: &str) -> String {
+        fs::read_to_string(self.path().join(file)).unwrap()
+    }
+
+    fn mode(&self, file: &str) -> u32 {
+        fs::metadata(self.path().join(file)).unwrap().permissions().mode() & 0o7777
+    }
+
+    fn set_mode(&self, file: &str, mode: u32) {
+        fs::set_permissions(self.path().join(file), fs::Permissions::from_mode(mode)).unwrap();
+    }
+
+    fn files(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.path()).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    fn identity(&self, file: &str) -> Identity {
+        Identity::parse(&self.read(file)).unwrap()
+    }
+}
+
+impl From<Output> for Ran {
+    fn from(output: Output) -> Self {
+        Self {
+            code: output.status.code(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+}
+
+#[test]
+fn a_fleet_is_made_for_its_owner_alone_and_never_overwritten() {
+    let place = Place::new();
+    let said = place.good(&["fleet", "create", "lab"]);
+    assert!(said.starts_with("lab.fleet: fleet lab, "), "{said}");
+    assert!(said.contains("sgc fleet enroll "), "{said}");
+    assert_eq!(place.mode("lab.fleet"), 0o600);
+    let before = place.read("lab.fleet");
+    assert_eq!(Fleet::parse(&before).unwrap().name().as_str(), "lab");
+
+    place.says(
+        2,
+        &["fleet", "create", "lab"],
+        "lab.fleet exists already; a fleet is never overwritten: its nodes would no longer be known",
+    );
+    assert_eq!(place.read("lab.fleet"), before);
+    assert_eq!(place.files(), ["lab.fleet"]);
+}
+
+#[test]
+fn a_fleet_goes_where_it_is_told() {
+    let place = Place::new();
+    fs::create_dir(place.path().join("keys")).unwrap();
+    let said = place.good(&["fleet", "create", "lab", "--dir", "keys"]);
+    assert!(said.contains("--fleet keys/lab.fleet"), "{said}");
+    place.good(&["fleet", "enroll", "arm-1", "--fleet", "keys/lab.fleet", "--out", "keys/a"]);
+    assert_eq!(place.mode("keys/a"), 0o600);
+    let said = place.bad(1, &["fleet", "create", "lab", "--dir", "nowhere"]);
+    assert!(said.starts_with("sgc: cannot write nowhere/lab.fleet: "), "{said}");
+}
+
+#[test]
+fn an_identity_is_what_was_asked_for() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab"]);
+    let said = place.good(&["fleet", "enroll", "arm-1", "--group", "b", "--group", "a", "--days", "3"]);
+    assert!(said.starts_with("arm-1.identity: node arm-1 of fleet lab, in b, a, holds until "), "{said}");
+    assert!(said.contains("sgc run --identity arm-1.identity "), "{said}");
+    assert_eq!(place.mode("arm-1.identity"), 0o600);
+    let identity = place.identity("arm-1.identity");
+    let fleet = Fleet::parse(&place.read("lab.fleet")).unwrap();
+    assert_eq!((identity.node_name().as_str(), identity.fleet_name().as_str()), ("arm-1", "lab"));
+    let tags = ["a", "b"].map(|group| fleet.secret().group_tag(group));
+    assert!(tags.iter().all(|tag| identity.groups().contains(tag)) && identity.groups().len() == 2);
+    let left = identity.not_after().secs() - now().secs();
+    assert!((3 * 86_400 - 600..=3 * 86_400).contains(&left), "{left}");
+
+    place.good(&["fleet", "enroll", "desk"]);
+    let left = place.identity("desk.identity").not_after().secs() - now().secs();
+    assert!((90 * 86_400 - 600..=90 * 86_400).contains(&left), "{left}");
+}
+
+#[test]
+fn a_routers_identity_has_no_secret() {
+    let place = Place::with_fleet();
+    assert!(place.identity("cloud.identity").fleet_secret().is_none());
+    assert!(place.identity("arm-1.identity").fleet_secret().is_some());
+}
+
+#[test]
+fn an_identity_is_overwritten_only_by_force() {
+    let place = Place::with_fleet();
+    let before = place.read("arm-1.identity");
+    let said = place.bad(2, &["fleet", "enroll", "arm-1"]);
+    assert!(said.starts_with("sgc: arm-1.identity exists already; --force replaces it"), "{said}");
+    assert_eq!(place.read("arm-1.identity"), before);
+    let id = place.identity("arm-1.identity").node_id();
+
+    place.set_mode("arm-1.identity", 0o644);
+    place.good(&["fleet", "enroll", "arm-1", "--force"]);
+    assert_ne!(place.read("arm-1.identity"), before);
+    assert_eq!(place.mode("arm-1.identity"), 0o600);
+    assert_eq!(place.identity("arm-1.identity").node_id(), id);
+    let left = ["arm-1.identity", "cloud.identity", "desk.identity", "lab.fleet"];
+    assert_eq!(place.files(), left, "no file is left over");
+}
+
+#[test]
+fn which_fleet_is_meant_is_not_guessed() {
+    let place = Place::new();
+    place.says(
+        2,
+        &["fleet", "enroll", "arm-1"],
+        "no fleet file here: name one with --fleet FILE, or make a fleet with `sgc fleet create NAME`",
+    );
+    place.good(&["fleet", "create", "lab"]);
+    place.good(&["fleet", "create", "field"]);
+    place.says(
+        2,
+        &["fleet", "enroll", "arm-1"],
+        "which fleet? Name one with --fleet: field.fleet, lab.fleet",
+    );
+    place.good(&["fleet", "enroll", "arm-1", "--fleet", "field.fleet"]);
+    assert_eq!(place.identity("arm-1.identity").fleet_name().as_str(), "field");
+}
+
+#[test]
+fn a_fleet_file_that_will_not_do_is_refused() {
+    let place = Place::with_fleet();
+    place.set_mode("lab.fleet", 0o640);
+    place.says(
+        2,
+        &["fleet", "enroll", "new"],
+        "lab.fleet: its mode 0640 lets others at the CA's private key: chmod 600 lab.fleet",
+    );
+    place.write("broken.fleet", "nothing");
+    place.set_mode("broken.fleet", 0o600);
+    let said = place.bad(2, &["fleet", "enroll", "new", "--fleet", "broken.fleet"]);
+    assert!(said.starts_with("sgc: broken.fleet: ") && said.lines().count() == 1, "{said}");
+    let said = place.bad(1, &["fleet", "enroll", "new", "--fleet", "absent.fleet"]);
+    assert!(said.starts_with("sgc: cannot read absent.fleet: "), "{said}");
+    assert!(!place.path().join("new.identity").exists());
+}
+
+#[test]
+fn names_that_are_none_are_refused_with_the_rule() {
+    let place = Place::with_fleet();
+    for args in [
+        &["fleet", "create", "Lab"][..],
+        &["fleet", "enroll", "Lab"],
+        &["fleet", "enroll", "x", "--group", "Lab"],
+    ] {
+        let said = place.bad(2, args);
+        let rule = "name \"Lab\" cannot contain 'L': use a-z, 0-9, '-', '_' and '.'\n";
+        assert!(said.starts_with("sgc: ") && said.ends_with(rule), "{said}");
+    }
+}
+
+#[test]
+fn a_good_configuration_is_summed_up() {
+    let place = Place::with_fleet();
+    place.write(
+        "node.toml",
+        r#"
+        [node]
+        name = "arm-1"
+        routers = ["quic://router.lab.example"]
+        [ros]
+        domain_id = 7
+        discovery_range = "localhost"
+        [[share]]
+        topic = "/camera/image"
+        type = "sensor_msgs/msg/Image"
+        to = ["desk", "group:operators"]
+        [[share]]
+        topic = "/tf"
+        to = ["*"]
+        [[use]]
+        from = "desk"
+        topic = "/cmd_vel"
+        "#,
+    );
+    let name = place.good(&[&NAME_ARGS[..], &["--owner", "arm-1"]].concat());
+    let until = place.identity("arm-1.identity").not_after();
+    let expected = format!(
+        "node.toml: no mistakes\n\
+         node      arm-1 of fleet lab\n\
+         identity  arm-1.identity, holds until {until}\n\
+         dials     quic://router.lab.example:7447\n\
+         ROS 2     domain 7, this host\n\
+         shares    /camera/image [sensor_msgs/msg/Image] with desk, group:operators\n          \
+         named {name}\
+         shares    /tf with everyone in the fleet\n\
+         uses      /cmd_vel from desk\n"
+    );
+    assert_eq!(place.good(&["check", "-c", "node.toml"]), expected);
+}
+
+#[test]
+fn every_mistake_is_told_with_its_line() {
+    let place = Place::with_fleet();
+    place.write(
+        "node.toml",
+        "identity = 'arm-1.identity'\n\
+         [node]\n\
+         router = ['quic://a']\n\
+         [[share]]\n\
+         topic = 'camera/image'\n\
+         to = ['Desk']\n\
+         [[use]]\n\
+         topic = '/cmd_vel'\n",
+    );
+    assert_eq!(
+        place.bad(2, &["check", "-c", "node.toml"]),
+        "node.toml:3: [node] has no key `router`; did you mean `routers`?\n\
+         node.toml:5: `topic` is \"camera/image\"; a topic name starts with '/': \"/camera/image\"\n\
+         node.toml:6: `to` names \"Desk\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
+         to 64 of a-z, 0-9, '-', '_' and '.'\n\
+         node.toml:7: [[use]] has no `from`; add one, such as from = \"arm-1\"\n\
+         sgc: node.toml: 4 mistakes\n"
+    );
+    assert_eq!(
+        place.bad(2, &["check", "-c", "absent.toml"]),
+        "absent.toml: cannot read the configuration: No such file or directory (os error 2)\n\
+         sgc: absent.toml: 1 mistake\n"
+    );
+}
+
+#[test]
+fn run_tells_the_mistakes_that_check_tells() {
+    let place = Place::with_fleet();
+    place.write("node.toml", "identity = 'arm-1.identity'\n[node]\nrouter = ['quic://a']\n");
+    let said = place.bad(2, &["check", "-c", "node.toml"]);
+    assert_eq!(place.bad(2, &["run", "-c", "node.toml"]), said);
+    assert_eq!(place.bad(2, &["status", "-c", "node.toml"]), said);
+}
+
+#[test]
+fn an_identity_of_another_node_or_a_router_is_found_by_check() {
+    let place = Place::with_fleet();
+    let start = "[node]\nname = 'desk'\nrouters = ['quic://a']\n";
+    place.write("other.toml", &format!("identity = 'arm-1.identity'\n{start}"));
+    let said = place.bad(2, &["check", "-c", "other.toml"]);
+    assert!(said.starts_with("sgc: other.toml: "), "{said}");
+    assert!(said.contains("\"desk\"") && said.contains("\"arm-1\"") && said.lines().count() == 1, "{said}");
+
+    let text =
+        "identity = 'cloud.identity'\n[node]\nrouters = ['quic://a']\n[[use]]\nfrom = 'desk'\ntopic = '/t'\n";
+    place.write("router.toml", text);
+    let said = place.bad(2, &["check", "-c", "router.toml"]);
+    assert!(said.starts_with("sgc: router.toml: this identity is a router's"), "{said}");
+}
+
+#[test]
+fn an_expired_identity_is_found_by_check_and_by_run() {
+    let place = Place::new();
+    let mut rng = <rand_chacha::ChaCha20Rng as rand_core::SeedableRng>::from_seed([5; 32]);
+    let then = UnixMillis(now().0 - 100 * 86_400_000);
+    let fleet = Fleet::create("lab".parse().unwrap(), then, &mut rng).unwrap();
+    let old = fleet.enroll(&EnrollRequest::new("arm-1".parse().unwrap(), then), &mut rng).unwrap();
+    place.write("arm-1.identity", &old.to_text());
+    place.set_mode("arm-1.identity", 0o600);
+    place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://127.0.0.1:1']\n");
+    for command in ["check", "run"] {
+        let said = place.bad(2, &[command, "-c", "node.toml"]);
+        assert!(said.contains("arm-1.identity") && said.contains("expired"), "{said}");
+    }
+}
+
+#[test]
+fn an_identity_that_others_can_read_is_refused() {
+    let place = Place::with_fleet();
+    place.set_mode("arm-1.identity", 0o644);
+    let mistake = "its mode 0644 lets others at the private key; `chmod 600 arm-1.identity` and, if others had \
+                   access, enrol again";
+    let run = ["run", "--identity", "arm-1.identity", "--router", "quic://127.0.0.1:1"];
+    assert_eq!(
+        place.bad(2, &run),
+        format!(
+            "command line: `--identity` is arm-1.identity: {mistake}\n\
+             sgc: command line: 1 mistake\n"
+        )
+    );
+    let said = place.bad(2, &[&NAME_ARGS[..], &["--owner", "arm-1"]].concat());
+    assert!(said.starts_with("sgc: identity arm-1.identity: "), "{said}");
+}
+
+#[test]
+fn a_name_is_the_one_that_the_nodes_derive() {
+    let place = Place::with_fleet();
+    let args = |more: &[&'static str]| [&NAME_ARGS[..], more].concat();
+    let name = place.good(&args(&["--owner", "arm-1"]));
+    let identity = place.identity("desk.identity");
+    let metadata = Metadata::topic("arm-1", "/camera/image", "sensor_msgs/msg/Image");
+    let secret = identity.fleet_secret().unwrap();
+    let owner = identity.node_id_of("arm-1").unwrap();
+    assert_eq!(name, format!("{}\n", derive_name(secret, &owner, &metadata)));
+    assert_eq!(name.trim_end().len(), 64);
+
+    // Whoever asks, whenever, the type spelt either way, and after the owner has a new key.
+    place.good(&["fleet", "enroll", "arm-1", "--force"]);
+    assert_eq!(place.good(&args(&["--owner", "arm-1"])), name);
+    let dds = "sensor_msgs::msg::dds_::Image_";
+    let asked = ["name", "--owner", "arm-1", "--topic", "/camera/image", "--type", dds];
+    assert_eq!(place.good(&[&asked[..], &["--identity", "desk.identity"]].concat()), name);
+
+    let full = Metadata {
+        node: "/camera".into(),
+        author: "Ada".into(),
+        maintainer: "ops@example.org".into(),
+        interface: "v4l2".into(),
+        description: "the \"wrist\" camera, 50 µs".into(),
+        unique: "left".into(),
+        ..metadata
+    };
+    let said = place.good(&args(&[
+        "--owner",
+        "arm-1",
+        "--node",
+        "/camera",
+        "--author",
+        "Ada",
+        "--maintainer",
+        "ops@example.org",
+        "--interface",
+        "v4l2",
+        "--description",
+        "the \"wrist\" camera, 50 µs",
+        "--unique",
+        "left",
+    ]));
+    assert_eq!(said, format!("{}\n", derive_name(secret, &owner, &full)));
+}
+
+#[test]
+fn a_router_can_derive_no_name() {
+    let place = Place::with_fleet();
+    let args = ["name", "--owner", "arm-1", "--topic", "/t", "--type", "a/msg/B", "--identity"];
+    place.says(
+        2,
+        &[&args[..], &["cloud.identity"]].concat(),
+        "cloud.identity is a router's identity: it holds no fleet secret, so that a router can derive no name; use \
+         a member's identity",
+    );
+}
+
+#[test]
+fn what_no_node_could_share_has_no_name() {
+    let place = Place::with_fleet();
+    let end = ["--owner", "arm-1", "--identity", "arm-1.identity"];
+    for (topic, type_name, mistake) in [
+        ("t", "a/msg/B", "`topic` is \"t\"; a topic name starts with '/': \"/t\""),
+        ("/t", "a/B", "`type` is \"a/B\"; a message type is PACKAGE/msg/NAME: \"a/msg/B\""),
+    ] {
+        place.says(2, &[&["name", "--topic", topic, "--type", type_name], &end[..]].concat(), mistake);
+    }
+}
+
+#[test]
+fn usage_errors_are_one_line_and_code_2() {
+    let place = Place::new();
+    place.says(2, &["fly"], "unrecognized subcommand 'fly'; see `sgc --help`");
+    place.says(
+        2,
+        &["statos"],
+        "unrecognized subcommand 'statos'; a similar subcommand exists: 'status'; see `sgc --help`",
+    );
+    for args in [
+        &["fleet", "enroll"][..],
+        &["fleet", "enroll", "a", "--days", "0"],
+        &["demo", "--seconds", "0"],
+        &["check"],
+        &["router", "--identity", "x"],
+        &["run", "-c", "node.toml", "--share", "/t"],
+        &["status", "-c", "node.toml", "--socket", "x"],
+    ] {
+        let said = place.bad(2, args);
+        assert!(said.starts_with("sgc: ") && said.lines().count() == 1, "{args:?}: {said}");
+    }
+    // With no command at all, help is what is missing.
+    assert!(place.bad(2, &[]).contains("Usage: sgc <COMMAND>"));
+    assert!(place.good(&["--help"]).contains("Usage: sgc <COMMAND>"));
+    assert_eq!(place.good(&["--version"]), format!("sgc {}\n", env!("CARGO_PKG_VERSION")));
+    assert!(!place.good(&["--help"]).contains("demo-peer"));
+}
+
+#[test]
+fn arguments_that_make_no_node_are_told() {
+    let place = Place::with_fleet();
+    let said = place.bad(2, &["run", "--identity", "arm-1.identity", "--use", "desk/t", "--to", "desk"]);
+    assert!(said.contains("command line: `--use` is \"desk/t\"; write NODE:/TOPIC: "), "{said}");
+    assert!(said.contains("command line: neither `--router` nor `--listen` is given"), "{said}");
+    assert!(said.ends_with("sgc: command line: 3 mistakes\n"), "{said}");
+    let args =
+        ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0", "--log", "loud=x=y"];
+    let said = place.bad(2, &args);
+    assert!(said.starts_with("sgc: --log is \"loud=x=y\": ") && said.lines().count() == 1, "{said}");
+}
+
+#[test]
+fn status_of_no_node_says_so() {
+    let place = Place::with_fleet();
+    let dir = place.path().join("sgc");
+    place.says(
+        1,
+        &["status"],
+        &format!(
+            "no node of this user runs here (no socket in {}); name one with -c or --socket",
+            dir.display()
+        ),
+    );
+    place.says(1, &["status", "--socket", "x.sock"], "no node runs at x.sock: there is no such socket");
+    place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://a']\n[admin]\nsocket = 'a.sock'\n");
+    drop(std::os::unix::net::UnixListener::bind(place.path().join("a.sock")).unwrap());
+    place.says(1, &["status", "-c", "node.toml"], "no node runs at a.sock: its socket is left over");
+}
+
+#[test]
+fn a_closed_reader_is_no_failure() {
+    let place = Place::with_fleet();
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let args = [&NAME_ARGS[..], &["--owner", "arm-1"]].concat();
+    let ran = Ran::from(place.command(&args).stdout(writer).stderr(Stdio::piped()).output().unwrap());
+    assert_eq!((ran.code, ran.stderr.as_str()), (Some(0), ""));
+}
+
+fn now() -> UnixMillis {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    UnixMillis(since.as_millis() as u64)
+}

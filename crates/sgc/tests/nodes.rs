@@ -1,0 +1,155 @@
+//! Running nodes as their user sees them: started, asked, and ended.
+
+#![allow(clippy::unwrap_used)]
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// Longest wait for an event, far beyond what any takes.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A router with a fleet of its own, listening on the loopback interface.
+struct Router {
+    place: TempDir,
+    child: Child,
+    _stdout: BufReader<ChildStdout>,
+    address: String,
+}
+
+impl Router {
+    fn start() -> Self {
+        let place = tempfile::tempdir().unwrap();
+        for args in [&["fleet", "create", "lab"][..], &["fleet", "enroll", "cloud", "--router"]] {
+            assert!(sgc(place.path(), args).output().unwrap().status.success());
+        }
+        let args = ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0"];
+        let mut command =
+            sgc(place.path(), &[&args[..], &["--print-ready", "--until-stdin-closes"]].concat());
+        let mut child = command.stdin(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        stdout.read_line(&mut line).unwrap();
+        let ready: Value = serde_json::from_str(&line).unwrap();
+        let address = ready["ready"][0].as_str().unwrap().to_owned();
+        Self { place, child, _stdout: stdout, address }
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    /// Waits for its end, and gives its log.
+    fn end(mut self) -> (ExitStatus, String) {
+        let status = wait(&mut self.child);
+        let mut log = String::new();
+        self.child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        (status, log)
+    }
+}
+
+fn sgc(dir: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sgc"));
+    command
+        .args(args)
+        .current_dir(dir)
+        .env_clear()
+        .env("XDG_RUNTIME_DIR", dir)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped());
+    command
+}
+
+fn wait(child: &mut Child) -> ExitStatus {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            return status;
+        }
+        if Instant::now() >= deadline {
+            let _ = child.kill();
+            panic!("it did not end");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_router_says_where_it_listens_and_how_it_is() {
+    let router = Router::start();
+    assert!(router.address.starts_with("quic://127.0.0.1:"), "{}", router.address);
+    assert!(!router.address.ends_with(":0"));
+
+    // It is the only one there, so it need not be named.
+    let output = sgc(router.place.path(), &["status", "--json"]).output().unwrap();
+    let status: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(status["node"], "cloud");
+    assert!(status["uptime_s"].is_u64() && status["links"] == Value::Array(Vec::new()));
+
+    let output = sgc(router.place.path(), &["status"]).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.starts_with("cloud: sgc ") && text.contains("\nLinks: none\n"), "{text}");
+    router.signal(Signal::TERM);
+    assert!(router.end().0.success());
+}
+
+#[test]
+fn either_signal_ends_a_node_cleanly() {
+    for signal in [Signal::TERM, Signal::INT] {
+        let router = Router::start();
+        let socket = router.place.path().join("sgc/cloud.sock");
+        assert!(socket.exists());
+        router.signal(signal);
+        let (status, log) = router.end();
+        assert!(status.success(), "{signal:?}: {status}\n{log}");
+        assert!(!socket.exists());
+    }
+}
+
+#[test]
+fn a_child_does_not_outlive_its_standard_input() {
+    let mut router = Router::start();
+    drop(router.child.stdin.take());
+    assert!(router.end().0.success());
+}
+
+#[test]
+fn an_address_in_use_is_a_failure_and_named() {
+    let router = Router::start();
+    let args = ["router", "--identity", "cloud.identity", "--listen", &router.address];
+    let output = sgc(router.place.path(), &args).stderr(Stdio::piped()).output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    let last = stderr.lines().last().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(last.starts_with("sgc: ") && last.contains(&router.address), "{stderr}");
+    router.signal(Signal::TERM);
+    assert!(router.end().0.success());
+}
+
+#[test]
+fn sharing_with_everyone_by_saying_nothing_is_said() {
+    let router = Router::start();
+    let dir = router.place.path();
+    assert!(sgc(dir, &["fleet", "enroll", "arm-1"]).output().unwrap().status.success());
+    let args = ["run", "--identity", "arm-1.identity", "--router", &router.address, "--share", "/t"];
+    let hint = "every member of the fleet may subscribe";
+    for (to, is_said) in [(&[][..], true), (&["--to", "desk"], false)] {
+        let mut command = sgc(dir, &[&args[..], to, &["--print-ready"]].concat());
+        command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF").stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        stdout.read_line(&mut String::new()).unwrap();
+        kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
+        let status = wait(&mut child);
+        let mut log = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        assert!(status.success() && log.contains(hint) == is_said, "{status}\n{log}");
+    }
+    router.signal(Signal::TERM);
+    assert!(router.end().0.success());
+}
