@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{NodeId, Role, Signed, SinkId};
+use sgc_wire::{Name, NodeId, Role, Signed, SinkId};
 use smallvec::SmallVec;
 
 use crate::{FibEntry, LinkId};
@@ -19,6 +19,8 @@ use crate::{FibEntry, LinkId};
 pub(crate) struct AdvertRecord {
     pub(crate) owner: VerifiedPeer,
     pub(crate) seq: u64,
+    /// Every name in it, in use over this link or not.
+    pub(crate) names: Vec<Name>,
     pub(crate) signed: Signed,
 }
 
@@ -30,6 +32,13 @@ pub(crate) struct Route {
     pub(crate) hops: u8,
     pub(crate) advert: Arc<AdvertRecord>,
     pub(crate) expires: Instant,
+}
+
+impl Route {
+    /// Links between this node and the owner, which neighbours are told; the owner's own node is at 0.
+    pub(crate) fn distance(&self) -> u8 {
+        if self.link == LinkId::LOCAL { 0 } else { self.hops.saturating_add(1) }
+    }
 }
 
 /// A sink's place in the tree.
@@ -51,6 +60,9 @@ pub(crate) struct NameState {
     feasible: Option<(u64, u8)>,
     /// Link, sequence number and hops of the route that neighbours were told last.
     told: Option<(LinkId, u64, u8)>,
+    /// Without a route: until when `feasible` is remembered, or what is still under way elsewhere would make
+    /// routes go in a circle.
+    remembered: Option<Instant>,
     pub(crate) branches: BTreeMap<SinkId, Branch>,
     pub(crate) interested: BTreeSet<LinkId>,
 }
@@ -97,35 +109,46 @@ impl NameState {
     }
 
     /// Chooses the route to use. A route in use stays while it is feasible and carries branches, so that equal
-    /// or slightly better paths do not make flows flap. Returns the link used before if it changed.
-    pub(crate) fn select(&mut self) -> Option<Option<LinkId>> {
+    /// or slightly better paths do not make flows flap; but a feasible one over `must` overrides that. Returns the
+    /// link used before if it changed.
+    pub(crate) fn select(&mut self, must: Option<LinkId>) -> Option<Option<LinkId>> {
         let before = self.selected;
         let feasible = self.feasible;
         let usable = |r: &&Route| match feasible {
-            Some((seq, distance)) => r.advert.seq > seq || (r.advert.seq == seq && r.hops < distance),
+            Some((seq, distance)) => {
+                r.advert.seq > seq || r.advert.seq == seq && (r.hops < distance || r.link == LinkId::LOCAL)
+            }
             None => true,
         };
-        let keep = self
-            .route()
-            .filter(|_| !self.branches.is_empty())
-            .filter(usable)
-            .map(|r| (r.link, r.hops, r.advert.seq));
+        let must = must.and_then(|link| self.route_over(link)).filter(usable);
+        let keep = must
+            .or_else(|| self.route().filter(|_| !self.branches.is_empty()).filter(usable))
+            .map(|r| (r.link, r.distance(), r.advert.seq));
         let best = keep.or_else(|| {
             self.routes
                 .iter()
                 .filter(usable)
                 .min_by_key(|r| (r.hops, Some(r.link) != before, r.link))
-                .map(|r| (r.link, r.hops, r.advert.seq))
+                .map(|r| (r.link, r.distance(), r.advert.seq))
         });
         self.selected = best.map(|(link, ..)| link);
-        if let Some((_, hops, seq)) = best {
-            let distance = hops.saturating_add(1);
+        if let Some((_, distance, seq)) = best {
             self.feasible = match self.feasible {
                 Some((s, d)) if s == seq => Some((s, d.min(distance))),
                 _ => Some((seq, distance)),
             };
         }
         (self.selected != before).then_some(before)
+    }
+
+    /// Neighbours are about to be told `distance` for `seq`. True if they were never told as much: then nothing
+    /// that is farther may be used from here on, and the caller selects anew.
+    pub(crate) fn promise(&mut self, seq: u64, distance: u8) -> bool {
+        let news = self.feasible.is_none_or(|(s, d)| s < seq || s == seq && d > distance);
+        if news {
+            self.feasible = Some((seq, distance));
+        }
+        news
     }
 
     /// True, once, if the route in use is not what neighbours were told last.
@@ -136,9 +159,31 @@ impl NameState {
         news
     }
 
+    /// Keeps what was told until then although there is no route any more; false if there is one.
+    pub(crate) fn remember(&mut self, until: Instant) -> bool {
+        if self.routes.is_empty() {
+            self.remembered = Some(until);
+        }
+        self.routes.is_empty()
+    }
+
+    /// Ends [`Self::remember`] because there is a route again; until when it was.
+    pub(crate) fn resume(&mut self) -> Option<Instant> {
+        self.remembered.take()
+    }
+
+    /// Forgets what was told: nobody can have an old route any more. Until when it was remembered.
+    pub(crate) fn forget(&mut self) -> Option<Instant> {
+        self.feasible = None;
+        self.remembered.take()
+    }
+
     /// True if nothing is known and nobody asks.
     pub(crate) fn is_idle(&self) -> bool {
-        self.routes.is_empty() && self.branches.is_empty() && self.interested.is_empty()
+        self.routes.is_empty()
+            && self.branches.is_empty()
+            && self.interested.is_empty()
+            && self.remembered.is_none()
     }
 
     /// The entry for the data path; `None` while nobody behind an active branch would receive or send.

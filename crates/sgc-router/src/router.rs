@@ -43,7 +43,7 @@ pub struct Limits {
     pub branches_per_name_max: usize,
     /// Names that one link may ask for.
     pub interests_per_link_max: usize,
-    /// Withdrawn names remembered against replay.
+    /// Withdrawn names remembered against replay, and as many lost ones against circles.
     pub tombstones_max: usize,
     /// How long an owner may take to answer a join.
     pub answer_wait: Duration,
@@ -191,6 +191,11 @@ pub enum DropReason {
 }
 
 impl DropReason {
+    /// True for what an honest neighbour never causes; the others happen when frames cross.
+    pub fn is_suspicious(&self) -> bool {
+        matches!(self, Self::NotVerified { .. } | Self::NotOwner { .. } | Self::HopLimit | Self::Limit { .. })
+    }
+
     /// A short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
@@ -238,6 +243,8 @@ pub struct Router {
     /// Withdrawn names: the withdrawal's sequence number, and until when a replay would still verify.
     tombstones: BTreeMap<Name, (u64, Instant)>,
     forgets: BTreeSet<(Instant, Name)>,
+    /// Names without a route whose feasible distance is remembered, and until when.
+    memories: BTreeSet<(Instant, Name)>,
     expiries: BTreeSet<(Instant, Name, LinkId)>,
     pending: BTreeSet<(Instant, Name, SinkId)>,
     outputs: VecDeque<Output>,
@@ -254,6 +261,7 @@ impl Router {
             names: BTreeMap::new(),
             tombstones: BTreeMap::new(),
             forgets: BTreeSet::new(),
+            memories: BTreeSet::new(),
             expiries: BTreeSet::new(),
             pending: BTreeSet::new(),
             outputs: VecDeque::new(),
@@ -329,6 +337,9 @@ impl Router {
             self.forgets.remove(&(at, name));
             self.tombstones.remove(&name);
         }
+        while let Some(&(_, name)) = self.memories.first().filter(|(at, _)| *at <= now.instant) {
+            self.forget(name);
+        }
     }
 
     /// The next thing to do; call until it is [`Output::Timeout`].
@@ -337,7 +348,8 @@ impl Router {
             let expiry = self.expiries.first().map(|(at, ..)| *at);
             let pending = self.pending.first().map(|(at, ..)| *at);
             let forget = self.forgets.first().map(|(at, _)| *at);
-            Output::Timeout(expiry.into_iter().chain(pending).chain(forget).min())
+            let memory = self.memories.first().map(|(at, _)| *at);
+            Output::Timeout(expiry.into_iter().chain(pending).chain(forget).chain(memory).min())
         })
     }
 
@@ -353,27 +365,35 @@ impl Router {
 
     /// The link towards the owner of `name`, and how far it is in links.
     pub fn route(&self, name: &Name) -> Option<(LinkId, u8)> {
-        self.names.get(name)?.route().map(|r| (r.link, r.hops))
+        self.names.get(name)?.route().map(|r| (r.link, r.distance()))
     }
 
     fn handle_hello(&mut self, link: LinkId, hello: Hello) {
         let Some(state) = self.links.get_mut(&link) else { return };
         state.hello = Some(hello);
         let (node, to_router) = (state.node, state.is_transit());
-        let superseded: Vec<_> = self
+        // Greetings of two runs may cross; the newer link is that of the newer run.
+        let mut runs: Vec<_> = self
             .links
             .iter()
             .filter(|(l, s)| {
-                **l != link
-                    && **l != LinkId::LOCAL
-                    && s.node == node
-                    && s.hello.is_some_and(|h| h.incarnation != hello.incarnation)
+                **l == link
+                    || **l != LinkId::LOCAL
+                        && s.node == node
+                        && s.hello.is_some_and(|h| h.incarnation != hello.incarnation)
             })
             .map(|(l, _)| *l)
             .collect();
-        for old in superseded {
+        let newest = runs.pop();
+        if newest != Some(link) {
+            runs = vec![link];
+        }
+        for old in runs {
             self.outputs.push_back(Output::Close { link: old, reason: LinkClose::Superseded });
             self.forget_link(old);
+        }
+        if newest != Some(link) {
+            return;
         }
         if to_router {
             self.send_routes(link);
@@ -387,7 +407,7 @@ impl Router {
         let mut frames = Vec::new();
         for route in self.names.values().filter_map(NameState::route) {
             if self.may_tell(route, link) && sent.insert(Arc::as_ptr(&route.advert)) {
-                frames.push(advert_frame(route));
+                frames.extend(self.route_frames(route));
             }
         }
         for frame in frames {
@@ -412,7 +432,8 @@ impl Router {
     }
 
     fn handle_advert(&mut self, now: Now, link: LinkId, hops: u8, signed: Signed) {
-        if hops >= HOP_LIMIT {
+        // Data must reach wherever a route does; a packet that comes with its last hop goes no further.
+        if hops >= HOP_LIMIT - 1 {
             return self.drop_frame(link, DropReason::HopLimit);
         }
         let advert = match verify_advert(&self.config.anchors, &signed, now.unix) {
@@ -430,10 +451,11 @@ impl Router {
         let lease = Duration::from_millis(advert.body.lease_ms.into()).min(self.config.limits.lease_max);
         let expires = now.instant + lease;
         let withdraw = advert.body.withdraw;
-        let record = Arc::new(AdvertRecord { owner: advert.owner, seq, signed });
+        let record = Arc::new(AdvertRecord { owner: advert.owner, seq, names: advert.names, signed });
         let mut news = Vec::new();
+        let mut elsewhere = Vec::new();
         let mut stale = None;
-        for name in advert.names {
+        for name in record.names.iter().copied() {
             let known = self.known_seq(name);
             if withdraw {
                 if known.is_none_or(|k| seq > k) {
@@ -455,22 +477,25 @@ impl Router {
                 self.drop_frame(link, DropReason::Limit { what: "routes per link" });
                 break;
             }
-            self.reselect(name);
+            let lost = matches!(self.reselect(name, None), Selection::Lost);
             if self.names.get_mut(&name).is_some_and(NameState::take_news) {
-                news.push(name);
-            } else if self.route(&name).is_none() {
+                let here = self.route(&name).is_some_and(|(up, _)| up == link);
+                if here { &mut news } else { &mut elsewhere }.push(name);
+            } else if lost {
                 self.tell_unreach(name);
             }
         }
         if let Some(known) = stale {
             self.drop_frame(link, DropReason::Stale { seq, known });
         }
-        if !news.is_empty() {
-            self.flood(
-                link,
-                &news,
-                Control::Advert { hops: hops.saturating_add(1), signed: record.signed.clone() },
-            );
+        if withdraw && !news.is_empty() {
+            let route = Route { link, hops, advert: record, expires };
+            self.flood(link, &news, &[advert_frame(&route)]);
+        } else if !news.is_empty() {
+            self.tell(&Route { link, hops, advert: record, expires }, &news);
+        }
+        for name in elsewhere {
+            self.tell_route(name);
         }
     }
 
@@ -481,7 +506,7 @@ impl Router {
     }
 
     /// Passes an advertisement on: to all other routers, and to those who asked for one of `names`.
-    fn flood(&mut self, ingress: LinkId, names: &[Name], frame: Control) {
+    fn flood(&mut self, ingress: LinkId, names: &[Name], frames: &[Control]) {
         let carries = ingress == LinkId::LOCAL || self.config.transit;
         let targets: Vec<_> = self
             .links
@@ -495,7 +520,9 @@ impl Router {
             .map(|(l, _)| *l)
             .collect();
         for link in targets {
-            self.send(link, frame.clone());
+            for frame in frames {
+                self.send(link, frame.clone());
+            }
         }
     }
 
@@ -515,8 +542,9 @@ impl Router {
         for link in &links {
             self.remove_route(name, *link);
         }
-        self.reselect(name);
-        self.tidy(name);
+        self.reselect(name, None);
+        // The sequence number alone tells what is old.
+        self.forget(name);
         !links.is_empty()
     }
 
@@ -545,7 +573,9 @@ impl Router {
             entry.interested.insert(link);
             let known = entry.route().cloned();
             if let Some(route) = known.filter(|r| self.may_tell(r, link)) {
-                self.send(link, advert_frame(&route));
+                for frame in self.route_frames(&route) {
+                    self.send(link, frame);
+                }
             }
             if link == LinkId::LOCAL {
                 self.ask(&Control::Interest { names: vec![*name] });
@@ -585,7 +615,14 @@ impl Router {
     fn handle_join(&mut self, now: Now, link: LinkId, signed: Signed) {
         let join = match verify_join(&self.config.anchors, &signed, now.unix) {
             Ok(join) => join,
-            Err(why) => return self.drop_frame(link, DropReason::NotVerified { what: "join", why }),
+            Err(why) => {
+                // Whoever sent it hears why: with a wrong clock, nothing else would say so.
+                if let Ok(body) = <sgc_wire::JoinBody as sgc_wire::Decode>::from_slice(&signed.body) {
+                    let (name, sink, reason) = (body.name, body.sink, RejectReason::NotVerified);
+                    self.send(link, Control::Reject { name, sink, reason });
+                }
+                return self.drop_frame(link, DropReason::NotVerified { what: "join", why });
+            }
         };
         let (name, sink) = (join.body.name, join.body.sink);
         let reject = |this: &mut Self, reason| this.send(link, Control::Reject { name, sink, reason });
@@ -597,7 +634,8 @@ impl Router {
         let Some(state) = self.names.get(&name).filter(|_| carries) else {
             return reject(self, RejectReason::NoRoute);
         };
-        if state.branches.get(&sink).is_some_and(|b| b.peer != join.peer.node_id) {
+        // A sink has one place in the tree and asks once: the same request over another link is a replay.
+        if state.branches.get(&sink).is_some_and(|b| b.peer != join.peer.node_id || b.link != link) {
             return reject(self, RejectReason::NotVerified);
         }
         let over_link = self.links.get(&link).map_or(0, |l| l.branches);
@@ -709,7 +747,7 @@ impl Router {
         if !self.remove_route(name, link) {
             return;
         }
-        match self.reselect(name) {
+        match self.reselect(name, None) {
             Selection::Same => {}
             Selection::Lost => self.tell_unreach(name),
             Selection::Moved => self.tell_route(name),
@@ -719,9 +757,9 @@ impl Router {
 
     /// Chooses the route of a name anew. If the link in use changed, the tree over the old one is cut and its
     /// sinks are told, so that they join again.
-    fn reselect(&mut self, name: Name) -> Selection {
+    fn reselect(&mut self, name: Name, must: Option<LinkId>) -> Selection {
         let Some(state) = self.names.get_mut(&name) else { return Selection::Same };
-        let Some(before) = state.select() else { return Selection::Same };
+        let Some(before) = state.select(must) else { return Selection::Same };
         let moved = state.route().is_some();
         let cut = std::mem::take(&mut state.branches);
         if cut.values().any(|b| b.pending.is_none()) {
@@ -755,7 +793,41 @@ impl Router {
         let Some(state) = self.names.get_mut(&name) else { return };
         state.take_news();
         let Some(route) = state.route().cloned() else { return };
-        self.flood(route.link, &[name], advert_frame(&route));
+        self.tell(&route, &[name]);
+    }
+
+    /// Tells `route`, which `names` now use. Its advertisement speaks for more names than those; whatever it says
+    /// of them must be true, or routes could go in a circle: so they take the same route, unless they are told
+    /// better already.
+    fn tell(&mut self, route: &Route, names: &[Name]) {
+        let (link, seq) = (route.link, route.advert.seq);
+        let tells_all = link == LinkId::LOCAL || self.config.transit;
+        for name in route.advert.names.iter().copied().filter(|_| tells_all) {
+            if !self.names.get_mut(&name).is_some_and(|s| s.promise(seq, route.distance())) {
+                continue;
+            }
+            match self.reselect(name, Some(link)) {
+                Selection::Same => {}
+                Selection::Lost => self.tell_unreach(name),
+                Selection::Moved => {
+                    let state = self.names.get_mut(&name);
+                    if state.is_some_and(NameState::take_news)
+                        && self.route(&name).is_some_and(|(up, _)| up != link)
+                    {
+                        self.tell_route(name);
+                    }
+                }
+            }
+        }
+        self.flood(link, names, &self.route_frames(route));
+    }
+
+    /// The frames that tell a route: its advertisement, and which of its names are out of reach from here by now.
+    fn route_frames(&self, route: &Route) -> Vec<Control> {
+        let known = |name: &Name| self.names.get(name).is_some_and(|s| s.route().is_some());
+        let gone: Vec<_> = route.advert.names.iter().copied().filter(|n| !known(n)).collect();
+        let unreach = (!gone.is_empty()).then_some(Control::Unreach { names: gone });
+        std::iter::once(advert_frame(route)).chain(unreach).collect()
     }
 
     /// Adds a route; false if the link has too many.
@@ -781,6 +853,9 @@ impl Router {
         if entry.put_route(route) {
             link.routes += 1;
         }
+        if let Some(until) = entry.resume() {
+            self.memories.remove(&(until, name));
+        }
         true
     }
 
@@ -789,6 +864,14 @@ impl Router {
         let Some(entry) = self.names.get_mut(&name) else { return false };
         let Some(route) = entry.remove_route(link) else { return false };
         self.expiries.remove(&(route.expires, name, link));
+        if entry.remember(route.expires) {
+            let full = self.memories.len() >= self.config.limits.tombstones_max;
+            let oldest = self.memories.first().filter(|_| full).map(|(_, oldest)| *oldest);
+            self.memories.insert((route.expires, name));
+            if let Some(oldest) = oldest {
+                self.forget(oldest);
+            }
+        }
         if let Some(state) = self.links.get_mut(&link) {
             state.routes -= 1;
         }
@@ -840,6 +923,14 @@ impl Router {
         }
     }
 
+    /// Forgets what was told of a name that has no route.
+    fn forget(&mut self, name: Name) {
+        if let Some(until) = self.names.get_mut(&name).and_then(NameState::forget) {
+            self.memories.remove(&(until, name));
+        }
+        self.tidy(name);
+    }
+
     /// Forgets a name of which nothing is known any more.
     fn tidy(&mut self, name: Name) {
         if self.names.get(&name).is_some_and(NameState::is_idle) {
@@ -871,5 +962,5 @@ impl Router {
 }
 
 fn advert_frame(route: &Route) -> Control {
-    Control::Advert { hops: route.hops.saturating_add(1), signed: route.advert.signed.clone() }
+    Control::Advert { hops: route.distance(), signed: route.advert.signed.clone() }
 }

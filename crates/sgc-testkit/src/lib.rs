@@ -1,1 +1,45 @@
-//! stub
+//! A whole network of SGC nodes in one thread: virtual clock, seeded links, real machines, real cryptography.
+//!
+//! A [`World`] holds nodes (a `Router` and an `Endpoint` each, wired as the driver of `sgc-node` wires them),
+//! cables between them, and a queue of what is under way. Nothing happens but in [`World::run`] and its
+//! relatives, and the same seed gives the same run. Tests read what came of it: deliveries, events, drops.
+//! [`Model`] says what should have come of it, from the configuration alone.
+//!
+//! There is no socket, no thread and no sleep here, and no ROS: what a node publishes is a numbered message.
+//! Sealing is as in production; the provider's own randomness in signatures decides nothing.
+//!
+//! ```
+//! use std::time::Duration;
+//! use sgc_testkit::{Sharing, World};
+//!
+//! let mut world = World::new(7);
+//! let (arm, cloud, desk) = (world.proxy("arm-1"), world.router("cloud"), world.proxy("desk"));
+//! world.link(arm, cloud);
+//! world.link(cloud, desk);
+//! world.share(arm, "/chatter", Sharing::to_fleet());
+//! world.use_topic(desk, arm, "/chatter");
+//! world.until_granted(desk, arm, "/chatter");
+//! let message = world.publish(arm, "/chatter");
+//! world.run(Duration::from_secs(1));
+//! assert_eq!(world.received(desk, arm, "/chatter"), [message]);
+//! ```
+#![forbid(unsafe_code)]
+
+mod cast;
+mod clock;
+mod model;
+mod node;
+mod record;
+mod rng;
+mod ros;
+mod wires;
+mod world;
+
+pub use cast::{Member, identity};
+pub use clock::Clock;
+pub use model::Model;
+pub use node::{NodeKey, Sharing};
+pub use record::{DataDrop, Logged, MessageId, Published, Received, What};
+pub use rng::Dice;
+pub use ros::{FakeDomain, FakeReader, FakeRos, FakeWriter};
+pub use world::{Captured, World, WorldConfig};

@@ -1,0 +1,328 @@
+//! One endpoint, spoken to in frames: what it answers, what it believes, what it bounds.
+
+use std::sync::Arc;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng;
+use sgc_endpoint::{
+    Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason, Output, ShareError, ShareSpec,
+};
+use sgc_testkit::{Clock, Member, identity};
+use sgc_trust::{Identity, Policy, ReplyKey, Suite, seal_grant};
+use sgc_wire::{
+    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody, Metadata, Name,
+    Qos, RefuseReason, Role, SinkId, TopicGrant,
+};
+
+/// An endpoint and what came out of it since it was last asked.
+struct Bench {
+    endpoint: Endpoint,
+    clock: Clock,
+    identity: Arc<Identity>,
+    sent: Vec<Control>,
+    events: Vec<Event>,
+    dropped: Vec<Dropped>,
+    timeout: Option<std::time::Instant>,
+}
+
+impl Bench {
+    fn new(name: &str, limits: Limits) -> Self {
+        let (clock, identity) = (Clock::default(), identity(&Member::new(name)));
+        let config = EndpointConfig { identity: identity.clone(), limits };
+        let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(1), clock.now());
+        let (sent, events, dropped) = (Vec::new(), Vec::new(), Vec::new());
+        let mut bench = Self { endpoint, clock, identity, sent, events, dropped, timeout: None };
+        bench.drain();
+        bench
+    }
+
+    fn drain(&mut self) {
+        self.sent.clear();
+        self.events.clear();
+        self.dropped.clear();
+        loop {
+            match self.endpoint.poll_output() {
+                Output::Send(frame) => self.sent.push(frame),
+                Output::Event(event) => self.events.push(event),
+                Output::Dropped(dropped) => self.dropped.push(dropped),
+                Output::Timeout(at) => {
+                    self.timeout = at;
+                    return;
+                }
+            }
+        }
+    }
+
+    fn frame(&mut self, frame: Control) {
+        self.endpoint.handle_frame(self.clock.now(), frame);
+        self.drain();
+    }
+
+    fn share(&mut self, topic: &str, policy: Policy) -> Result<Name, ShareError> {
+        let spec = ShareSpec {
+            metadata: Metadata::topic(self.identity.node_name().as_str(), topic, "p/msg/T"),
+            policy,
+            suite: Suite::Group,
+            class: Class::Default,
+            keyless: true,
+            type_hash: None,
+            qos: Qos::default(),
+            sources: Vec::new(),
+        };
+        self.endpoint.share(self.clock.now(), spec)
+    }
+
+    fn share_with_fleet(&mut self, topic: &str) -> Name {
+        let policy = Policy { fleet: Some(self.identity.as_peer().ca), ..Policy::default() };
+        self.share(topic, policy).unwrap()
+    }
+
+    /// The advertisements sent: sequence number, whether a withdrawal, how many names.
+    fn adverts(&self) -> Vec<(u64, bool, usize)> {
+        self.sent
+            .iter()
+            .filter_map(|frame| match frame {
+                Control::Advert { signed, .. } => AdvertBody::from_slice(&signed.body).ok(),
+                _ => None,
+            })
+            .map(|body| (body.seq, body.withdraw, body.blinds.len()))
+            .collect()
+    }
+
+    /// The answers sent: whom to, and why not if not.
+    fn answers(&self) -> Vec<(SinkId, Option<RefuseReason>)> {
+        self.sent
+            .iter()
+            .filter_map(|frame| match frame {
+                Control::Answer { signed } => AnswerBody::from_slice(&signed.body).ok(),
+                _ => None,
+            })
+            .map(|body| match body.answer {
+                Answer::Grant { .. } => (body.sink, None),
+                Answer::Refuse { reason } => (body.sink, Some(reason)),
+            })
+            .collect()
+    }
+}
+
+fn owner() -> Bench {
+    Bench::new("arm-1", Limits::default())
+}
+
+fn join(bench: &Bench, who: &Identity, name: Name, sink: u8) -> (Control, ReplyKey) {
+    let reply_key = ReplyKey::generate();
+    let body = JoinBody {
+        name,
+        sink: SinkId([sink; 16]),
+        role: Role::Subscribe,
+        issued_at: bench.clock.now().unix,
+        chain: who.chain_bytes(),
+        reply_key: reply_key.public().clone(),
+    };
+    (Control::Join { signed: who.sign_join(&body) }, reply_key)
+}
+
+#[test]
+fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
+    let mut bench = owner();
+    let name = bench.share_with_fleet("/a");
+    let stranger = identity(&Member { fleet: "umbrella".to_owned(), ..Member::new("desk") });
+    let (frame, _) = join(&bench, &stranger, name, 1);
+    bench.frame(frame);
+    assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotVerified))]);
+    assert!(matches!(bench.dropped[..], [Dropped::NotVerified { what: "join", .. }]), "{:?}", bench.dropped);
+    assert_eq!(bench.endpoint.granted(&name), []);
+}
+
+#[test]
+fn an_unusable_reply_key_is_refused_and_no_sink_is_kept() {
+    let mut bench = owner();
+    let name = bench.share_with_fleet("/a");
+    let desk = identity(&Member::new("desk"));
+    let body = JoinBody {
+        name,
+        sink: SinkId([1; 16]),
+        role: Role::Subscribe,
+        issued_at: bench.clock.now().unix,
+        chain: desk.chain_bytes(),
+        reply_key: (&b"no key"[..]).into(),
+    };
+    bench.frame(Control::Join { signed: desk.sign_join(&body) });
+    assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotVerified))]);
+    assert_eq!(bench.endpoint.granted(&name), []);
+}
+
+#[test]
+fn sinks_of_a_share_are_bounded() {
+    let mut bench = Bench::new("arm-1", Limits { sinks_per_name_max: 2, ..Limits::default() });
+    let name = bench.share_with_fleet("/a");
+    let desk = identity(&Member::new("desk"));
+    for (sink, refused) in [(1, None), (2, None), (3, Some(RefuseReason::Limit))] {
+        let (frame, _) = join(&bench, &desk, name, sink);
+        bench.frame(frame);
+        assert_eq!(bench.answers(), [(SinkId([sink; 16]), refused)]);
+    }
+    bench.frame(Control::Leave { name, sink: SinkId([1; 16]) });
+    let (frame, _) = join(&bench, &desk, name, 4);
+    bench.frame(frame);
+    assert_eq!(bench.answers(), [(SinkId([4; 16]), None)]);
+}
+
+#[test]
+fn shares_are_bounded_and_each_is_made_once() {
+    let mut bench = Bench::new("arm-1", Limits { shares_max: 2, ..Limits::default() });
+    bench.share_with_fleet("/a");
+    let again = bench.share("/a", Policy::default());
+    assert_eq!(again, Err(ShareError::Duplicate { ros_name: "/a".into(), type_name: "p/msg/T".into() }));
+    bench.share_with_fleet("/b");
+    assert_eq!(bench.share("/c", Policy::default()), Err(ShareError::Limit { max: 2 }));
+}
+
+#[test]
+fn a_closed_policy_permits_nobody() {
+    let mut bench = owner();
+    let name = bench.share("/a", Policy::default()).unwrap();
+    let (frame, _) = join(&bench, &identity(&Member::new("desk")), name, 1);
+    bench.frame(frame);
+    assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotPermitted))]);
+}
+
+#[test]
+fn many_names_go_into_few_advertisements_with_growing_numbers() {
+    let mut bench = owner();
+    for n in 0..600 {
+        bench.share_with_fleet(&format!("/{n}"));
+    }
+    bench.drain();
+    let adverts = bench.adverts();
+    assert_eq!(adverts.iter().map(|a| a.2).collect::<Vec<_>>(), [ADVERT_NAMES_MAX, ADVERT_NAMES_MAX, 88]);
+    assert!(adverts.is_sorted_by(|a, b| a.0 < b.0));
+    let before = adverts[2].0;
+    bench.clock.advance_to(bench.timeout.unwrap());
+    bench.endpoint.handle_timeout(bench.clock.now());
+    bench.drain();
+    let renewed = bench.adverts();
+    // And the catalogue.
+    assert_eq!(renewed.iter().map(|a| a.2).sum::<usize>(), 601);
+    assert!(renewed.iter().all(|a| a.0 > before && !a.1));
+}
+
+#[test]
+fn shutdown_withdraws_every_name_and_leaves_no_timer() {
+    let mut bench = owner();
+    for n in 0..3 {
+        bench.share_with_fleet(&format!("/{n}"));
+    }
+    bench.drain();
+    let last = bench.adverts()[0].0;
+    bench.endpoint.withdraw_all(bench.clock.now());
+    bench.drain();
+    let adverts = bench.adverts();
+    assert_eq!(adverts.iter().map(|a| (a.1, a.2)).collect::<Vec<_>>(), [(true, 4)]);
+    assert!(adverts[0].0 > last, "in the same millisecond, too");
+    assert_eq!(bench.timeout, None);
+}
+
+#[test]
+fn a_topic_shared_again_within_the_same_moment_is_advertised_after_its_withdrawal() {
+    let mut bench = owner();
+    let name = bench.share_with_fleet("/a");
+    bench.drain();
+    bench.endpoint.unshare(bench.clock.now(), &name);
+    assert_eq!(bench.share_with_fleet("/a"), name);
+    bench.drain();
+    // Withdrawn and shared between two drains: for the network nothing happened but a renewal.
+    let adverts = bench.adverts();
+    assert!(adverts.last().is_some_and(|a| !a.1), "{adverts:?}");
+}
+
+/// A joiner that was granted `/a` of the robot, with what is needed to go on answering it.
+fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
+    let mut bench = Bench::new("desk", Limits::default());
+    let arm = identity(&Member::new("arm-1"));
+    let secret = arm.fleet_secret().unwrap();
+    let metadata = Metadata::topic("arm-1", "/a", "p/msg/T");
+    let blind = sgc_trust::TopicSecret::derive(secret, &metadata).blind();
+    let name = sgc_trust::name_of(&arm.node_id(), &blind);
+    bench.endpoint.join(bench.clock.now(), name, arm.node_id());
+    bench.drain();
+    assert!(matches!(&bench.sent[..], [Control::Interest { names }] if *names == [name]), "{:?}", bench.sent);
+    let body = AdvertBody {
+        chain: arm.chain_bytes(),
+        seq: 1,
+        issued_at: bench.clock.now().unix,
+        lease_ms: 60_000,
+        withdraw: false,
+        blinds: vec![blind],
+    };
+    bench.frame(Control::Advert { hops: 1, signed: arm.sign_advert(&body) });
+    let [Control::Join { signed }] = &bench.sent[..] else { panic!("{:?}", bench.sent) };
+    let JoinBody { sink, reply_key, .. } = JoinBody::from_slice(&signed.body).unwrap();
+    let frame = grant(&arm, name, sink, &reply_key, 1, 7);
+    bench.frame(frame);
+    assert!(matches!(bench.events[..], [Event::Granted { .. }]), "{:?}", bench.events);
+    (bench, arm, name, sink, reply_key)
+}
+
+fn grant(owner: &Identity, name: Name, sink: SinkId, reply_key: &[u8], serial: u64, key: u8) -> Control {
+    let content = GrantContent::Topic(TopicGrant { epoch: serial as u32, suite: 1, key: [key; 32] });
+    let (enc, sealed) = seal_grant(reply_key, &name, &sink, serial, &content).unwrap();
+    let body = AnswerBody { name, sink, serial, answer: Answer::Grant { enc, sealed } };
+    Control::Answer { signed: owner.sign_answer(&body) }
+}
+
+#[test]
+fn answers_are_taken_in_their_order_and_each_once() {
+    let (mut bench, arm, name, sink, reply_key) = granted();
+    let (second, third) = (grant(&arm, name, sink, &reply_key, 2, 8), grant(&arm, name, sink, &reply_key, 3, 9));
+    bench.frame(third.clone());
+    assert!(matches!(&bench.events[..], [Event::Granted { grant, .. }] if grant.epoch == 3), "{:?}", bench.events);
+    for old in [second, third] {
+        bench.frame(old);
+        assert!(bench.events.is_empty() && matches!(bench.dropped[..], [Dropped::Unexpected { .. }]));
+        assert_eq!(bench.endpoint.join_status(&name), Some(JoinStatus::Granted));
+    }
+}
+
+#[test]
+fn an_answer_that_the_owner_did_not_sign_or_seal_changes_nothing() {
+    let (mut bench, arm, name, sink, reply_key) = granted();
+    let other = identity(&Member::new("mallory"));
+    bench.frame(grant(&other, name, sink, &reply_key, 2, 8));
+    assert!(matches!(bench.dropped[..], [Dropped::NotVerified { what: "answer", .. }]), "{:?}", bench.dropped);
+    bench.frame(grant(&arm, name, SinkId([0; 16]), &reply_key, 2, 8));
+    assert!(matches!(bench.dropped[..], [Dropped::Unexpected { .. }]), "{:?}", bench.dropped);
+    assert_eq!((bench.events.len(), bench.endpoint.join_status(&name)), (0, Some(JoinStatus::Granted)));
+}
+
+#[test]
+fn a_grant_taken_back_is_lost_with_the_owners_reason() {
+    let (mut bench, arm, name, sink, _) = granted();
+    let reason = RefuseReason::NotPermitted;
+    let body = AnswerBody { name, sink, serial: 2, answer: Answer::Refuse { reason } };
+    bench.frame(Control::Answer { signed: arm.sign_answer(&body) });
+    let lost = |e: &Event| matches!(e, Event::Lost { reason: LostReason::Refused(r), .. } if *r == reason);
+    assert!(bench.events.iter().any(lost), "{:?}", bench.events);
+    assert_ne!(bench.endpoint.join_status(&name), Some(JoinStatus::Granted));
+}
+
+#[test]
+fn a_name_of_another_owner_than_expected_is_not_asked_for() {
+    let mut bench = Bench::new("desk", Limits::default());
+    let (arm, other) = (identity(&Member::new("arm-1")), identity(&Member::new("mallory")));
+    let blind = sgc_wire::Blind([5; 32]);
+    let name = sgc_trust::name_of(&arm.node_id(), &blind);
+    bench.endpoint.join(bench.clock.now(), name, other.node_id());
+    bench.drain();
+    let body = AdvertBody {
+        chain: arm.chain_bytes(),
+        seq: 1,
+        issued_at: bench.clock.now().unix,
+        lease_ms: 60_000,
+        withdraw: false,
+        blinds: vec![blind],
+    };
+    bench.frame(Control::Advert { hops: 1, signed: arm.sign_advert(&body) });
+    assert!(bench.sent.is_empty());
+    assert_eq!(bench.endpoint.join_status(&name), Some(JoinStatus::Waiting));
+}

@@ -1,0 +1,46 @@
+//! The virtual clock. It moves when the world says so.
+
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use sgc_wire::{Now, UnixMillis};
+
+/// When every world begins; the identities of [`crate::identity`] are made for it.
+pub(crate) const GENESIS: UnixMillis = UnixMillis(1_795_000_000_000);
+
+/// Both clocks of a world, moving together.
+#[derive(Clone, Copy, Debug)]
+pub struct Clock {
+    base: Instant,
+    elapsed: Duration,
+}
+
+impl Default for Clock {
+    fn default() -> Self {
+        static BASE: OnceLock<Instant> = OnceLock::new();
+        // Only differences of instants are ever looked at, so any base gives the same run.
+        Self { base: *BASE.get_or_init(Instant::now), elapsed: Duration::ZERO }
+    }
+}
+
+impl Clock {
+    /// Moves on; never back.
+    pub fn advance_to(&mut self, instant: Instant) {
+        self.elapsed = self.elapsed.max(instant.saturating_duration_since(self.base));
+    }
+
+    /// The present.
+    pub fn now(&self) -> Now {
+        Now { instant: self.instant(), unix: UnixMillis(GENESIS.0 + self.elapsed.as_millis() as u64) }
+    }
+
+    /// The present, monotonic.
+    pub fn instant(&self) -> Instant {
+        self.base + self.elapsed
+    }
+
+    /// Time since the world began.
+    pub fn elapsed(&self) -> Duration {
+        self.elapsed
+    }
+}

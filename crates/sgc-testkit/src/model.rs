@@ -1,0 +1,144 @@
+//! What should be: computed from cables, runs, shares and uses alone, never from a machine's state.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use sgc_endpoint::JoinStatus;
+
+use crate::{NodeKey, Sharing, World};
+
+/// The reference model: who reaches whom, who may have what, and so who has what once all is quiet.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Model {
+    /// The nodes that each running node reaches: neighbours, and what is behind nodes that carry others.
+    pub reached: BTreeMap<NodeKey, BTreeSet<NodeKey>>,
+    /// To whom each shared topic of a running owner is granted.
+    pub granted: BTreeMap<(NodeKey, String), BTreeSet<NodeKey>>,
+    /// Which nodes follow each running owner's catalogue and reach it.
+    pub following: BTreeMap<NodeKey, BTreeSet<NodeKey>>,
+}
+
+impl Model {
+    /// What should come of a world as it is configured now.
+    pub fn of(world: &World) -> Self {
+        let alive = |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none();
+        let reached: BTreeMap<_, _> =
+            world.nodes().filter(|n| alive(*n)).map(|n| (n, reach(world, n, alive))).collect();
+        let mut granted = BTreeMap::new();
+        let mut following = BTreeMap::new();
+        for (owner, reached) in &reached {
+            let users = reached.iter().filter(|u| *u != owner);
+            for (topic, sharing) in &world.nodes[owner.0].shares {
+                let uses = |u: &&NodeKey| world.nodes[u.0].uses.contains(&(*owner, topic.clone()));
+                let permitted = users.clone().filter(|u| permits(world, *owner, sharing, **u));
+                granted.insert((*owner, topic.clone()), permitted.filter(uses).copied().collect());
+            }
+            let follows = |u: &&NodeKey| world.nodes[u.0].uses.iter().any(|(o, _)| o == owner);
+            let of_fleet = |u: &&NodeKey| same_fleet(world, *owner, **u);
+            let has_secret = !world.members[owner.0].router;
+            let followers = users.filter(follows).filter(of_fleet).filter(|_| has_secret);
+            following.insert(*owner, followers.copied().collect());
+        }
+        Self { reached, granted, following }
+    }
+
+    /// The nodes that may use a shared topic, whether they want to or not.
+    pub fn permitted(world: &World, owner: NodeKey, topic: &str) -> BTreeSet<NodeKey> {
+        let Some(sharing) = world.nodes[owner.0].shares.get(topic) else { return BTreeSet::new() };
+        world.nodes().filter(|user| permits(world, owner, sharing, *user)).collect()
+    }
+
+    /// Where a quiet world differs from this.
+    pub fn check(&self, world: &World) -> Result<(), String> {
+        for ((owner, topic), expected) in &self.granted {
+            let granted = world.granted(*owner, topic);
+            if !granted.iter().eq(expected) {
+                return Err(format!("{owner:?}:{topic} is granted to {granted:?}, not {expected:?}"));
+            }
+        }
+        for user in self.reached.keys() {
+            for (owner, topic) in &world.nodes[user.0].uses {
+                let expected =
+                    self.granted.get(&(*owner, topic.clone())).is_some_and(|users| users.contains(user));
+                let status = world.status(*user, *owner, topic);
+                if (status == Some(JoinStatus::Granted)) != expected {
+                    return Err(format!("{user:?} stands at {status:?} with {owner:?}:{topic}"));
+                }
+            }
+            self.check_tables(world, *user)?;
+        }
+        Ok(())
+    }
+
+    /// A router holds what the living need and nothing of the departed.
+    fn check_tables(&self, world: &World, node: NodeKey) -> Result<(), String> {
+        let mut named = BTreeMap::new();
+        let mut routed = 0;
+        for (owner, reached) in &self.reached {
+            if world.members[owner.0].router || !reached.contains(&node) {
+                continue;
+            }
+            routed += 1;
+            let followers = &self.following[owner];
+            named.insert(world.catalogue_name(*owner), (followers.len(), None));
+            for topic in world.nodes[owner.0].shares.keys() {
+                let users = &self.granted[&(*owner, topic.clone())];
+                let sinks: BTreeSet<_> =
+                    world.granted_sinks(*owner, topic).into_iter().map(|(sink, _)| sink).collect();
+                named.insert(world.name(*owner, topic), (users.len(), Some(sinks)));
+                routed += 1;
+            }
+        }
+        let stats = world.stats(node);
+        if world.nodes[node.0].transit && stats.routed_names != routed {
+            let known = stats.routed_names;
+            return Err(format!("{node:?} has routes to {known} names, not to {routed}"));
+        }
+        let mut branches = 0;
+        for name in world.forwarding(node) {
+            let forwarded = world.forwarding_sinks(node, &name);
+            branches += forwarded.len();
+            let Some((users, sinks)) = named.get(&name) else {
+                return Err(format!("{node:?} forwards {name:?}, which nobody shares"));
+            };
+            if forwarded.len() > *users {
+                return Err(format!("{node:?} forwards {name:?} to {forwarded:?}, more than {users} users"));
+            }
+            if let Some(gone) = sinks.as_ref().and_then(|all| forwarded.iter().find(|s| !all.contains(s))) {
+                return Err(format!("{node:?} forwards {name:?} to {gone:?}, which its owner does not know"));
+            }
+        }
+        if stats.branches != branches {
+            return Err(format!("{node:?} has {} branches but forwards to {branches}", stats.branches));
+        }
+        Ok(())
+    }
+}
+
+fn reach(world: &World, from: NodeKey, alive: impl Fn(NodeKey) -> bool) -> BTreeSet<NodeKey> {
+    let mut reached = BTreeSet::from([from]);
+    let mut edge = vec![from];
+    while let Some(here) = edge.pop() {
+        if here != from && !world.nodes[here.0].transit {
+            continue;
+        }
+        for cable in world.cables.iter().filter(|c| c.whole) {
+            let Some(side) = cable.end_of(here) else { continue };
+            let there = cable.ends[1 - side];
+            if alive(there) && reached.insert(there) {
+                edge.push(there);
+            }
+        }
+    }
+    reached
+}
+
+fn permits(world: &World, owner: NodeKey, sharing: &Sharing, user: NodeKey) -> bool {
+    let member = &world.members[user.0];
+    let in_fleet = same_fleet(world, owner, user);
+    let in_group = member.groups.iter().any(|g| sharing.groups.contains(g));
+    !member.router && in_fleet && (sharing.fleet || sharing.nodes.contains(&user) || in_group)
+}
+
+fn same_fleet(world: &World, a: NodeKey, b: NodeKey) -> bool {
+    world.members[a.0].fleet == world.members[b.0].fleet
+}

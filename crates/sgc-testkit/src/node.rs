@@ -1,0 +1,584 @@
+//! One node: a router and an endpoint, wired as the driver wires them, with the data path between.
+//!
+//! The node owns no time and no network: the world hands it what arrives and carries away its [`Effect`]s.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::fmt;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng;
+use sgc_endpoint::{
+    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkLimits, Source,
+    SourceConfig,
+};
+use sgc_router::{FibEntry, LinkClose, LinkId, Router, RouterConfig};
+use sgc_trust::{Identity, Policy, Suite, derive_name};
+use sgc_wire::{
+    Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
+    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
+};
+
+use crate::record::{DataDrop, MessageId, What};
+
+/// Type of every topic.
+const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
+/// How long a history is waited for before it is asked for again.
+const HISTORY_RETRY: Duration = Duration::from_secs(2);
+const HISTORY_BYTES_MAX: usize = 1 << 20;
+
+/// A node of a world.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct NodeKey(pub usize);
+
+impl fmt::Debug for NodeKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "n{}", self.0)
+    }
+}
+
+/// With whom and how a topic is shared.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Sharing {
+    /// With every member of the owner's fleet.
+    pub fleet: bool,
+    /// With these nodes.
+    pub nodes: BTreeSet<NodeKey>,
+    /// With the members of these groups of the owner's fleet.
+    pub groups: BTreeSet<String>,
+    /// Messages that late joiners get; 0 for a volatile topic.
+    pub depth: usize,
+    /// True if links may lose it.
+    pub best_effort: bool,
+}
+
+impl Sharing {
+    /// With the whole fleet.
+    pub fn to_fleet() -> Self {
+        Self { fleet: true, ..Self::default() }
+    }
+
+    /// With these nodes.
+    pub fn to(nodes: &[NodeKey]) -> Self {
+        Self { nodes: nodes.iter().copied().collect(), ..Self::default() }
+    }
+
+    /// With these groups.
+    pub fn to_groups(groups: &[&str]) -> Self {
+        Self { groups: groups.iter().map(|g| (*g).to_owned()).collect(), ..Self::default() }
+    }
+
+    /// As a transient-local topic that keeps the last `depth` messages.
+    pub fn transient_local(self, depth: usize) -> Self {
+        Self { depth, ..self }
+    }
+
+    /// As a best-effort topic.
+    pub fn best_effort(self) -> Self {
+        Self { best_effort: true, ..self }
+    }
+
+    fn qos(&self) -> Qos {
+        Qos {
+            reliability: if self.best_effort { Reliability::BestEffort } else { Reliability::Reliable },
+            durability: if self.depth > 0 { Durability::TransientLocal } else { Durability::Volatile },
+            history: History::KeepLast(self.depth.max(1) as u32),
+            ..Qos::default()
+        }
+    }
+}
+
+/// What a node is, whether it runs or not: its configuration file, so to say.
+pub(crate) struct Node {
+    pub(crate) key: NodeKey,
+    pub(crate) name: String,
+    pub(crate) identity: Arc<Identity>,
+    pub(crate) transit: bool,
+    pub(crate) router_limits: sgc_router::Limits,
+    pub(crate) endpoint_limits: sgc_endpoint::Limits,
+    pub(crate) shares: BTreeMap<String, Sharing>,
+    pub(crate) uses: BTreeSet<(NodeKey, String)>,
+    pub(crate) running: Option<Running>,
+    /// Starts so far.
+    pub(crate) runs: u64,
+    /// What arrived while it was stopped in its tracks; `None` while it is not.
+    pub(crate) frozen: Option<VecDeque<Arrival>>,
+}
+
+/// What may arrive at a node.
+pub(crate) enum Arrival {
+    Frame(LinkId, Control),
+    Packet(LinkId, Packet),
+    LinkDown(LinkId),
+}
+
+/// What the world has to do for a node.
+pub(crate) enum Effect {
+    /// Carry a frame over a link.
+    Frame(LinkId, Control),
+    /// Carry a packet over a link.
+    Packet(LinkId, Packet),
+    /// Take a link down.
+    Close(LinkId, LinkClose),
+    /// A message came through.
+    Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
+    /// Something a test may want to see.
+    Log(What),
+}
+
+/// Names and ids of all nodes, for those who look each other up.
+#[derive(Default)]
+pub(crate) struct Directory {
+    pub(crate) by_id: BTreeMap<NodeId, NodeKey>,
+    pub(crate) names: Vec<String>,
+}
+
+/// A running node.
+pub(crate) struct Running {
+    pub(crate) run: u64,
+    pub(crate) router: Router,
+    pub(crate) endpoint: Endpoint,
+    identity: Arc<Identity>,
+    next_link: u32,
+    /// Wire and side of each link that is up.
+    pub(crate) links: BTreeMap<LinkId, (usize, usize)>,
+    pub(crate) fib: BTreeMap<Name, FibEntry>,
+    pub(crate) sources: BTreeMap<Name, LocalSource>,
+    pub(crate) sinks: BTreeMap<Name, LocalSink>,
+    pub(crate) catalogues: BTreeMap<NodeKey, Catalogue>,
+    uses: BTreeSet<(NodeKey, String)>,
+    /// Owners that are followed.
+    owners: BTreeMap<NodeKey, NodeId>,
+    uses_begun: u64,
+    pub(crate) wake: Option<Instant>,
+    to_router: VecDeque<Control>,
+    effects: Vec<Effect>,
+}
+
+pub(crate) struct LocalSource {
+    pub(crate) topic: String,
+    pub(crate) source: Source,
+}
+
+pub(crate) struct LocalSink {
+    pub(crate) owner: NodeKey,
+    pub(crate) topic: String,
+    use_number: u64,
+    transient_local: bool,
+    sources: Vec<SourceId>,
+    sink: Option<Sink>,
+    retry_at: Option<Instant>,
+}
+
+impl Node {
+    /// Starts it with what it is configured for.
+    pub(crate) fn start(&mut self, now: Now, seed: u64, directory: &Directory) {
+        self.runs += 1;
+        self.frozen = None;
+        let router = Router::new(RouterConfig {
+            node: self.identity.node_id(),
+            transit: self.transit,
+            incarnation: seed,
+            anchors: Arc::new(self.identity.anchors().clone()),
+            limits: self.router_limits.clone(),
+        });
+        let config = EndpointConfig { identity: self.identity.clone(), limits: self.endpoint_limits.clone() };
+        let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        let mut running = Running {
+            run: self.runs,
+            router,
+            endpoint,
+            identity: self.identity.clone(),
+            next_link: 1,
+            links: BTreeMap::new(),
+            fib: BTreeMap::new(),
+            sources: BTreeMap::new(),
+            sinks: BTreeMap::new(),
+            catalogues: BTreeMap::new(),
+            uses: BTreeSet::new(),
+            owners: BTreeMap::new(),
+            uses_begun: 0,
+            wake: None,
+            to_router: VecDeque::new(),
+            effects: Vec::new(),
+        };
+        for (topic, sharing) in &self.shares {
+            running.share(now, topic, sharing, directory);
+        }
+        for (owner, topic) in &self.uses {
+            running.use_topic(now, *owner, topic, directory);
+        }
+        self.running = Some(running);
+    }
+}
+
+impl Running {
+    pub(crate) fn new_link(&mut self, wire: usize, side: usize, peer: NodeId) -> LinkId {
+        let link = LinkId(self.next_link);
+        self.next_link += 1;
+        self.links.insert(link, (wire, side));
+        self.router.handle_link_up(link, peer);
+        link
+    }
+
+    pub(crate) fn handle(&mut self, now: Now, arrival: Arrival) {
+        match arrival {
+            Arrival::Frame(link, frame) => self.router.handle_frame(now, link, frame),
+            Arrival::Packet(link, packet) => self.forward(now, link, packet),
+            Arrival::LinkDown(link) => self.link_down(link),
+        }
+    }
+
+    pub(crate) fn link_down(&mut self, link: LinkId) {
+        if self.links.remove(&link).is_some() {
+            self.router.handle_link_down(link);
+        }
+    }
+
+    pub(crate) fn handle_timeout(&mut self, now: Now) {
+        self.router.handle_timeout(now);
+        self.drain_router(now, None);
+        self.endpoint.handle_timeout(now);
+        let due: Vec<_> = self
+            .sinks
+            .iter()
+            .filter(|(_, s)| s.retry_at.is_some_and(|at| at <= now.instant))
+            .map(|(n, _)| *n)
+            .collect();
+        for name in due {
+            self.ask_history(now, name);
+        }
+    }
+
+    pub(crate) fn share(
+        &mut self,
+        now: Now,
+        topic: &str,
+        sharing: &Sharing,
+        directory: &Directory,
+    ) -> Option<Name> {
+        let secret = self.identity.fleet_secret()?;
+        let own = self.identity.as_peer();
+        let id = |node: &NodeKey| {
+            directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
+        };
+        let policy = Policy {
+            fleet: sharing.fleet.then_some(own.ca),
+            nodes: sharing.nodes.iter().map(id).collect(),
+            groups: sharing.groups.iter().map(|g| secret.group_tag(g)).collect(),
+        };
+        let source_id = self.endpoint.new_source_id();
+        let sources = match sharing.depth {
+            0 => Vec::new(),
+            _ => vec![CatalogueSource { source: source_id, qos: sharing.qos() }],
+        };
+        let spec = ShareSpec {
+            metadata: metadata(self.identity.node_name().as_str(), topic),
+            policy,
+            suite: Suite::Group,
+            class: Class::Default,
+            keyless: true,
+            type_hash: None,
+            qos: sharing.qos(),
+            sources,
+        };
+        let name = self.endpoint.share(now, spec).ok()?;
+        let config = SourceConfig {
+            name,
+            id: source_id,
+            class: Class::Default,
+            reliable: !sharing.best_effort,
+            history_depth: sharing.depth,
+            history_bytes_max: HISTORY_BYTES_MAX,
+        };
+        let grant = self.endpoint.share_grant(&name).expect("shared above");
+        let source = Source::new(config, grant).expect("the group suite is in every build");
+        self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
+        Some(name)
+    }
+
+    pub(crate) fn unshare(&mut self, now: Now, topic: &str) {
+        let name = self.sources.iter().find(|(_, s)| s.topic == topic).map(|(n, _)| *n);
+        if let Some(name) = name {
+            self.sources.remove(&name);
+            self.endpoint.unshare(now, &name);
+        }
+    }
+
+    pub(crate) fn use_topic(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+        self.uses.insert((owner, topic.to_owned()));
+        // The owner may be of a fleet that this node cannot see; then there is nothing to follow.
+        let owner_name = &directory.names[owner.0];
+        if self.endpoint.follow(now, owner_name) {
+            self.owners.extend(self.identity.node_id_of(owner_name).map(|id| (owner, id)));
+        }
+        self.reconcile(now, owner);
+    }
+
+    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+        self.uses.remove(&(owner, topic.to_owned()));
+        self.reconcile(now, owner);
+        if self.uses.iter().all(|(o, _)| *o != owner) {
+            if let (Some(secret), Some(id)) = (self.identity.fleet_secret(), self.owners.remove(&owner)) {
+                let name = derive_name(secret, &id, &Metadata::catalogue(&directory.names[owner.0]));
+                self.endpoint.leave(now, &name);
+            }
+            self.catalogues.remove(&owner);
+        }
+    }
+
+    pub(crate) fn publish(&mut self, now: Now, topic: &str, id: MessageId, bytes: usize) -> Option<SourceId> {
+        let (_, local) = self.sources.iter_mut().find(|(_, s)| s.topic == topic)?;
+        let mut payload = id.0.to_be_bytes().to_vec();
+        payload.resize(bytes.max(8), 0x5a);
+        let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
+        let source = local.source.id();
+        let mut packets = Vec::new();
+        local.source.publish(&head, &payload, |p| packets.push(p)).expect("tests publish what fits");
+        for packet in packets {
+            // As in the driver: what nobody asked for is not sent.
+            if self.fib.contains_key(&packet.header.name) {
+                self.forward(now, LinkId::LOCAL, packet);
+            }
+        }
+        Some(source)
+    }
+
+    /// Everything that both machines and the data path want done, until they want nothing more.
+    pub(crate) fn drain(&mut self, now: Now) -> Vec<Effect> {
+        self.drain_endpoint(now);
+        self.drain_router(now, None);
+        while let Some(frame) = self.to_router.pop_front() {
+            self.router.handle_frame(now, LinkId::LOCAL, frame);
+            self.drain_router(now, None);
+        }
+        let mut wake = None;
+        self.drain_router(now, Some(&mut wake));
+        if let sgc_endpoint::Output::Timeout(Some(at)) = self.endpoint.poll_output() {
+            wake = Some(wake.map_or(at, |w: Instant| w.min(at)));
+        }
+        self.wake = self.sinks.values().filter_map(|s| s.retry_at).chain(wake).min();
+        std::mem::take(&mut self.effects)
+    }
+
+    fn drain_router(&mut self, now: Now, mut wake: Option<&mut Option<Instant>>) {
+        loop {
+            match self.router.poll_output() {
+                sgc_router::Output::Send { link: LinkId::LOCAL, frame } => {
+                    self.endpoint.handle_frame(now, frame);
+                    self.drain_endpoint(now);
+                }
+                sgc_router::Output::Send { link, frame } => self.effects.push(Effect::Frame(link, frame)),
+                sgc_router::Output::Forward { name, entry: Some(entry) } => {
+                    self.fib.insert(name, entry);
+                }
+                sgc_router::Output::Forward { name, entry: None } => {
+                    self.fib.remove(&name);
+                }
+                sgc_router::Output::Close { link, reason } => {
+                    self.effects.push(Effect::Close(link, reason));
+                }
+                sgc_router::Output::Dropped(dropped) => {
+                    self.effects.push(Effect::Log(What::RouterDrop(dropped)));
+                }
+                sgc_router::Output::Timeout(at) => {
+                    if let Some(wake) = wake.as_deref_mut() {
+                        *wake = at;
+                    }
+                    return;
+                }
+            }
+        }
+    }
+
+    fn drain_endpoint(&mut self, now: Now) {
+        loop {
+            match self.endpoint.poll_output() {
+                sgc_endpoint::Output::Send(frame) => self.to_router.push_back(frame),
+                sgc_endpoint::Output::Event(event) => {
+                    self.effects.push(Effect::Log(What::Event(event.clone())));
+                    self.handle_event(now, event);
+                }
+                sgc_endpoint::Output::Dropped(dropped) => {
+                    self.effects.push(Effect::Log(What::EndpointDrop(dropped)));
+                }
+                sgc_endpoint::Output::Timeout(_) => return,
+            }
+        }
+    }
+
+    fn handle_event(&mut self, now: Now, event: Event) {
+        match event {
+            Event::Granted { name, grant } => {
+                if let Some(local) = self.sinks.get_mut(&name) {
+                    match &mut local.sink {
+                        Some(sink) => sink.regrant(grant),
+                        None => {
+                            let limits = SinkLimits::default();
+                            local.sink = Some(Sink::new(name, grant, local.transient_local, limits));
+                        }
+                    }
+                    self.ask_history(now, name);
+                }
+            }
+            Event::Catalogue { owner, catalogue } => {
+                let found = self.owners.iter().find(|(_, id)| **id == owner).map(|(key, _)| *key);
+                if let Some(owner) = found {
+                    self.catalogues.insert(owner, catalogue);
+                    self.reconcile(now, owner);
+                }
+            }
+            Event::Recover(recover) => {
+                let mut packets = Vec::new();
+                if let Some(local) = self.sources.get(&recover.name)
+                    && local.source.id() == recover.source
+                {
+                    local.source.replay(recover.sink, recover.from, recover.to, |p| packets.push(p));
+                }
+                for packet in packets {
+                    self.forward(now, LinkId::LOCAL, packet);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Joins what is wanted and in the owner's catalogue, leaves what is not.
+    fn reconcile(&mut self, now: Now, owner: NodeKey) {
+        let (Some(secret), Some(owner_id)) = (self.identity.fleet_secret(), self.owners.get(&owner).copied())
+        else {
+            return;
+        };
+        let mut wanted = BTreeMap::new();
+        for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries) {
+            if self.uses.contains(&(owner, entry.metadata.ros_name.clone())) {
+                wanted.insert(derive_name(secret, &owner_id, &entry.metadata), entry.clone());
+            }
+        }
+        let gone: Vec<_> = self
+            .sinks
+            .iter()
+            .filter(|(name, s)| s.owner == owner && !wanted.contains_key(*name))
+            .map(|(name, _)| *name)
+            .collect();
+        for name in gone {
+            self.sinks.remove(&name);
+            self.endpoint.leave(now, &name);
+        }
+        for (name, entry) in wanted {
+            let sources: Vec<_> = entry.sources.iter().map(|s| s.source).collect();
+            if let Some(local) = self.sinks.get_mut(&name) {
+                for old in local.sources.iter().filter(|s| !sources.contains(s)) {
+                    if let Some(sink) = &mut local.sink {
+                        sink.forget(old);
+                    }
+                }
+                local.sources = sources;
+                self.ask_history(now, name);
+                continue;
+            }
+            self.uses_begun += 1;
+            let local = LocalSink {
+                owner,
+                topic: entry.metadata.ros_name.clone(),
+                use_number: self.uses_begun,
+                transient_local: entry.qos.is_transient_local(),
+                sources,
+                sink: None,
+                retry_at: None,
+            };
+            self.sinks.insert(name, local);
+            self.endpoint.join(now, name, owner_id);
+        }
+    }
+
+    /// Asks for the histories that are not here yet, if the name is granted.
+    fn ask_history(&mut self, now: Now, name: Name) {
+        let granted = self.endpoint.join_status(&name) == Some(JoinStatus::Granted);
+        let Some(local) = self.sinks.get_mut(&name) else { return };
+        local.retry_at = None;
+        let Some(sink) = local.sink.as_mut().filter(|_| granted) else { return };
+        for source in local.sources.clone() {
+            if sink.expect(source) {
+                local.retry_at = Some(now.instant + HISTORY_RETRY);
+                self.endpoint.recover(name, source, 1, u64::MAX);
+            }
+        }
+    }
+
+    /// The data path, packet by packet.
+    pub(crate) fn forward(&mut self, now: Now, ingress: LinkId, mut packet: Packet) {
+        let name = packet.header.name;
+        let Some(entry) = self.fib.get(&name) else {
+            return self.drop_packet(name, ingress, DataDrop::NoTree);
+        };
+        if !entry.accepts_from(ingress) {
+            return self.drop_packet(name, ingress, DataDrop::WrongWay);
+        }
+        if ingress != LinkId::LOCAL {
+            match packet.header.hops.checked_sub(1) {
+                Some(hops) if hops > 0 => packet.header.hops = hops,
+                _ => return self.drop_packet(name, ingress, DataDrop::HopLimit),
+            }
+        }
+        let links: Vec<_> = match packet.header.to {
+            Some(sink) => entry.egress_to(&sink).into_iter().collect(),
+            None => entry.egress(ingress).collect(),
+        };
+        if links.is_empty() && packet.header.to.is_some() {
+            return self.drop_packet(name, ingress, DataDrop::NoSuchSink);
+        }
+        for link in links {
+            if link == LinkId::LOCAL {
+                self.deliver(now, &packet);
+            } else {
+                self.effects.push(Effect::Packet(link, packet.clone()));
+            }
+        }
+    }
+
+    fn deliver(&mut self, now: Now, packet: &Packet) {
+        let name = packet.header.name;
+        let Some(local) = self.sinks.get_mut(&name) else {
+            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
+        };
+        let Some(sink) = &mut local.sink else {
+            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
+        };
+        match sink.handle_packet(packet) {
+            Ok(Delivery::Message(message)) => {
+                let (owner, topic, use_number) = (local.owner, local.topic.clone(), local.use_number);
+                self.effects.push(Effect::Delivered { owner, topic, id: number(&message), use_number });
+            }
+            Ok(Delivery::NeedsHistory(source)) => {
+                local.retry_at.get_or_insert(now.instant + HISTORY_RETRY);
+                self.endpoint.recover(name, source, 1, u64::MAX);
+            }
+            Ok(Delivery::Synced(_)) => {
+                if sink.unsynced().next().is_none() {
+                    local.retry_at = None;
+                }
+            }
+            Ok(Delivery::Incomplete) => {}
+            Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
+        }
+    }
+
+    fn drop_packet(&mut self, name: Name, ingress: LinkId, why: DataDrop) {
+        self.effects.push(Effect::Log(What::DataDrop { name, ingress, why }));
+    }
+}
+
+/// Metadata of a topic of a node.
+pub(crate) fn metadata(owner: &str, topic: &str) -> Metadata {
+    Metadata::topic(owner, topic, TYPE_NAME)
+}
+
+fn number(message: &Message) -> MessageId {
+    let mut id = [0; 8];
+    let payload: &Bytes = &message.payload;
+    id.copy_from_slice(&payload[..8]);
+    MessageId(u64::from_be_bytes(id))
+}

@@ -1,0 +1,959 @@
+//! The network and its time: who is connected, what is under way, and what came of it.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::fmt::Write as _;
+use std::ops::RangeInclusive;
+use std::time::{Duration, Instant};
+
+use sgc_endpoint::{Event, JoinStatus};
+use sgc_router::{LinkId, RouterStats};
+use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
+use sgc_wire::{
+    AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
+    SinkId,
+};
+
+use crate::cast::{Member, identity};
+use crate::clock::{Clock, GENESIS};
+use crate::node::{Arrival, Directory, Effect, Node, Sharing, metadata};
+use crate::record::{Logged, MessageId, Published, Received, What};
+use crate::rng::Dice;
+use crate::wires::{Cable, Wire, WireEnd};
+use crate::{DataDrop, NodeKey};
+
+/// Deliveries of one call of [`World::run`] beyond which the network is taken to run in circles.
+const STEPS_MAX: usize = 300_000;
+/// How often [`World::run_until`] looks.
+const LOOK: Duration = Duration::from_millis(20);
+/// Bound of the `until_…` methods: longer than a lease and the longest wait between attempts.
+const PATIENCE: Duration = Duration::from_secs(150);
+
+/// What a world is made of.
+#[derive(Clone, Debug)]
+pub struct WorldConfig {
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+    /// Latency of a cable, drawn once for each.
+    pub latency: RangeInclusive<Duration>,
+    /// What each frame or packet may take longer; frames of a link, and packets of one name on it, keep their
+    /// order.
+    pub jitter: RangeInclusive<Duration>,
+    /// How many of a hundred best-effort packets each link loses.
+    pub loss_percent: usize,
+    /// Bounds of the routers.
+    pub router_limits: sgc_router::Limits,
+    /// Bounds and timers of the endpoints.
+    pub endpoint_limits: sgc_endpoint::Limits,
+}
+
+impl WorldConfig {
+    /// Links of 1–40 ms with a little jitter and no loss, everything else as in production.
+    pub fn new(seed: u64) -> Self {
+        Self {
+            seed,
+            latency: Duration::from_millis(1)..=Duration::from_millis(40),
+            jitter: Duration::ZERO..=Duration::from_millis(3),
+            loss_percent: 0,
+            router_limits: sgc_router::Limits::default(),
+            endpoint_limits: sgc_endpoint::Limits::default(),
+        }
+    }
+}
+
+/// A frame that crossed a link while [`World::capture`] was on.
+#[derive(Clone, Debug)]
+pub struct Captured {
+    /// Who sent it.
+    pub from: NodeKey,
+    /// To whom.
+    pub to: NodeKey,
+    /// What.
+    pub frame: Control,
+}
+
+enum Pending {
+    Frame { wire: usize, to: usize, bytes: Vec<u8> },
+    Packet { wire: usize, to: usize, packet: Packet },
+    LinkDown { wire: usize, to: usize },
+}
+
+/// How much a trace holds; the environment variable `SGC_TRACE` may ask for more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Tracing {
+    /// What was done to the world.
+    Transitions,
+    /// `SGC_TRACE=log`: and what happened at the nodes.
+    Log,
+    /// `SGC_TRACE=frames`: and every frame.
+    Frames,
+}
+
+/// The nodes, the network, and the time.
+pub struct World {
+    pub(crate) clock: Clock,
+    config: WorldConfig,
+    dice: Dice,
+    pub(crate) nodes: Vec<Node>,
+    pub(crate) members: Vec<Member>,
+    directory: Directory,
+    pub(crate) cables: Vec<Cable>,
+    wires: Vec<Wire>,
+    queue: BTreeMap<(Instant, u64), Pending>,
+    queued: u64,
+    log: Vec<Logged>,
+    received: Vec<Received>,
+    published: Vec<Published>,
+    captured: Option<Vec<Captured>>,
+    trace: Vec<String>,
+    tracing: Tracing,
+    steps: usize,
+}
+
+impl World {
+    /// A world of [`WorldConfig::new`].
+    pub fn new(seed: u64) -> Self {
+        Self::with(WorldConfig::new(seed))
+    }
+
+    /// A world without nodes.
+    pub fn with(config: WorldConfig) -> Self {
+        Self {
+            clock: Clock::default(),
+            dice: Dice::new(config.seed),
+            config,
+            nodes: Vec::new(),
+            members: Vec::new(),
+            directory: Directory::default(),
+            cables: Vec::new(),
+            wires: Vec::new(),
+            queue: BTreeMap::new(),
+            queued: 0,
+            log: Vec::new(),
+            received: Vec::new(),
+            published: Vec::new(),
+            captured: None,
+            trace: Vec::new(),
+            tracing: match std::env::var("SGC_TRACE").as_deref() {
+                Err(_) => Tracing::Transitions,
+                Ok("frames") => Tracing::Frames,
+                Ok(_) => Tracing::Log,
+            },
+            steps: 0,
+        }
+    }
+
+    // ---- Nodes.
+
+    /// Adds and starts a node that only routes; its identity lacks the fleet secret.
+    pub fn router(&mut self, name: &str) -> NodeKey {
+        self.node(Member { router: true, ..Member::new(name) }, true)
+    }
+
+    /// Adds and starts a node that only serves itself.
+    pub fn proxy(&mut self, name: &str) -> NodeKey {
+        self.node(Member::new(name), false)
+    }
+
+    /// Adds and starts a node that is any member and carries others' names or not.
+    pub fn node(&mut self, member: Member, transit: bool) -> NodeKey {
+        let key = NodeKey(self.nodes.len());
+        let identity = identity(&member);
+        self.directory.by_id.insert(identity.node_id(), key);
+        self.directory.names.push(member.name.clone());
+        self.note(format!("{key:?} is {}{}", member.name, if transit { ", carries others" } else { "" }));
+        self.nodes.push(Node {
+            key,
+            name: member.name.clone(),
+            identity,
+            transit,
+            router_limits: self.config.router_limits.clone(),
+            endpoint_limits: self.config.endpoint_limits.clone(),
+            shares: BTreeMap::new(),
+            uses: BTreeSet::new(),
+            running: None,
+            runs: 0,
+            frozen: None,
+        });
+        self.members.push(member);
+        self.start(key);
+        key
+    }
+
+    /// Starts a node that does not run, with what it is configured for, and connects its cables.
+    pub fn start(&mut self, node: NodeKey) {
+        if self.is_running(node) {
+            return;
+        }
+        self.note(format!("start {node:?}"));
+        let (now, seed) = (self.clock.now(), self.dice.number());
+        self.nodes[node.0].start(now, seed, &self.directory);
+        self.settle(node);
+        for cable in self.cables_of(node) {
+            self.connect(cable);
+        }
+    }
+
+    /// Kills a node; its neighbours see its links go down at once.
+    pub fn crash(&mut self, node: NodeKey) {
+        self.crash_unseen(node, Duration::ZERO);
+    }
+
+    /// Kills a node; its neighbours see its links go down only after `idle`, unless they hear of its restart.
+    pub fn crash_unseen(&mut self, node: NodeKey, idle: Duration) {
+        if !self.is_running(node) {
+            return;
+        }
+        self.note(format!("crash {node:?}, seen after {idle:?}"));
+        self.stop(node, idle, false);
+    }
+
+    /// Kills a node and starts it again 50 ms later; its neighbours see both at once.
+    pub fn restart(&mut self, node: NodeKey) {
+        self.crash(node);
+        self.run(Duration::from_millis(50));
+        self.start(node);
+    }
+
+    /// Ends a node in good order: its names are withdrawn, its neighbours told goodbye.
+    pub fn shut_down(&mut self, node: NodeKey) {
+        if !self.is_running(node) {
+            return;
+        }
+        self.note(format!("shut down {node:?}"));
+        let now = self.clock.now();
+        let Some(running) = &mut self.nodes[node.0].running else { return };
+        running.endpoint.withdraw_all(now);
+        self.settle(node);
+        let links: Vec<_> = self.nodes[node.0].running.iter().flat_map(|r| r.links.keys().copied()).collect();
+        for link in links {
+            self.send_frame(node, link, Control::Goodbye);
+        }
+        self.stop(node, Duration::ZERO, true);
+    }
+
+    /// Stops a node in its tracks, as SIGSTOP does: its links stay up, it does nothing.
+    pub fn freeze(&mut self, node: NodeKey) {
+        self.note(format!("freeze {node:?}"));
+        self.nodes[node.0].frozen.get_or_insert_default();
+    }
+
+    /// Lets a frozen node go on, with all that arrived meanwhile.
+    pub fn thaw(&mut self, node: NodeKey) {
+        self.note(format!("thaw {node:?}"));
+        for arrival in self.nodes[node.0].frozen.take().into_iter().flatten() {
+            self.arrive(node, arrival);
+        }
+    }
+
+    // ---- Cables.
+
+    /// Lays a cable and connects it.
+    pub fn link(&mut self, a: NodeKey, b: NodeKey) {
+        let latency = self.dice.time(&self.config.latency.clone());
+        self.note(format!("link {a:?} {b:?} {latency:?}"));
+        let cable = Cable { ends: [a, b], whole: true, wire: None, latency, tampers: [None, None] };
+        self.cables.push(cable);
+        self.connect(self.cables.len() - 1);
+    }
+
+    /// Cuts a cable; both ends see it at once.
+    pub fn cut(&mut self, a: NodeKey, b: NodeKey) {
+        self.cut_unseen(a, b, Duration::ZERO, Duration::ZERO);
+    }
+
+    /// Cuts a cable; `a` sees it after `a_idle`, `b` after `b_idle`.
+    pub fn cut_unseen(&mut self, a: NodeKey, b: NodeKey, a_idle: Duration, b_idle: Duration) {
+        self.note(format!("cut {a:?} {b:?}, seen after {a_idle:?} and {b_idle:?}"));
+        let cable = self.cable(a, b);
+        self.cables[cable].whole = false;
+        let Some(wire) = self.cables[cable].wire.take() else { return };
+        self.wires[wire].carries = false;
+        for to in 0..2 {
+            let idle = if self.wires[wire].ends[to].node == a { a_idle } else { b_idle };
+            self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to });
+        }
+    }
+
+    /// Mends a cable and connects it.
+    pub fn rejoin(&mut self, a: NodeKey, b: NodeKey) {
+        self.note(format!("rejoin {a:?} {b:?}"));
+        let cable = self.cable(a, b);
+        self.cables[cable].whole = true;
+        self.connect(cable);
+    }
+
+    // ---- Wishes.
+
+    /// Shares a topic, now and after every restart; the name it has.
+    pub fn share(&mut self, node: NodeKey, topic: &str, sharing: Sharing) -> Name {
+        self.note(format!("share {node:?} {topic} {sharing:?}"));
+        let now = self.clock.now();
+        let Node { shares, running, .. } = &mut self.nodes[node.0];
+        if let Some(running) = running {
+            running.share(now, topic, &sharing, &self.directory);
+        }
+        shares.insert(topic.to_owned(), sharing);
+        self.settle(node);
+        self.name(node, topic)
+    }
+
+    /// Ends a share.
+    pub fn unshare(&mut self, node: NodeKey, topic: &str) {
+        self.note(format!("unshare {node:?} {topic}"));
+        let now = self.clock.now();
+        let Node { shares, running, .. } = &mut self.nodes[node.0];
+        shares.remove(topic);
+        if let Some(running) = running {
+            running.unshare(now, topic);
+        }
+        self.settle(node);
+    }
+
+    /// Uses a topic whenever the owner's catalogue shows it, now and after every restart.
+    pub fn use_topic(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
+        self.note(format!("use {node:?} {owner:?}:{topic}"));
+        let now = self.clock.now();
+        let Node { uses, running, .. } = &mut self.nodes[node.0];
+        uses.insert((owner, topic.to_owned()));
+        if let Some(running) = running {
+            running.use_topic(now, owner, topic, &self.directory);
+        }
+        self.settle(node);
+    }
+
+    /// Uses a topic no longer.
+    pub fn stop_using(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
+        self.note(format!("stop using {node:?} {owner:?}:{topic}"));
+        let now = self.clock.now();
+        let Node { uses, running, .. } = &mut self.nodes[node.0];
+        uses.remove(&(owner, topic.to_owned()));
+        if let Some(running) = running {
+            running.stop_using(now, owner, topic, &self.directory);
+        }
+        self.settle(node);
+    }
+
+    /// Joins a name without looking into its owner's catalogue, until the node stops.
+    pub fn join_blindly(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
+        self.note(format!("join blindly {node:?} {owner:?}:{topic}"));
+        let (now, name, id) = (self.clock.now(), self.name(owner, topic), self.identity(owner).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.join(now, name, id);
+        }
+        self.settle(node);
+    }
+
+    /// Publishes a small message on a shared topic; its number.
+    pub fn publish(&mut self, node: NodeKey, topic: &str) -> MessageId {
+        self.publish_bytes(node, topic, 8)
+    }
+
+    /// Publishes a message of that size.
+    pub fn publish_bytes(&mut self, node: NodeKey, topic: &str, bytes: usize) -> MessageId {
+        let (now, id) = (self.clock.now(), MessageId(self.published.len() as u64));
+        let Node { running, frozen: None, .. } = &mut self.nodes[node.0] else {
+            panic!("{node:?} is frozen and cannot publish")
+        };
+        let running = running.as_mut().expect("only a running node publishes");
+        let source = running.publish(now, topic, id, bytes).expect("only what is shared is published");
+        let (run, at, topic) = (running.run, self.clock.elapsed(), topic.to_owned());
+        self.published.push(Published { id, at, owner: node, run, topic, source });
+        self.settle(node);
+        id
+    }
+
+    // ---- Evil.
+
+    /// Sends a frame from one node to a neighbour, as if its router had.
+    pub fn inject(&mut self, from: NodeKey, to: NodeKey, frame: &Control) {
+        let (wire, side) = self.wire_between(from, to);
+        self.carry_frame(wire, side, frame);
+    }
+
+    /// Sends a packet from one node to a neighbour, as if its data path had.
+    pub fn inject_packet(&mut self, from: NodeKey, to: NodeKey, packet: Packet) {
+        let (wire, side) = self.wire_between(from, to);
+        self.carry_packet(wire, side, packet);
+    }
+
+    /// Replaces every frame that `from` sends to `to` by what `tamper` makes of it.
+    pub fn tamper(
+        &mut self,
+        from: NodeKey,
+        to: NodeKey,
+        tamper: impl FnMut(&Control) -> Vec<Control> + 'static,
+    ) {
+        let cable = self.cable(from, to);
+        let side = self.cables[cable].end_of(from).expect("the cable of both");
+        self.cables[cable].tampers[side] = Some(Box::new(tamper));
+    }
+
+    /// Ends [`World::tamper`].
+    pub fn be_honest(&mut self, from: NodeKey, to: NodeKey) {
+        let cable = self.cable(from, to);
+        let side = self.cables[cable].end_of(from).expect("the cable of both");
+        self.cables[cable].tampers[side] = None;
+    }
+
+    /// Keeps all frames from here on.
+    pub fn capture(&mut self) {
+        self.captured.get_or_insert_default();
+    }
+
+    /// The frames kept.
+    pub fn captured(&self) -> &[Captured] {
+        self.captured.as_deref().unwrap_or_default()
+    }
+
+    // ---- Time.
+
+    /// Lets time pass.
+    pub fn run(&mut self, time: Duration) {
+        let until = self.clock.instant() + time;
+        self.steps = 0;
+        while self.step(until) {}
+        self.clock.advance_to(until);
+    }
+
+    /// Lets time pass until `done`, at most `bound`; whether it was.
+    pub fn run_until(&mut self, bound: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
+        let until = self.clock.instant() + bound;
+        while !done(self) {
+            if self.clock.instant() >= until {
+                return false;
+            }
+            self.run(LOOK);
+        }
+        true
+    }
+
+    /// Lets time pass until the use of a topic is granted, and the owner knows it.
+    ///
+    /// # Panics
+    /// If that takes longer than anything in the protocol takes.
+    pub fn until_granted(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
+        let done = |w: &Self| {
+            w.status(node, owner, topic) == Some(JoinStatus::Granted)
+                && w.granted(owner, topic).contains(&node)
+        };
+        if !self.run_until(PATIENCE, done) {
+            let status = self.status(node, owner, topic);
+            panic!("{node:?} is not granted {owner:?}:{topic} but {status:?}\n{}", self.trace());
+        }
+    }
+
+    /// Lets time pass until an event that `is` the one occurs at `node`, counting from now; when it did.
+    ///
+    /// # Panics
+    /// If that takes longer than anything in the protocol takes.
+    pub fn until_event(&mut self, node: NodeKey, what: &str, mut is: impl FnMut(&Event) -> bool) -> Duration {
+        let mut from = self.log.len();
+        let mut at = None;
+        let done = self.run_until(PATIENCE, |w| {
+            for logged in &w.log[from..] {
+                if let What::Event(event) = &logged.what
+                    && logged.node == node
+                    && is(event)
+                {
+                    at = at.or(Some(logged.at));
+                }
+            }
+            from = w.log.len();
+            at.is_some()
+        });
+        assert!(done, "{what} never happened at {node:?}\n{}", self.trace());
+        at.expect("set when done")
+    }
+
+    // ---- Looking.
+
+    /// Time since the world began.
+    pub fn elapsed(&self) -> Duration {
+        self.clock.elapsed()
+    }
+
+    /// The present.
+    pub fn now(&self) -> sgc_wire::Now {
+        self.clock.now()
+    }
+
+    /// All nodes.
+    pub fn nodes(&self) -> impl Iterator<Item = NodeKey> + '_ {
+        self.nodes.iter().map(|n| n.key)
+    }
+
+    /// True unless it crashed or was shut down.
+    pub fn is_running(&self, node: NodeKey) -> bool {
+        self.nodes[node.0].running.is_some()
+    }
+
+    /// True while it is stopped in its tracks.
+    pub fn is_frozen(&self, node: NodeKey) -> bool {
+        self.nodes[node.0].frozen.is_some()
+    }
+
+    /// How often a node was started.
+    pub fn runs(&self, node: NodeKey) -> u64 {
+        self.nodes[node.0].runs
+    }
+
+    /// Who a node is.
+    pub fn identity(&self, node: NodeKey) -> &Identity {
+        &self.nodes[node.0].identity
+    }
+
+    /// The name of a node's topic.
+    pub fn name(&self, owner: NodeKey, topic: &str) -> Name {
+        self.name_of(owner, &metadata(&self.nodes[owner.0].name, topic))
+    }
+
+    /// The name of a node's catalogue.
+    pub fn catalogue_name(&self, owner: NodeKey) -> Name {
+        self.name_of(owner, &Metadata::catalogue(&self.nodes[owner.0].name))
+    }
+
+    /// The blind of a node's topic, as its advertisements hold it.
+    pub fn blind(&self, owner: NodeKey, topic: &str) -> sgc_wire::Blind {
+        let secret = self.identity(owner).fleet_secret().expect("owners hold the fleet secret");
+        TopicSecret::derive(secret, &metadata(&self.nodes[owner.0].name, topic)).blind()
+    }
+
+    /// Where the join of a topic stands; `None` if the node does not run or does not want it (yet).
+    pub fn status(&self, node: NodeKey, owner: NodeKey, topic: &str) -> Option<JoinStatus> {
+        self.nodes[node.0].running.as_ref()?.endpoint.join_status(&self.name(owner, topic))
+    }
+
+    /// To which nodes a topic is granted, in ascending order, by what the owner knows.
+    pub fn granted(&self, owner: NodeKey, topic: &str) -> Vec<NodeKey> {
+        let mut nodes: Vec<_> = self.granted_sinks(owner, topic).into_iter().map(|(_, node)| node).collect();
+        nodes.sort_unstable();
+        nodes
+    }
+
+    /// The sinks that a topic is granted to, by what the owner knows.
+    pub fn granted_sinks(&self, owner: NodeKey, topic: &str) -> Vec<(SinkId, NodeKey)> {
+        let Some(running) = &self.nodes[owner.0].running else { return Vec::new() };
+        let granted = running.endpoint.granted(&self.name(owner, topic)).into_iter();
+        granted.filter_map(|(sink, id)| Some((sink, *self.directory.by_id.get(&id)?))).collect()
+    }
+
+    /// The last catalogue of an owner that a node received.
+    pub fn catalogue(&self, node: NodeKey, owner: NodeKey) -> Option<&Catalogue> {
+        self.nodes[node.0].running.as_ref()?.catalogues.get(&owner)
+    }
+
+    /// The topics in the last catalogue of an owner that a node received.
+    pub fn catalogue_topics(&self, node: NodeKey, owner: NodeKey) -> Vec<String> {
+        let entries = self.catalogue(node, owner).map(|c| c.entries.as_slice()).unwrap_or_default();
+        let mut topics: Vec<_> = entries.iter().map(|e| e.metadata.ros_name.clone()).collect();
+        topics.sort_unstable();
+        topics
+    }
+
+    /// What the router of a running node knows; all zero for one that does not run.
+    pub fn stats(&self, node: NodeKey) -> RouterStats {
+        self.nodes[node.0].running.as_ref().map(|r| r.router.stats()).unwrap_or_default()
+    }
+
+    /// Names with a forwarding entry at a node.
+    pub fn forwarding(&self, node: NodeKey) -> Vec<Name> {
+        self.nodes[node.0].running.iter().flat_map(|r| r.fib.keys().copied()).collect()
+    }
+
+    /// The sinks in the forwarding entry of a name at a node.
+    pub fn forwarding_sinks(&self, node: NodeKey, name: &Name) -> Vec<SinkId> {
+        let entry = self.nodes[node.0].running.as_ref().and_then(|r| r.fib.get(name));
+        entry.map(|e| e.sinks.iter().map(|(sink, _)| *sink).collect()).unwrap_or_default()
+    }
+
+    /// How far the owner of a name is from a node, in links; `None` without a route.
+    pub fn distance(&self, node: NodeKey, name: &Name) -> Option<u8> {
+        self.nodes[node.0].running.as_ref()?.router.route(name).map(|(_, hops)| hops)
+    }
+
+    /// The neighbour on a node's route to a name: the node itself for its own; `None` without a route, or if
+    /// the link is not there any more.
+    pub fn next_hop(&self, node: NodeKey, name: &Name) -> Option<NodeKey> {
+        let running = self.nodes[node.0].running.as_ref()?;
+        let (link, _) = running.router.route(name)?;
+        if link == LinkId::LOCAL {
+            return Some(node);
+        }
+        let (wire, side) = *running.links.get(&link)?;
+        let far = &self.wires[wire].ends[1 - side];
+        let there = self.nodes[far.node.0].running.as_ref()?;
+        (self.wires[wire].carries && far.up && there.run == far.run).then_some(far.node)
+    }
+
+    /// Follows the routes of a name from every node; the nodes of the first circle found.
+    pub fn circle(&self, name: &Name) -> Option<Vec<NodeKey>> {
+        self.nodes().find_map(|start| {
+            let mut way = vec![start];
+            loop {
+                let here = way[way.len() - 1];
+                let next = self.next_hop(here, name)?;
+                if next == here {
+                    return None;
+                }
+                if way.contains(&next) {
+                    way.push(next);
+                    return Some(way);
+                }
+                way.push(next);
+            }
+        })
+    }
+
+    /// Numbers of the messages of a topic that a node received, over all its runs, in order of arrival.
+    pub fn received(&self, node: NodeKey, owner: NodeKey, topic: &str) -> Vec<MessageId> {
+        let of_topic = |r: &&Received| (r.node, r.owner) == (node, owner) && r.topic == topic;
+        self.received.iter().filter(of_topic).map(|r| r.id).collect()
+    }
+
+    /// Everything that was received.
+    pub fn all_received(&self) -> &[Received] {
+        &self.received
+    }
+
+    /// Everything that was published.
+    pub fn all_published(&self) -> &[Published] {
+        &self.published
+    }
+
+    /// Everything that happened.
+    pub fn log(&self) -> &[Logged] {
+        &self.log
+    }
+
+    /// The frames that a node's router refused, as the keys of their reasons.
+    pub fn router_drops(&self, node: NodeKey) -> Vec<&'static str> {
+        let of_node = self.log.iter().filter(|l| l.node == node);
+        of_node
+            .filter_map(|l| match &l.what {
+                What::RouterDrop(dropped) => Some(dropped.reason.key()),
+                _ => None,
+            })
+            .collect()
+    }
+
+    /// The packets that a node's data path refused.
+    pub fn data_drops(&self, node: NodeKey) -> Vec<DataDrop> {
+        let of_node = self.log.iter().filter(|l| l.node == node);
+        of_node
+            .filter_map(|l| match &l.what {
+                What::DataDrop { why, .. } => Some(*why),
+                _ => None,
+            })
+            .collect()
+    }
+
+    /// What was done to this world, for a failing test's output.
+    pub fn trace(&self) -> String {
+        let mut text = format!("seed {}\n", self.config.seed);
+        for line in &self.trace {
+            let _ = writeln!(text, "{line}");
+        }
+        text
+    }
+
+    /// Adds a line to the trace.
+    pub fn note(&mut self, line: String) {
+        let at = self.clock.elapsed();
+        self.trace.push(format!("{:>10.3} {line}", at.as_secs_f64()));
+    }
+
+    // ---- Within.
+
+    fn name_of(&self, owner: NodeKey, metadata: &Metadata) -> Name {
+        let identity = self.identity(owner);
+        match identity.fleet_secret() {
+            Some(secret) => derive_name(secret, &identity.node_id(), metadata),
+            // A router owns nothing: a name that nobody has.
+            None => name_of(&identity.node_id(), &sgc_wire::Blind([0; 32])),
+        }
+    }
+
+    fn cables_of(&self, node: NodeKey) -> Vec<usize> {
+        (0..self.cables.len()).filter(|c| self.cables[*c].end_of(node).is_some()).collect()
+    }
+
+    fn cable(&self, a: NodeKey, b: NodeKey) -> usize {
+        let found = self.cables.iter().position(|c| c.end_of(a).is_some() && c.end_of(b).is_some());
+        found.expect("a cable between the two")
+    }
+
+    fn wire_between(&self, from: NodeKey, to: NodeKey) -> (usize, usize) {
+        let wire = self.cables[self.cable(from, to)].wire.expect("the two are connected");
+        let side = self.wires[wire].ends.iter().position(|e| e.node == from);
+        (wire, side.expect("the wire of both"))
+    }
+
+    /// Connects a whole cable whose ends both run and are not connected.
+    fn connect(&mut self, cable: usize) {
+        let Cable { ends, whole, wire, .. } = &self.cables[cable];
+        let ends = *ends;
+        if !whole || wire.is_some() || ends.iter().any(|n| !self.is_running(*n)) {
+            return;
+        }
+        let wire = self.wires.len();
+        self.cables[cable].wire = Some(wire);
+        let now = self.clock.instant();
+        let ends = [0, 1].map(|side| {
+            let peer = self.identity(ends[1 - side]).node_id();
+            let running = self.nodes[ends[side].0].running.as_mut().expect("checked above");
+            let link = running.new_link(wire, side, peer);
+            let (run, data) = (running.run, BTreeMap::new());
+            WireEnd { node: ends[side], run, link, up: true, control: now, data }
+        });
+        let nodes = [ends[0].node, ends[1].node];
+        self.wires.push(Wire { cable, carries: true, ends });
+        for node in nodes {
+            self.settle(node);
+        }
+    }
+
+    /// Ends a node. In good order what it sent last still arrives.
+    fn stop(&mut self, node: NodeKey, idle: Duration, in_order: bool) {
+        let Node { running, frozen, .. } = &mut self.nodes[node.0];
+        *frozen = None;
+        let Some(running) = running.take() else { return };
+        for (wire, side) in running.links.into_values() {
+            self.wires[wire].ends[side].up = false;
+            if in_order {
+                self.hang_up(wire, side);
+            } else if self.wires[wire].carries {
+                self.wires[wire].carries = false;
+                self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to: 1 - side });
+                self.unplug(wire);
+            }
+        }
+    }
+
+    /// Tells the far end, behind all that was sent before, that this end closed.
+    fn hang_up(&mut self, wire: usize, side: usize) {
+        self.wires[wire].ends[side].up = false;
+        if self.wires[wire].carries {
+            let at = self.arrival(wire, side);
+            self.queue(at, Pending::LinkDown { wire, to: 1 - side });
+        }
+        self.unplug(wire);
+    }
+
+    fn unplug(&mut self, wire: usize) {
+        let cable = &mut self.cables[self.wires[wire].cable];
+        if cable.wire == Some(wire) {
+            cable.wire = None;
+        }
+    }
+
+    fn queue(&mut self, at: Instant, pending: Pending) {
+        self.queued += 1;
+        self.queue.insert((at, self.queued), pending);
+    }
+
+    /// When a frame sent now arrives: not before those sent earlier.
+    fn arrival(&mut self, wire: usize, side: usize) -> Instant {
+        let Wire { cable, ends, .. } = &mut self.wires[wire];
+        let takes = self.cables[*cable].latency + self.dice.time(&self.config.jitter);
+        let at = (self.clock.instant() + takes).max(ends[side].control);
+        ends[side].control = at;
+        at
+    }
+
+    fn send_frame(&mut self, node: NodeKey, link: LinkId, frame: Control) {
+        let Some((wire, side)) =
+            self.nodes[node.0].running.as_ref().and_then(|r| r.links.get(&link)).copied()
+        else {
+            return;
+        };
+        let cable = self.wires[wire].cable;
+        let cable_side = self.cables[cable].end_of(node).expect("its own cable");
+        let Some(mut tamper) = self.cables[cable].tampers[cable_side].take() else {
+            return self.carry_frame(wire, side, &frame);
+        };
+        for frame in tamper(&frame) {
+            self.carry_frame(wire, side, &frame);
+        }
+        self.cables[cable].tampers[cable_side] = Some(tamper);
+    }
+
+    fn carry_frame(&mut self, wire: usize, side: usize, frame: &Control) {
+        let ends = &self.wires[wire].ends;
+        let (from, to) = (ends[side].node, ends[1 - side].node);
+        if let Some(captured) = &mut self.captured {
+            captured.push(Captured { from, to, frame: frame.clone() });
+        }
+        if self.tracing == Tracing::Frames {
+            self.note(format!("  {from:?} -> {to:?} {}", frame_text(frame)));
+        }
+        let at = self.arrival(wire, side);
+        self.queue(at, Pending::Frame { wire, to: 1 - side, bytes: frame.to_vec() });
+    }
+
+    fn carry_packet(&mut self, wire: usize, side: usize, packet: Packet) {
+        if !packet.header.reliable && self.dice.chance(self.config.loss_percent) {
+            let (name, ingress) = (packet.header.name, self.wires[wire].ends[side].link);
+            let node = self.wires[wire].ends[side].node;
+            return self.write_log(node, What::DataDrop { name, ingress, why: DataDrop::Lost });
+        }
+        let Wire { cable, ends, .. } = &mut self.wires[wire];
+        let takes = self.cables[*cable].latency + self.dice.time(&self.config.jitter);
+        let last = ends[side].data.entry(packet.header.name).or_insert(self.clock.instant());
+        *last = (self.clock.instant() + takes).max(*last);
+        let at = *last;
+        self.queue(at, Pending::Packet { wire, to: 1 - side, packet });
+    }
+
+    /// Does the next thing that is due by `until`; false if there is none.
+    fn step(&mut self, until: Instant) -> bool {
+        let due = self.queue.first_key_value().map(|((at, _), _)| *at);
+        let wake = self
+            .nodes
+            .iter()
+            .filter(|n| n.frozen.is_none())
+            .filter_map(|n| Some((n.running.as_ref()?.wake?, n.key)))
+            .min();
+        let at = due.into_iter().chain(wake.map(|(at, _)| at)).min().filter(|at| *at <= until);
+        let Some(at) = at else { return false };
+        self.steps += 1;
+        assert!(self.steps <= STEPS_MAX, "the network runs in circles\n{}", self.trace());
+        self.clock.advance_to(at);
+        if due == Some(at) {
+            let (_, pending) = self.queue.pop_first().expect("one is due");
+            self.deliver(pending);
+        } else if let Some((_, node)) = wake {
+            let now = self.clock.now();
+            let running = self.nodes[node.0].running.as_mut().expect("only running nodes have timers");
+            running.handle_timeout(now);
+            self.settle(node);
+            let again = self.nodes[node.0].running.as_ref().and_then(|r| r.wake);
+            assert!(again != Some(at), "a timer of {node:?} that is due is not served\n{}", self.trace());
+        }
+        true
+    }
+
+    fn deliver(&mut self, pending: Pending) {
+        let (wire, to) = match &pending {
+            Pending::Frame { wire, to, .. }
+            | Pending::Packet { wire, to, .. }
+            | Pending::LinkDown { wire, to } => (*wire, *to),
+        };
+        let Wire { carries, ends, .. } = &mut self.wires[wire];
+        let end = &mut ends[to];
+        let (node, link, run) = (end.node, end.link, end.run);
+        let is_down = matches!(pending, Pending::LinkDown { .. });
+        if !end.up || !(*carries || is_down) {
+            return;
+        }
+        end.up &= !is_down;
+        if self.nodes[node.0].running.as_ref().is_none_or(|r| r.run != run) {
+            return;
+        }
+        let arrival = match pending {
+            Pending::Frame { bytes, .. } => {
+                let frame = Control::from_slice(&bytes).expect("a frame reads as it was written");
+                Arrival::Frame(link, frame)
+            }
+            Pending::Packet { packet, .. } => {
+                let mut bytes = Vec::with_capacity(packet.encoded_bytes());
+                packet.header.put_into(&mut bytes);
+                packet.payload.copy_into(&mut bytes);
+                let packet = Packet::from_datagram(bytes.into()).expect("a packet reads as it was written");
+                Arrival::Packet(link, packet)
+            }
+            Pending::LinkDown { .. } => {
+                self.unplug(wire);
+                Arrival::LinkDown(link)
+            }
+        };
+        self.arrive(node, arrival);
+    }
+
+    fn arrive(&mut self, node: NodeKey, arrival: Arrival) {
+        let now = self.clock.now();
+        let Node { running, frozen, .. } = &mut self.nodes[node.0];
+        match (frozen, running) {
+            (Some(backlog), _) => backlog.push_back(arrival),
+            (None, Some(running)) => {
+                running.handle(now, arrival);
+                self.settle(node);
+            }
+            (None, None) => {}
+        }
+    }
+
+    /// Drains a node and does what it wants done.
+    fn settle(&mut self, node: NodeKey) {
+        let now = self.clock.now();
+        let mut effects = VecDeque::new();
+        loop {
+            match &mut self.nodes[node.0].running {
+                Some(running) => effects.extend(running.drain(now)),
+                None => return,
+            }
+            if effects.is_empty() {
+                return;
+            }
+            for effect in std::mem::take(&mut effects) {
+                self.perform(node, effect);
+            }
+        }
+    }
+
+    fn perform(&mut self, node: NodeKey, effect: Effect) {
+        match effect {
+            Effect::Frame(link, frame) => self.send_frame(node, link, frame),
+            Effect::Packet(link, packet) => {
+                let links = self.nodes[node.0].running.as_ref().map(|r| &r.links);
+                if let Some((wire, side)) = links.and_then(|l| l.get(&link)).copied() {
+                    self.carry_packet(wire, side, packet);
+                }
+            }
+            Effect::Close(link, reason) => {
+                self.write_log(node, What::Closed { reason });
+                let Some(running) = &mut self.nodes[node.0].running else { return };
+                if let Some((wire, side)) = running.links.get(&link).copied() {
+                    running.link_down(link);
+                    self.hang_up(wire, side);
+                }
+            }
+            Effect::Delivered { owner, topic, id, use_number } => {
+                let (at, run) = (self.clock.elapsed(), self.nodes[node.0].runs);
+                self.received.push(Received { id, at, node, run, use_number, owner, topic });
+            }
+            Effect::Log(what) => self.write_log(node, what),
+        }
+    }
+
+    fn write_log(&mut self, node: NodeKey, what: What) {
+        if self.tracing != Tracing::Transitions {
+            self.note(format!("  {node:?} {what:?}"));
+        }
+        self.log.push(Logged { at: self.clock.elapsed(), node, what });
+    }
+}
+
+fn frame_text(frame: &Control) -> String {
+    match frame {
+        Control::Advert { hops, signed } => match AdvertBody::from_slice(&signed.body) {
+            Ok(AdvertBody { seq, withdraw, blinds, .. }) => {
+                let kind = if withdraw { "Withdrawal" } else { "Advert" };
+                let blinds: Vec<_> = blinds.iter().map(|b| b.short()).collect();
+                format!("{kind} at {hops} of {}: {}", seq - GENESIS.0, blinds.join(" "))
+            }
+            Err(_) => "malformed Advert".to_owned(),
+        },
+        Control::Join { signed } => match JoinBody::from_slice(&signed.body) {
+            Ok(JoinBody { name, sink, .. }) => format!("Join {name:?} {sink:?}"),
+            Err(_) => "malformed Join".to_owned(),
+        },
+        Control::Answer { signed } => match AnswerBody::from_slice(&signed.body) {
+            Ok(AnswerBody { name, sink, serial, answer }) => {
+                let text = if matches!(answer, Answer::Grant { .. }) { "Grant" } else { "Refuse" };
+                format!("{text} {name:?} {sink:?} {serial}")
+            }
+            Err(_) => "malformed Answer".to_owned(),
+        },
+        other => format!("{other:?}"),
+    }
+}

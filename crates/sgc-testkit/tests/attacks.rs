@@ -1,0 +1,411 @@
+//! What those who are in the network but not to be trusted try, and what comes of it: nothing, and it is counted.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_endpoint::{Event, JoinStatus, RefusedBy};
+use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, identity};
+use sgc_trust::Identity;
+use sgc_wire::{
+    AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
+    RejectReason, Role, Signed, SinkId, SourceId,
+};
+
+const fn ms(n: u64) -> Duration {
+    Duration::from_millis(n)
+}
+
+/// A robot, two routers and an operator in a line, and a member of the fleet at the first router who is up to
+/// no good.
+struct Scene {
+    world: World,
+    arm: NodeKey,
+    east: NodeKey,
+    west: NodeKey,
+    desk: NodeKey,
+    mallory: NodeKey,
+}
+
+fn scene(seed: u64) -> Scene {
+    let mut world = World::new(seed);
+    world.capture();
+    let (arm, desk, mallory) = (world.proxy("arm-1"), world.proxy("desk"), world.proxy("mallory"));
+    let (east, west) = (world.router("east"), world.router("west"));
+    for (a, b) in [(arm, east), (east, west), (west, desk), (mallory, east)] {
+        world.link(a, b);
+    }
+    world.share(arm, "/chatter", Sharing::to(&[desk]));
+    world.use_topic(desk, arm, "/chatter");
+    Scene { world, arm, east, west, desk, mallory }
+}
+
+fn assert_flows(scene: &mut Scene) {
+    let Scene { world, arm, desk, .. } = scene;
+    world.until_granted(*desk, *arm, "/chatter");
+    world.run(ms(500));
+    let id = world.publish(*arm, "/chatter");
+    world.run(ms(1000));
+    assert_eq!(world.received(*desk, *arm, "/chatter").last(), Some(&id), "{}", world.trace());
+}
+
+/// The last frame from one node to another that `is` the one.
+fn last(world: &World, from: NodeKey, to: NodeKey, is: impl Fn(&Control) -> bool) -> Control {
+    let of_link = |c: &&Captured| (c.from, c.to) == (from, to) && is(&c.frame);
+    world.captured().iter().rev().find(of_link).expect("such a frame was sent").frame.clone()
+}
+
+fn is_advert_of(world: &World, owner: NodeKey, frame: &Control) -> bool {
+    let Control::Advert { signed, .. } = frame else { return false };
+    let body = AdvertBody::from_slice(&signed.body).unwrap();
+    body.chain == world.identity(owner).chain_bytes() && !body.withdraw
+}
+
+fn altered(signed: &Signed) -> Signed {
+    let mut signature = signed.signature.to_vec();
+    let at = signature.len() - 1;
+    signature[at] ^= 1;
+    Signed { body: signed.body.clone(), signature: signature.into() }
+}
+
+/// How many frames or packets a node refused for that reason.
+fn drops(world: &World, node: NodeKey, key: &str) -> usize {
+    world.router_drops(node).iter().filter(|d| **d == key).count()
+}
+
+#[test]
+fn a_proxy_cannot_advertise_anothers_names() {
+    let mut scene = scene(1);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, mallory, .. } = &mut scene;
+    let advert = last(world, *arm, *east, |f| is_advert_of(world, *arm, f));
+    world.inject(*mallory, *east, &advert);
+    world.run(ms(500));
+    assert_eq!(drops(world, *east, "not_owner"), 1);
+    assert_eq!(world.next_hop(*east, &world.name(*arm, "/chatter")), Some(*arm));
+    // Nor when the owner is away, nor from farther than its own node.
+    world.crash(*arm);
+    world.run(ms(500));
+    world.inject(*mallory, *east, &advert);
+    let Control::Advert { signed, .. } = advert else { unreachable!("picked as one") };
+    world.inject(*mallory, *east, &Control::Advert { hops: 3, signed });
+    world.run(ms(500));
+    assert_eq!(drops(world, *east, "not_owner"), 3);
+    assert_eq!(world.distance(*east, &world.name(*arm, "/chatter")), None);
+    world.start(*arm);
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn an_altered_or_ancient_advertisement_is_not_believed() {
+    let Scene { mut world, arm, east, west, .. } = scene(2);
+    world.run(ms(1000));
+    let advert = last(&world, arm, east, |f| is_advert_of(&world, arm, f));
+    world.crash(arm);
+    world.run(ms(1000));
+    let Control::Advert { signed, .. } = &advert else { unreachable!("picked as one") };
+    world.inject(west, east, &Control::Advert { hops: 1, signed: altered(signed) });
+    world.run(ms(500));
+    assert_eq!(drops(&world, east, "not_verified"), 1);
+    world.run(ms(11 * 60 * 1000));
+    world.inject(west, east, &advert);
+    world.run(ms(500));
+    assert_eq!(drops(&world, east, "not_verified"), 2, "signed too long ago");
+    assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
+}
+
+#[test]
+fn a_withdrawn_advertisement_cannot_be_replayed() {
+    let Scene { mut world, arm, east, west, .. } = scene(3);
+    world.run(ms(1000));
+    let advert = last(&world, arm, east, |f| is_advert_of(&world, arm, f));
+    world.shut_down(arm);
+    world.run(ms(1000));
+    for _ in 0..3 {
+        // Well within the time in which it would verify.
+        world.inject(west, east, &advert);
+        world.run(ms(120_000));
+    }
+    assert_eq!(drops(&world, east, "stale"), 3);
+    assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
+}
+
+/// The answers that `west` passes on to the operator are replaced by what `forge` makes of them; nothing is
+/// granted on their word.
+fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> Signed + 'static) {
+    let mut scene = scene(seed);
+    let Scene { world, arm, west, desk, .. } = &mut scene;
+    let (arm, west, desk) = (*arm, *west, *desk);
+    world.tamper(west, desk, move |frame| match frame {
+        Control::Answer { signed } => {
+            let body = AnswerBody::from_slice(&signed.body).unwrap();
+            vec![Control::Answer { signed: forge(body) }]
+        }
+        frame => vec![frame.clone()],
+    });
+    world.run(ms(5000));
+    assert!(drops(world, desk, "not_verified") > 0);
+    let believed = world.log().iter().any(|l| {
+        l.node == desk
+            && matches!(
+                l.what,
+                What::Event(Event::Granted { .. } | Event::Catalogue { .. } | Event::OwnerRefused { .. })
+            )
+    });
+    assert!(!believed, "nothing is believed of it");
+    let owner = world.identity(arm).node_id();
+    assert!(world.catalogue(desk, arm).is_none(), "{owner:?}");
+    world.be_honest(west, desk);
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn an_answer_signed_by_a_router_is_not_believed() {
+    let router = identity(&Member { router: true, ..Member::new("west") });
+    check_forged_answers(4, move |body| router.sign_answer(&body));
+}
+
+#[test]
+fn an_answer_of_another_owner_is_not_believed() {
+    let other = identity(&Member::new("mallory"));
+    check_forged_answers(5, move |body| other.sign_answer(&body));
+}
+
+#[test]
+fn a_refusal_forged_by_a_router_is_not_believed() {
+    let router = identity(&Member { router: true, ..Member::new("west") });
+    check_forged_answers(6, move |body| {
+        let reason = sgc_wire::RefuseReason::NotPermitted;
+        router.sign_answer(&AnswerBody { answer: Answer::Refuse { reason }, ..body })
+    });
+}
+
+#[test]
+fn a_grant_for_another_request_does_not_open() {
+    let mut scene = scene(7);
+    assert_flows(&mut scene);
+    let Scene { world, west, desk, arm, .. } = &mut scene;
+    // The owner's own answer to an earlier request, played again to a later one.
+    let old = last(world, *west, *desk, |f| matches!(f, Control::Answer { .. }));
+    let granted =
+        |w: &World| w.log().iter().filter(|l| matches!(l.what, What::Event(Event::Granted { .. }))).count();
+    world.restart(*desk);
+    world.tamper(*west, *desk, move |frame| match frame {
+        Control::Answer { .. } => vec![old.clone()],
+        frame => vec![frame.clone()],
+    });
+    let before = granted(world);
+    world.run(ms(20_000));
+    assert_eq!(granted(world), before);
+    assert_ne!(world.status(*desk, *arm, "/chatter"), Some(JoinStatus::Granted));
+    world.be_honest(*west, *desk);
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn a_join_with_a_forged_signature_is_refused_by_the_first_router() {
+    let mut scene = scene(8);
+    let Scene { world, arm, west, desk, .. } = &mut scene;
+    world.tamper(*desk, *west, |frame| match frame {
+        Control::Join { signed } => vec![Control::Join { signed: altered(signed) }],
+        frame => vec![frame.clone()],
+    });
+    let by = RefusedBy::Router(RejectReason::NotVerified);
+    world.until_event(*desk, "refusal", |e| matches!(e, Event::OwnerRefused { by: b, .. } if *b == by));
+    assert!(drops(world, *west, "not_verified") > 0);
+    assert_eq!(world.granted(*arm, "/chatter"), []);
+    world.be_honest(*desk, *west);
+    assert_flows(&mut scene);
+}
+
+fn join(identity: &Identity, world: &World, owner: NodeKey, sink: SinkId, role: Role) -> Control {
+    let body = JoinBody {
+        name: world.name(owner, "/chatter"),
+        sink,
+        role,
+        issued_at: world.now().unix,
+        chain: identity.chain_bytes(),
+        reply_key: sgc_trust::ReplyKey::generate().public().clone(),
+    };
+    Control::Join { signed: identity.sign_join(&body) }
+}
+
+#[test]
+fn a_node_of_another_fleet_is_refused_by_routers_and_owner() {
+    let mut scene = scene(9);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, mallory, desk, .. } = &mut scene;
+    let stranger = identity(&Member { fleet: "umbrella".to_owned(), ..Member::new("desk") });
+    let forged = join(&stranger, world, *arm, SinkId([7; 16]), Role::Subscribe);
+    world.inject(*mallory, *east, &forged);
+    world.run(ms(500));
+    assert_eq!(drops(world, *east, "not_verified"), 1);
+    let answered = last(world, *east, *mallory, |f| matches!(f, Control::Reject { .. }));
+    assert!(matches!(answered, Control::Reject { reason: RejectReason::NotVerified, .. }), "{answered:?}");
+    // Even with a router that lets it pass, the owner's own node does not.
+    world.inject(*east, *arm, &forged);
+    world.run(ms(500));
+    assert_eq!(drops(world, *arm, "not_verified"), 1);
+    assert_eq!(world.granted(*arm, "/chatter"), [*desk]);
+}
+
+#[test]
+fn who_asks_to_publish_is_told_that_it_is_not_offered() {
+    let mut scene = scene(10);
+    assert_flows(&mut scene);
+    let Scene { world, arm, west, desk, .. } = &mut scene;
+    let asked = join(world.identity(*desk), world, *arm, SinkId([8; 16]), Role::Publish);
+    world.inject(*desk, *west, &asked);
+    world.run(ms(500));
+    let refused = world.log().iter().any(|l| {
+        let reason = sgc_wire::RefuseReason::RoleNotOffered;
+        l.node == *arm && matches!(&l.what, What::Event(Event::SinkRefused { reason: r, .. }) if *r == reason)
+    });
+    assert!(refused);
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn a_captured_join_does_not_move_or_take_a_sinks_place() {
+    let mut scene = scene(11);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, west, desk, mallory } = &mut scene;
+    let name = world.name(*arm, "/chatter");
+    let captured = last(world, *west, *east, |f| match f {
+        Control::Join { signed } => JoinBody::from_slice(&signed.body).unwrap().name == name,
+        _ => false,
+    });
+    let Control::Join { signed } = &captured else { unreachable!("picked as one") };
+    let sink = JoinBody::from_slice(&signed.body).unwrap().sink;
+    world.inject(*mallory, *east, &captured);
+    // A join of its own under the same sink id is no better.
+    let own = join(world.identity(*mallory), world, *arm, sink, Role::Subscribe);
+    world.inject(*mallory, *east, &own);
+    world.inject(*mallory, *east, &Control::Leave { name, sink });
+    world.run(ms(500));
+    assert_eq!(world.granted(*arm, "/chatter"), [*desk]);
+    assert_eq!(world.forwarding_sinks(*east, &name), [sink]);
+    let before = world.received(*desk, *arm, "/chatter").len();
+    world.publish(*arm, "/chatter");
+    world.run(ms(500));
+    assert_eq!(world.received(*desk, *arm, "/chatter").len(), before + 1, "the flow was not disturbed");
+    assert!(world.all_received().iter().all(|r| r.node == *desk));
+}
+
+fn packet(world: &World, owner: NodeKey, to: Option<SinkId>) -> Packet {
+    let header = PacketHeader {
+        reliable: true,
+        class: Class::Default,
+        hops: 30,
+        suite: 1,
+        epoch: 1,
+        name: world.name(owner, "/chatter"),
+        source: SourceId([9; 16]),
+        seq: 1,
+        total: 8,
+        index: 0,
+        grid: 16 * 1024,
+        to,
+    };
+    Packet::new(header, Bytes::from(vec![0; 8 + 12 + 16]).into()).unwrap()
+}
+
+#[test]
+fn data_is_accepted_from_the_owners_side_only() {
+    let mut scene = scene(12);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, west, desk, mallory } = &mut scene;
+    let (count, sink) = (world.all_received().len(), world.granted_sinks(*arm, "/chatter")[0].0);
+    for to in [None, Some(sink)] {
+        let forged = packet(world, *arm, to);
+        world.inject_packet(*desk, *west, forged.clone());
+        world.inject_packet(*mallory, *east, forged.clone());
+        // Upstream, against the tree.
+        world.inject_packet(*west, *east, forged);
+    }
+    world.run(ms(500));
+    assert_eq!(world.data_drops(*west), [DataDrop::WrongWay; 2]);
+    assert_eq!(world.data_drops(*east), [DataDrop::WrongWay; 4]);
+    assert_eq!(world.all_received().len(), count);
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn data_that_a_router_forges_reaches_the_sink_and_no_further() {
+    let mut scene = scene(13);
+    assert_flows(&mut scene);
+    let Scene { world, arm, west, desk, .. } = &mut scene;
+    let (count, forged) = (world.all_received().len(), packet(world, *arm, None));
+    world.inject_packet(*west, *desk, forged);
+    world.run(ms(500));
+    let why = sgc_endpoint::SinkDrop::Open(sgc_trust::OpenError::Forged);
+    assert_eq!(world.data_drops(*desk), [DataDrop::Sink(why)]);
+    assert_eq!(world.all_received().len(), count);
+}
+
+#[test]
+fn data_under_a_name_that_nobody_asked_for_goes_nowhere() {
+    let mut scene = scene(14);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, mallory, .. } = &mut scene;
+    let mut unknown = packet(world, *arm, None);
+    unknown.header.name = sgc_wire::Name([3; 32]);
+    world.inject_packet(*mallory, *east, unknown);
+    world.run(ms(500));
+    assert_eq!(world.data_drops(*east), [DataDrop::NoTree]);
+}
+
+#[test]
+fn a_neighbour_that_cuts_what_is_not_its_own_is_ignored() {
+    let mut scene = scene(15);
+    assert_flows(&mut scene);
+    let Scene { world, arm, east, west, desk, mallory } = &mut scene;
+    let (name, sink) = (world.name(*arm, "/chatter"), world.granted_sinks(*arm, "/chatter")[0].0);
+    let reason = RejectReason::RouteLost;
+    for frame in [
+        Control::Unreach { names: vec![name] },
+        Control::Reject { name, sink, reason },
+        Control::Leave { name, sink },
+        Control::Recover(sgc_wire::Recover { name, sink, source: SourceId([1; 16]), from: 0, to: u64::MAX }),
+        last(world, *arm, *east, |f| matches!(f, Control::Answer { .. })),
+    ] {
+        world.inject(*mallory, *east, &frame);
+    }
+    world.run(ms(1000));
+    let mut refused = world.router_drops(*east);
+    refused.sort_unstable();
+    assert_eq!(refused, ["unknown", "unknown", "wrong_way", "wrong_way"]);
+    assert_eq!(world.status(*desk, *arm, "/chatter"), Some(JoinStatus::Granted));
+    assert_eq!(world.next_hop(*west, &name), Some(*east));
+    assert_flows(&mut scene);
+}
+
+#[test]
+fn frames_before_the_greeting_and_a_second_greeting_close_the_link() {
+    let Scene { mut world, east, mallory, .. } = scene(16);
+    world.run(ms(1000));
+    let hello = last(&world, mallory, east, |f| matches!(f, Control::Hello(_)));
+    world.inject(mallory, east, &hello);
+    world.run(ms(500));
+    let closed = |l: &&sgc_testkit::Logged| {
+        l.node == east && matches!(l.what, What::Closed { reason: sgc_router::LinkClose::Greeting })
+    };
+    assert_eq!(world.log().iter().filter(closed).count(), 1);
+    assert_eq!(world.distance(east, &world.catalogue_name(mallory)), None, "all that it said is forgotten");
+    world.tamper(mallory, east, |frame| match frame {
+        Control::Hello(_) => vec![Control::Goodbye],
+        frame => vec![frame.clone()],
+    });
+    world.rejoin(mallory, east);
+    world.run(ms(500));
+    assert_eq!(world.log().iter().filter(closed).count(), 2);
+}
+
+#[test]
+fn nobody_passes_as_a_node_by_its_name_alone() {
+    // The same node name in another fleet is another owner with other names.
+    let stranger = identity(&Member { fleet: "umbrella".to_owned(), ..Member::new("arm-1") });
+    let arm = identity(&Member::new("arm-1"));
+    let ids: [NodeId; 2] = [stranger.node_id(), arm.node_id()];
+    assert_ne!(ids[0], ids[1]);
+    assert_ne!(stranger.pseudonym(), arm.pseudonym());
+}

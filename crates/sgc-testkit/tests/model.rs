@@ -1,0 +1,399 @@
+//! Random networks and random histories against the reference model.
+//!
+//! A seed decides topology and transitions. After each burst of them the network is left alone until it is what
+//! [`Model`] says, within a bound; then messages are published and must reach exactly those who are granted.
+//! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and says which fail.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Duration;
+
+use sgc_endpoint::SinkDrop;
+use sgc_router::DropReason;
+use sgc_testkit::{DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig};
+use sgc_trust::OpenError;
+
+/// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
+const COMMITTED: &[u64] = &[
+    5, 24, 28, 34, 42, 43, 46, 64, 85, 99, 188, 342, // showed bugs
+    1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31, 32,
+    33, 35, 36, 37, 38, 39, 40,
+];
+/// Longest time from the last transition until all is as it should be: a lease for owners that vanished, a
+/// renewal for routes that wait for one, the longest wait between attempts to join, and idle time-outs.
+const QUIET_MAX: Duration = Duration::from_secs(120);
+const IDLE_MAX: Duration = Duration::from_secs(10);
+const TOPICS: [&str; 3] = ["/a", "/b", "/c"];
+
+const fn ms(n: u64) -> Duration {
+    Duration::from_millis(n)
+}
+
+/// Everything that can happen to a network of honest nodes.
+#[derive(Clone, Debug)]
+enum Transition {
+    Crash(NodeKey),
+    CrashUnseen(NodeKey, Duration),
+    Cut(NodeKey, NodeKey),
+    CutUnseen(NodeKey, NodeKey, Duration, Duration),
+    Publish(NodeKey, &'static str),
+    Rejoin(NodeKey, NodeKey),
+    Restart(NodeKey),
+    Share(NodeKey, &'static str, Sharing),
+    ShutDown(NodeKey),
+    Start(NodeKey),
+    StopUsing(NodeKey, NodeKey, &'static str),
+    Unshare(NodeKey, &'static str),
+    Use(NodeKey, NodeKey, &'static str),
+    Wait(Duration),
+}
+
+/// A network under test and what the test knows of it.
+struct Run {
+    world: World,
+    dice: Dice,
+    members: Vec<NodeKey>,
+    cables: Vec<(NodeKey, NodeKey)>,
+    cut: BTreeSet<(NodeKey, NodeKey)>,
+    shared: BTreeMap<(NodeKey, &'static str), Sharing>,
+    /// Who was permitted what when it was published.
+    permitted: BTreeMap<MessageId, BTreeSet<NodeKey>>,
+    slowest: Duration,
+}
+
+impl Run {
+    fn new(seed: u64) -> Self {
+        let mut dice = Dice::new(seed);
+        let mut config = WorldConfig::new(dice.number());
+        config.seed = seed;
+        config.jitter = Duration::ZERO..=ms([0, 3, 50][dice.below(3)]);
+        let mut world = World::with(config);
+        let mut members = Vec::new();
+        let mut routers = Vec::new();
+        for n in 0..dice.within(1..=6) {
+            routers.push(if dice.chance(20) {
+                let both = world.node(Member::new(&format!("both-{n}")), true);
+                members.push(both);
+                both
+            } else {
+                world.router(&format!("router-{n}"))
+            });
+        }
+        let mut cables = BTreeSet::new();
+        for (n, router) in routers.iter().enumerate().skip(1) {
+            cables.insert((routers[dice.below(n)], *router));
+        }
+        for _ in 0..dice.below(routers.len() + 1) {
+            let (a, b) = (dice.below(routers.len()), dice.below(routers.len()));
+            if a != b {
+                cables.insert((routers[a.min(b)], routers[a.max(b)]));
+            }
+        }
+        for n in 0..dice.within(2..=6) {
+            let groups = ["odd", "even"][n % 2].to_owned();
+            let proxy =
+                world.node(Member { groups: vec![groups], ..Member::new(&format!("proxy-{n}")) }, false);
+            for _ in 0..dice.within(1..=2) {
+                cables.insert((routers[dice.below(routers.len())], proxy));
+            }
+            if dice.chance(10) {
+                cables.extend(dice.pick(&members).map(|other| (other, proxy)));
+            }
+            members.push(proxy);
+        }
+        cables.retain(|(a, b)| a != b);
+        for (a, b) in &cables {
+            world.link(*a, *b);
+        }
+        Self {
+            world,
+            dice,
+            members,
+            cables: cables.into_iter().collect(),
+            cut: BTreeSet::new(),
+            shared: BTreeMap::new(),
+            permitted: BTreeMap::new(),
+            slowest: Duration::ZERO,
+        }
+    }
+
+    /// A transition that is possible now; `None` if the one drawn is not.
+    fn draw(&mut self) -> Option<Transition> {
+        let dice = &mut self.dice;
+        let world = &self.world;
+        let nodes: Vec<_> = world.nodes().collect();
+        let up: Vec<_> = nodes.iter().copied().filter(|n| world.is_running(*n)).collect();
+        let down: Vec<_> = nodes.iter().copied().filter(|n| !world.is_running(*n)).collect();
+        let whole: Vec<_> = self.cables.iter().copied().filter(|c| !self.cut.contains(c)).collect();
+        let broken: Vec<_> = self.cut.iter().copied().collect();
+        let member = dice.pick(&self.members)?;
+        let other = dice.pick(&self.members).filter(|o| *o != member)?;
+        let topic = TOPICS[dice.below(TOPICS.len())];
+        let idle = Duration::ZERO..=IDLE_MAX;
+        Some(match dice.below(100) {
+            0..5 => dice.pick(&whole).map(|(a, b)| Transition::Cut(a, b))?,
+            5..9 => {
+                let (a, b) = dice.pick(&whole)?;
+                Transition::CutUnseen(a, b, dice.time(&idle), dice.time(&idle))
+            }
+            9..17 => dice.pick(&broken).map(|(a, b)| Transition::Rejoin(a, b))?,
+            17..21 => Transition::Crash(dice.pick(&up)?),
+            21..25 => Transition::CrashUnseen(dice.pick(&up)?, dice.time(&idle)),
+            25..29 => Transition::Restart(dice.pick(&up)?),
+            29..32 => Transition::ShutDown(dice.pick(&up)?),
+            32..42 => Transition::Start(dice.pick(&down)?),
+            42..54 if !self.shared.contains_key(&(member, topic)) => {
+                let sharing = match dice.below(4) {
+                    0 => Sharing::to(&[other]),
+                    1 => Sharing::to_groups(&["odd"]),
+                    _ => Sharing::to_fleet(),
+                };
+                Transition::Share(member, topic, sharing.transient_local([0, 0, 1, 5][dice.below(4)]))
+            }
+            54..57 => dice
+                .pick(&self.shared.keys().copied().collect::<Vec<_>>())
+                .map(|(n, t)| Transition::Unshare(n, t))?,
+            57..77 => Transition::Use(other, member, topic),
+            77..80 => Transition::StopUsing(other, member, topic),
+            80..90 => {
+                let shared: Vec<_> =
+                    self.shared.keys().copied().filter(|(n, _)| up.contains(n)).collect();
+                dice.pick(&shared).map(|(n, t)| Transition::Publish(n, t))?
+            }
+            _ => {
+                let longest = ms([20, 300, 5000, 25_000][dice.below(4)]);
+                Transition::Wait(dice.time(&(Duration::ZERO..=longest)))
+            }
+        })
+    }
+
+    fn apply(&mut self, transition: Transition) {
+        let world = &mut self.world;
+        match transition {
+            Transition::Crash(n) => world.crash(n),
+            Transition::CrashUnseen(n, idle) => world.crash_unseen(n, idle),
+            Transition::Cut(a, b) => {
+                self.cut.insert((a, b));
+                world.cut(a, b);
+            }
+            Transition::CutUnseen(a, b, a_idle, b_idle) => {
+                self.cut.insert((a, b));
+                world.cut_unseen(a, b, a_idle, b_idle);
+            }
+            Transition::Publish(n, topic) => self.publish(n, topic),
+            Transition::Rejoin(a, b) => {
+                self.cut.remove(&(a, b));
+                world.rejoin(a, b);
+            }
+            Transition::Restart(n) => world.restart(n),
+            Transition::Share(n, topic, sharing) => {
+                world.share(n, topic, sharing.clone());
+                self.shared.insert((n, topic), sharing);
+            }
+            Transition::ShutDown(n) => world.shut_down(n),
+            Transition::Start(n) => world.start(n),
+            Transition::StopUsing(n, owner, topic) => world.stop_using(n, owner, topic),
+            Transition::Unshare(n, topic) => {
+                self.shared.remove(&(n, topic));
+                world.unshare(n, topic);
+            }
+            Transition::Use(n, owner, topic) => world.use_topic(n, owner, topic),
+            Transition::Wait(time) => self.pass(time),
+        }
+        self.assert_no_circle();
+    }
+
+    fn publish(&mut self, node: NodeKey, topic: &'static str) {
+        let permitted = Model::permitted(&self.world, node, topic);
+        let id = self.world.publish(node, topic);
+        self.permitted.insert(id, permitted);
+    }
+
+    /// Lets time pass and looks for circles now and then.
+    fn pass(&mut self, time: Duration) {
+        let end = self.world.elapsed() + time;
+        while self.world.elapsed() < end {
+            self.world.run(ms(100).min(end - self.world.elapsed()));
+            self.assert_no_circle();
+        }
+    }
+
+    fn assert_no_circle(&self) {
+        for owner in &self.members {
+            let catalogue = self.world.catalogue_name(*owner);
+            let topics = TOPICS.iter().map(|t| self.world.name(*owner, t));
+            for name in topics.chain([catalogue]) {
+                if let Some(circle) = self.world.circle(&name) {
+                    panic!("routes to a name of {owner:?} go in a circle: {circle:?}");
+                }
+            }
+        }
+    }
+
+    /// Waits until all is as the model says, then checks that messages go where they should.
+    fn quiet(&mut self) {
+        let model = Model::of(&self.world);
+        let begin = self.world.elapsed();
+        // What nobody noticed yet may look as it should.
+        self.pass(IDLE_MAX + ms(500));
+        while let Err(why) = model.check(&self.world) {
+            let waited = self.world.elapsed() - begin;
+            assert!(waited < QUIET_MAX, "after {waited:?} of quiet: {why}");
+            self.pass(ms(500));
+        }
+        let took = self.world.elapsed() - begin;
+        self.slowest = self.slowest.max(took);
+        self.world.note(format!("quiet after {took:?}"));
+        // A sink holds what it was granted a moment before the data path and its history follow.
+        self.pass(ms(2500));
+        let mut expected = BTreeMap::new();
+        for (owner, topic) in self.shared.keys().copied().collect::<Vec<_>>() {
+            if !self.world.is_running(owner) {
+                continue;
+            }
+            for _ in 0..2 {
+                self.publish(owner, topic);
+                let id = self.world.all_published().last().expect("just published").id;
+                expected.insert(id, model.granted[&(owner, topic.to_owned())].clone());
+            }
+        }
+        self.pass(ms(1500));
+        for (id, nodes) in expected {
+            let received: Vec<_> =
+                self.world.all_received().iter().filter(|r| r.id == id).map(|r| r.node).collect();
+            let set: BTreeSet<_> = received.iter().copied().collect();
+            let published = &self.world.all_published()[id.0 as usize];
+            assert!(
+                set == nodes && received.len() == nodes.len(),
+                "{published:?}: {received:?}, not {nodes:?}"
+            );
+        }
+        self.check_histories(&model);
+        self.check_deliveries();
+        self.check_log();
+    }
+
+    /// Whoever has a transient-local topic has the last messages of its source.
+    fn check_histories(&self, model: &Model) {
+        let world = &self.world;
+        for ((owner, topic), sharing) in &self.shared {
+            let of_topic = |p: &&sgc_testkit::Published| p.owner == *owner && p.topic == *topic;
+            let Some(last) = world.all_published().iter().rev().find(of_topic) else { continue };
+            let current = world.all_published().iter().filter(of_topic).filter(|p| p.source == last.source);
+            let mut history: Vec<_> = current.map(|p| p.id).collect();
+            history.drain(..history.len().saturating_sub(sharing.depth));
+            let users = model.granted.get(&(*owner, (*topic).to_owned()));
+            for user in users.into_iter().flatten() {
+                let of_use = world.all_received().iter().filter(|r| {
+                    r.node == *user && r.owner == *owner && r.topic == *topic && r.run == world.runs(*user)
+                });
+                let use_number = of_use.clone().map(|r| r.use_number).max();
+                let received: BTreeSet<_> =
+                    of_use.filter(|r| Some(r.use_number) == use_number).map(|r| r.id).collect();
+                let missing: Vec<_> = history.iter().filter(|id| !received.contains(id)).collect();
+                assert!(missing.is_empty(), "{user:?} lacks {missing:?} of {owner:?}:{topic}, {sharing:?}");
+            }
+        }
+    }
+
+    /// Nothing is delivered twice, or to one who was not permitted.
+    fn check_deliveries(&self) {
+        let mut seen = BTreeSet::new();
+        for r in self.world.all_received() {
+            assert!(seen.insert((r.node, r.run, r.use_number, r.id)), "delivered twice: {r:?}");
+            assert!(self.permitted[&r.id].contains(&r.node), "delivered to one not permitted: {r:?}");
+        }
+    }
+
+    /// Honest nodes give each other no reason for suspicion.
+    fn check_log(&self) {
+        for logged in self.world.log() {
+            let fine = match &logged.what {
+                What::RouterDrop(dropped) => matches!(
+                    dropped.reason,
+                    DropReason::Unknown { .. } | DropReason::WrongWay { .. } | DropReason::Stale { .. }
+                ),
+                What::EndpointDrop(dropped) => matches!(dropped, sgc_endpoint::Dropped::Unexpected { .. }),
+                What::DataDrop { why, .. } => match why {
+                    DataDrop::HopLimit | DataDrop::Sink(SinkDrop::Head | SinkDrop::Inconsistent) => false,
+                    DataDrop::Sink(SinkDrop::Open(why)) => *why == OpenError::Forged,
+                    _ => true,
+                },
+                What::Closed { .. } | What::Event(_) => true,
+            };
+            assert!(fine, "{logged:?}");
+        }
+    }
+
+    /// Once all owners and users are gone, nothing of them is left in any router.
+    fn end(&mut self) {
+        for node in self.members.clone() {
+            match self.dice.below(3) {
+                0 => self.world.crash(node),
+                1 => self.world.crash_unseen(node, IDLE_MAX),
+                _ => self.world.shut_down(node),
+            }
+            self.pass(ms(self.dice.clone().below(200) as u64));
+        }
+        self.pass(Duration::from_secs(130));
+        for node in self.world.nodes().collect::<Vec<_>>() {
+            let stats = self.world.stats(node);
+            let left = (stats.names, stats.branches, self.world.forwarding(node).len());
+            assert_eq!(left, (0, 0, 0), "names, branches and entries left behind in {node:?}");
+        }
+        self.check_deliveries();
+        self.check_log();
+    }
+
+    fn all(&mut self) {
+        for _ in 0..self.dice.within(1..=3) {
+            for _ in 0..self.dice.within(3..=25) {
+                if let Some(transition) = self.draw() {
+                    self.apply(transition);
+                }
+            }
+            self.quiet();
+        }
+        self.end();
+    }
+}
+
+/// Runs one seed; on failure says why, with the way there.
+fn run(seed: u64) -> Result<Duration, String> {
+    let mut run = Run::new(seed);
+    catch_unwind(AssertUnwindSafe(|| run.all())).map(|()| run.slowest).map_err(|panic| {
+        let text = panic.downcast_ref::<String>().cloned();
+        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
+        format!("{}\nseed {seed}: {}", run.world.trace(), text.unwrap_or_default())
+    })
+}
+
+fn seeds() -> Vec<u64> {
+    let Ok(text) = std::env::var("SGC_SEEDS") else { return COMMITTED.to_vec() };
+    let range = text.split_once("..").and_then(|(a, b)| Some(a.parse().ok()?..b.parse().ok()?));
+    match (range, text.parse()) {
+        (Some(range), _) => range.collect(),
+        (None, Ok(one)) => vec![one],
+        (None, Err(_)) => panic!("SGC_SEEDS is {text:?}, not one seed or a range like 100..200"),
+    }
+}
+
+#[test]
+fn random_networks_become_what_the_model_says() {
+    // A failing seed is told once, with its trace; not a second time with a stack.
+    std::panic::set_hook(Box::new(|_| {}));
+    let mut failed = Vec::new();
+    let mut slowest = Duration::ZERO;
+    for seed in seeds() {
+        match run(seed) {
+            Ok(took) => slowest = slowest.max(took),
+            Err(why) => {
+                eprintln!("{why}\n");
+                failed.push(seed);
+            }
+        }
+    }
+    let _ = std::panic::take_hook();
+    eprintln!("slowest to become quiet: {slowest:?}");
+    assert!(failed.is_empty(), "failing seeds: {failed:?}");
+}
