@@ -10,8 +10,8 @@ use sgc_endpoint::{
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Identity, Policy, ReplyKey, Suite, seal_grant};
 use sgc_wire::{
-    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody, Metadata, Name,
-    Qos, RefuseReason, Role, SinkId, TopicGrant,
+    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody,
+    Metadata, Name, Qos, RefuseReason, Role, SinkId, TopicGrant,
 };
 
 /// An endpoint and what came out of it since it was last asked.
@@ -74,7 +74,7 @@ impl Bench {
 
     fn share_with_fleet(&mut self, topic: &str) -> Name {
         let policy = Policy { fleet: Some(self.identity.as_peer().ca), ..Policy::default() };
-        self.share(topic, policy).unwrap()
+        self.share(topic, policy).expect("within the bounds")
     }
 
     /// The advertisements sent: sequence number, whether a withdrawal, how many names.
@@ -240,7 +240,7 @@ fn a_topic_shared_again_within_the_same_moment_is_advertised_after_its_withdrawa
 fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let mut bench = Bench::new("desk", Limits::default());
     let arm = identity(&Member::new("arm-1"));
-    let secret = arm.fleet_secret().unwrap();
+    let secret = arm.fleet_secret().expect("no router");
     let metadata = Metadata::topic("arm-1", "/a", "p/msg/T");
     let blind = sgc_trust::TopicSecret::derive(secret, &metadata).blind();
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
@@ -257,7 +257,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     };
     bench.frame(Control::Advert { hops: 1, signed: arm.sign_advert(&body) });
     let [Control::Join { signed }] = &bench.sent[..] else { panic!("{:?}", bench.sent) };
-    let JoinBody { sink, reply_key, .. } = JoinBody::from_slice(&signed.body).unwrap();
+    let JoinBody { sink, reply_key, .. } = JoinBody::from_slice(&signed.body).expect("as it was signed");
     let frame = grant(&arm, name, sink, &reply_key, 1, 7);
     bench.frame(frame);
     assert!(matches!(bench.events[..], [Event::Granted { .. }]), "{:?}", bench.events);
@@ -266,7 +266,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
 
 fn grant(owner: &Identity, name: Name, sink: SinkId, reply_key: &[u8], serial: u64, key: u8) -> Control {
     let content = GrantContent::Topic(TopicGrant { epoch: serial as u32, suite: 1, key: [key; 32] });
-    let (enc, sealed) = seal_grant(reply_key, &name, &sink, serial, &content).unwrap();
+    let (enc, sealed) = seal_grant(reply_key, &name, &sink, serial, &content).expect("a usable reply key");
     let body = AnswerBody { name, sink, serial, answer: Answer::Grant { enc, sealed } };
     Control::Answer { signed: owner.sign_answer(&body) }
 }
@@ -274,9 +274,14 @@ fn grant(owner: &Identity, name: Name, sink: SinkId, reply_key: &[u8], serial: u
 #[test]
 fn answers_are_taken_in_their_order_and_each_once() {
     let (mut bench, arm, name, sink, reply_key) = granted();
-    let (second, third) = (grant(&arm, name, sink, &reply_key, 2, 8), grant(&arm, name, sink, &reply_key, 3, 9));
+    let (second, third) =
+        (grant(&arm, name, sink, &reply_key, 2, 8), grant(&arm, name, sink, &reply_key, 3, 9));
     bench.frame(third.clone());
-    assert!(matches!(&bench.events[..], [Event::Granted { grant, .. }] if grant.epoch == 3), "{:?}", bench.events);
+    assert!(
+        matches!(&bench.events[..], [Event::Granted { grant, .. }] if grant.epoch == 3),
+        "{:?}",
+        bench.events
+    );
     for old in [second, third] {
         bench.frame(old);
         assert!(bench.events.is_empty() && matches!(bench.dropped[..], [Dropped::Unexpected { .. }]));
@@ -289,7 +294,11 @@ fn an_answer_that_the_owner_did_not_sign_or_seal_changes_nothing() {
     let (mut bench, arm, name, sink, reply_key) = granted();
     let other = identity(&Member::new("mallory"));
     bench.frame(grant(&other, name, sink, &reply_key, 2, 8));
-    assert!(matches!(bench.dropped[..], [Dropped::NotVerified { what: "answer", .. }]), "{:?}", bench.dropped);
+    assert!(
+        matches!(bench.dropped[..], [Dropped::NotVerified { what: "answer", .. }]),
+        "{:?}",
+        bench.dropped
+    );
     bench.frame(grant(&arm, name, SinkId([0; 16]), &reply_key, 2, 8));
     assert!(matches!(bench.dropped[..], [Dropped::Unexpected { .. }]), "{:?}", bench.dropped);
     assert_eq!((bench.events.len(), bench.endpoint.join_status(&name)), (0, Some(JoinStatus::Granted)));

@@ -3,10 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytes::Bytes;
 use sgc_router::{Limits, LinkId, Output, Router, RouterConfig};
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Identity, name_of};
-use sgc_wire::{AdvertBody, Blind, Control, Decode, HOP_LIMIT, Hello, Name, NodeId};
+use sgc_wire::{
+    AdvertBody, Answer, AnswerBody, Blind, Control, Decode, HOP_LIMIT, Hello, Name, NodeId, SinkId,
+};
 
 const A: Blind = Blind([0xa; 32]);
 const B: Blind = Blind([0xb; 32]);
@@ -108,7 +111,7 @@ impl Bench {
             .iter()
             .filter_map(|(link, frame)| match frame {
                 Control::Advert { hops, signed } => {
-                    Some((link.0, *hops, AdvertBody::from_slice(&signed.body).unwrap().seq))
+                    Some((link.0, *hops, AdvertBody::from_slice(&signed.body).expect("as it was signed").seq))
                 }
                 _ => None,
             })
@@ -216,7 +219,22 @@ fn a_name_that_is_gone_is_not_told_with_those_advertised_along_with_it() {
     bench.sent.clear();
     bench.router.handle_link_up(LinkId(4), NodeId([4; 32]));
     bench.frame(4, Control::Hello(Hello { minor: 0, incarnation: 4, transit: true }));
-    assert_eq!((bench.told(), bench.told_unreach(&B), bench.told_unreach(&A)), (vec![(4, 2, 10)], vec![4], vec![]));
+    assert_eq!(
+        (bench.told(), bench.told_unreach(&B), bench.told_unreach(&A)),
+        (vec![(4, 2, 10)], vec![4], vec![])
+    );
+}
+
+#[test]
+fn a_grant_for_a_sink_that_left_is_given_back() {
+    let mut bench = bench();
+    bench.advert(1, 1, 10, &[A]);
+    let (name, sink) = (bench.name(&A), SinkId([1; 16]));
+    let answer = Answer::Grant { enc: Bytes::new(), sealed: Bytes::new() };
+    let signed = bench.owner.sign_answer(&AnswerBody { name, sink, serial: 1, answer });
+    bench.frame(1, Control::Answer { signed });
+    assert_eq!(bench.sent, [(LinkId(1), Control::Leave { name, sink })]);
+    assert_eq!(bench.dropped, ["unknown"]);
 }
 
 #[test]

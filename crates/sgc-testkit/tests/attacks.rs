@@ -56,7 +56,7 @@ fn last(world: &World, from: NodeKey, to: NodeKey, is: impl Fn(&Control) -> bool
 
 fn is_advert_of(world: &World, owner: NodeKey, frame: &Control) -> bool {
     let Control::Advert { signed, .. } = frame else { return false };
-    let body = AdvertBody::from_slice(&signed.body).unwrap();
+    let body = AdvertBody::from_slice(&signed.body).expect("as its sender made it");
     body.chain == world.identity(owner).chain_bytes() && !body.withdraw
 }
 
@@ -137,7 +137,7 @@ fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> Signed + 'stati
     let (arm, west, desk) = (*arm, *west, *desk);
     world.tamper(west, desk, move |frame| match frame {
         Control::Answer { signed } => {
-            let body = AnswerBody::from_slice(&signed.body).unwrap();
+            let body = AnswerBody::from_slice(&signed.body).expect("as its sender made it");
             vec![Control::Answer { signed: forge(body) }]
         }
         frame => vec![frame.clone()],
@@ -306,7 +306,7 @@ fn packet(world: &World, owner: NodeKey, to: Option<SinkId>) -> Packet {
         grid: 16 * 1024,
         to,
     };
-    Packet::new(header, Bytes::from(vec![0; 8 + 12 + 16]).into()).unwrap()
+    Packet::new(header, Bytes::from(vec![0; 8 + 12 + 16]).into()).expect("far below the bound")
 }
 
 #[test]

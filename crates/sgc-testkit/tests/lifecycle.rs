@@ -463,6 +463,23 @@ fn a_flow_moves_to_a_shorter_way_and_back_without_a_circle() {
         world.run(ms(25_000));
         assert_eq!(world.distance(south, &world.name(arm, "/chatter")), Some(2), "{}", world.trace());
         assert_flows(&mut world, arm, desk);
+        // The longer way is left, all the way up.
+        assert_eq!(Model::of(&world).check(&world), Ok(()));
+    }
+}
+
+#[test]
+fn an_equally_short_way_is_taken_at_once() {
+    for seed in 50..60 {
+        let Ring { mut world, arm, desk, .. } = ring(seed);
+        let used = world.next_hop(desk, &world.name(arm, "/chatter")).expect("it flows");
+        world.cut(used, desk);
+        let begin = world.elapsed();
+        world.run(ms(10));
+        world.until_granted(desk, arm, "/chatter");
+        let took = world.elapsed() - begin;
+        assert!(took < ms(1000), "it took {took:?}, as if it had waited for a renewal\n{}", world.trace());
+        assert_flows(&mut world, arm, desk);
     }
 }
 
@@ -560,7 +577,8 @@ fn branches_beyond_a_names_limit_are_refused_and_a_place_that_gets_free_is_taken
         world.join_blindly(user, arm, "/chatter");
     }
     world.run(ms(5000));
-    let granted = |w: &World| [desk, other].map(|n| w.status(n, arm, "/chatter") == Some(JoinStatus::Granted));
+    let granted =
+        |w: &World| [desk, other].map(|n| w.status(n, arm, "/chatter") == Some(JoinStatus::Granted));
     let first = granted(&world);
     assert!(first == [true, false] || first == [false, true], "{first:?}");
     assert!(world.router_drops(cloud).contains(&"limit"));

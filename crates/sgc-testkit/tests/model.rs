@@ -16,8 +16,8 @@ use sgc_trust::OpenError;
 /// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
 const COMMITTED: &[u64] = &[
     5, 24, 28, 34, 42, 43, 46, 64, 85, 99, 188, 342, // showed bugs
-    1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31, 32,
-    33, 35, 36, 37, 38, 39, 40,
+    1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31,
+    32, 33, 35, 36, 37, 38, 39, 40,
 ];
 /// Longest time from the last transition until all is as it should be: a lease for owners that vanished, a
 /// renewal for routes that wait for one, the longest wait between attempts to join, and idle time-outs.
@@ -156,8 +156,7 @@ impl Run {
             57..77 => Transition::Use(other, member, topic),
             77..80 => Transition::StopUsing(other, member, topic),
             80..90 => {
-                let shared: Vec<_> =
-                    self.shared.keys().copied().filter(|(n, _)| up.contains(n)).collect();
+                let shared: Vec<_> = self.shared.keys().copied().filter(|(n, _)| up.contains(n)).collect();
                 dice.pick(&shared).map(|(n, t)| Transition::Publish(n, t))?
             }
             _ => {
