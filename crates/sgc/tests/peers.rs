@@ -1,0 +1,633 @@
+//! The whole thing between programs that are not ours: Cyclone DDS in Python and Fast DDS in C++, in networks that
+//! share nothing but an `sgc` router (`tests/peers/README.md`).
+//!
+//! Three network namespaces stand for a robot's network, the cloud and an operator's desk; both networks reach the cloud
+//! and nothing routes between them. DDS stays on the loopback interface of each. Where namespaces cannot be made the
+//! tests say so and use two ROS domains of this host instead.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// Longest wait for an event, far beyond what any takes.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// One lab at a time: each fills both processors.
+static TURN: Mutex<()> = Mutex::new(());
+static LABS: AtomicU32 = AtomicU32::new(0);
+
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Site {
+    Robot,
+    Cloud,
+    Desk,
+}
+
+const SITES: [Site; 3] = [Site::Robot, Site::Cloud, Site::Desk];
+
+impl Site {
+    fn name(self) -> &'static str {
+        ["robot", "cloud", "desk"][self as usize]
+    }
+
+    /// Its ROS domain: the same in both networks if those are apart by themselves.
+    fn domain(self, apart: bool) -> &'static str {
+        match (apart, self) {
+            (true, _) => "0",
+            (false, Self::Robot) => "91",
+            (false, _) => "92",
+        }
+    }
+}
+
+struct Lab {
+    dir: TempDir,
+    number: u32,
+    /// False where the kernel or the user cannot make namespaces.
+    apart: bool,
+    nodes: [Option<Child>; 3],
+    _turn: MutexGuard<'static, ()>,
+}
+
+impl Lab {
+    /// A fleet, and a node at each site; the robot shares `topics` with the desk.
+    fn new(topics: &[&str]) -> Self {
+        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        let number = std::process::id() * 16 % 100_000 + LABS.fetch_add(1, Ordering::Relaxed);
+        let dir = tempfile::tempdir().unwrap();
+        let mut lab = Self { dir, number, apart: false, nodes: [None, None, None], _turn: turn };
+        lab.apart = match lab.make_namespaces() {
+            Ok(()) => true,
+            Err(why) => {
+                say(&format!("NO NETWORK NAMESPACES ({why}): using two ROS domains of this host instead"));
+                lab.remove_namespaces();
+                false
+            }
+        };
+        for args in [
+            &["fleet", "create", "lab"][..],
+            &["fleet", "enroll", "robot"],
+            &["fleet", "enroll", "cloud", "--router"],
+            &["fleet", "enroll", "desk"],
+        ] {
+            let output = lab.sgc(None, args).output().unwrap();
+            assert!(output.status.success(), "{output:?}");
+        }
+        lab.write_configs(topics, "");
+        SITES.into_iter().for_each(|site| lab.start(site));
+        lab
+    }
+
+    fn make_namespaces(&self) -> Result<(), String> {
+        for site in SITES {
+            ip(&["netns", "add", &self.namespace(site)])?;
+            ip(&["-n", &self.namespace(site), "link", "set", "lo", "up"])?;
+        }
+        for (net, site) in [(1, Site::Robot), (2, Site::Desk)] {
+            let (here, cloud) = (self.namespace(site), self.namespace(Site::Cloud));
+            let (near, far) = (format!("sg{}n{net}", self.number), format!("sg{}f{net}", self.number));
+            ip(&[
+                "link", "add", &near, "netns", &here, "type", "veth", "peer", "name", &far, "netns", &cloud,
+            ])?;
+            ip(&["-n", &here, "address", "add", &format!("10.91.{net}.2/24"), "dev", &near])?;
+            ip(&["-n", &cloud, "address", "add", &format!("10.91.{net}.1/24"), "dev", &far])?;
+            ip(&["-n", &here, "link", "set", &near, "up"])?;
+            ip(&["-n", &cloud, "link", "set", &far, "up"])?;
+        }
+        Ok(())
+    }
+
+    fn remove_namespaces(&self) {
+        for site in SITES {
+            let _ = ip(&["netns", "delete", &self.namespace(site)]);
+        }
+    }
+
+    fn namespace(&self, site: Site) -> String {
+        format!("sgct-{}-{}", self.number, site.name())
+    }
+
+    fn cloud_address(&self, from: Site) -> String {
+        let port = 20_000 + self.number % 20_000;
+        match (self.apart, from) {
+            (false, _) => format!("127.0.0.1:{port}"),
+            (true, Site::Robot) => format!("10.91.1.1:{port}"),
+            (true, Site::Desk) => format!("10.91.2.1:{port}"),
+            (true, Site::Cloud) => format!("0.0.0.0:{port}"),
+        }
+    }
+
+    fn write_configs(&self, topics: &[&str], use_extra: &str) {
+        for site in SITES {
+            let address = self.cloud_address(site);
+            let mut text =
+                format!("identity = \"{0}.identity\"\n[admin]\nsocket = \"{0}.sock\"\n", site.name());
+            if site == Site::Cloud {
+                text += &format!("[router]\nlisten = [\"quic://{address}\"]\n");
+            } else {
+                let domain = site.domain(self.apart);
+                text += &format!("[node]\nrouters = [\"quic://{address}\"]\n");
+                text += &format!(
+                    "[ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n"
+                );
+            }
+            for topic in topics {
+                match site {
+                    Site::Robot => text += &format!("[[share]]\ntopic = \"{topic}\"\nto = [\"desk\"]\n"),
+                    Site::Desk => {
+                        text += &format!("[[use]]\nfrom = \"robot\"\ntopic = \"{topic}\"\n{use_extra}");
+                    }
+                    Site::Cloud => {}
+                }
+            }
+            fs::write(self.path(site, "toml"), text).unwrap();
+        }
+    }
+
+    fn path(&self, site: Site, kind: &str) -> PathBuf {
+        self.dir.path().join(format!("{}.{kind}", site.name()))
+    }
+
+    /// A command at a site, or on this host where none is given or there are no namespaces.
+    fn command(&self, site: Option<Site>, program: &Path) -> Command {
+        let mut command = match site.filter(|_| self.apart) {
+            Some(site) => {
+                let mut command = Command::new("ip");
+                command.args(["netns", "exec", &self.namespace(site)]).arg(program);
+                command
+            }
+            None => Command::new(program),
+        };
+        let path = std::env::var_os("PATH").unwrap();
+        command.env_clear().env("PATH", path).env("XDG_RUNTIME_DIR", self.dir.path());
+        command.envs(std::env::var_os("SGC_LOG").map(|level| ("SGC_LOG", level)));
+        command.current_dir(self.dir.path()).stdin(Stdio::null());
+        command
+    }
+
+    fn sgc(&self, site: Option<Site>, args: &[&str]) -> Command {
+        let mut command = self.command(site, Path::new(env!("CARGO_BIN_EXE_sgc")));
+        command.args(args);
+        command
+    }
+
+    fn start(&mut self, site: Site) {
+        let log = fs::File::options().create(true).append(true).open(self.path(site, "log")).unwrap();
+        let config = self.path(site, "toml");
+        let mut command = self.sgc(Some(site), &["run", "--print-ready", "-c", config.to_str().unwrap()]);
+        let mut child = command.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        assert!(line.contains("ready"), "{}: {}", site.name(), self.log(site));
+        self.nodes[site as usize] = Some(child);
+    }
+
+    /// SIGKILL, and its end.
+    fn kill(&mut self, site: Site) {
+        let mut child = self.nodes[site as usize].take().unwrap();
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+
+    /// SIGTERM, and its end.
+    fn terminate(&mut self, site: Site) -> ExitStatus {
+        let mut child = self.nodes[site as usize].take().unwrap();
+        kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
+        let mut ended = None;
+        eventually("the node ends", || {
+            ended = child.try_wait().unwrap();
+            ended.is_some()
+        });
+        ended.unwrap()
+    }
+
+    fn pid(&self, site: Site) -> u32 {
+        self.nodes[site as usize].as_ref().unwrap().id()
+    }
+
+    fn log(&self, site: Site) -> String {
+        fs::read_to_string(self.path(site, "log")).unwrap_or_default()
+    }
+
+    fn status(&self, site: Site) -> Value {
+        let socket = self.path(site, "sock");
+        let output =
+            self.sgc(None, &["status", "--json", "--socket", socket.to_str().unwrap()]).output().unwrap();
+        serde_json::from_slice(&output.stdout).unwrap_or(Value::Null)
+    }
+
+    fn peer(&self, site: Site, vendor: &str, role: &str, args: &[&str]) -> Peer {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap();
+        let program = root.join(".peers").join(vendor);
+        assert!(program.exists(), "{} is missing: run `make peers`", program.display());
+        let mut command = self.command(Some(site), &program);
+        command
+            .args([role, "--localhost", "--domain", site.domain(self.apart), "--timeout", "120"])
+            .args(args);
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let (sender, events) = channel();
+        let stdout = BufReader::new(child.stdout.take().unwrap());
+        std::thread::spawn(move || {
+            for line in stdout.lines().map_while(Result::ok) {
+                match serde_json::from_str(&line) {
+                    Ok(event) => drop(sender.send(event)),
+                    Err(error) => panic!("{line}: {error}"),
+                }
+            }
+        });
+        Peer { stdin: child.stdin.take(), child, events }
+    }
+
+    /// A publisher at the robot and a subscriber at the desk, both matched: then `sent` messages, of which all from the
+    /// first one heard on must arrive. A reader may be matched a moment before it knows, so that the first few may
+    /// be lost without anyone's fault; `wanted` must come.
+    fn carries(&self, from: &str, to: &str, kind: &str, extra: &[&str], sent: u32, wanted: u32) {
+        let what = format!("{kind} from {from} to {to}");
+        let topic = format!("/{kind}");
+        let common = ["--type", kind, "--topic", &topic, "--large"];
+        let wanted_text = wanted.to_string();
+        let listen = [&common[..], &["--count", &wanted_text, "--linger", "0.7"], extra].concat();
+        let mut listener = self.peer(Site::Desk, to, "sub", &listen);
+        listener.wait("ready", |e| e["event"] == "ready");
+        let sent_text = sent.to_string();
+        let mut talk = [&common[..], &["--count", &sent_text, "--rate", "20", "--wait-go"], extra].concat();
+        if kind == "image" {
+            talk.extend(["--size", if extra.contains(&"--timeout") { "13000000" } else { "1000000" }]);
+        }
+        let mut talker = self.peer(Site::Robot, from, "pub", &talk);
+        talker.wait("a match at the robot", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
+        listener.wait("a match at the desk", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
+        talker.go();
+        let summary = listener.summary();
+        let count = |key: &str| summary[key].as_u64().unwrap();
+        assert!(count("received") >= wanted.into(), "{what}: {summary}");
+        assert_eq!((count("duplicated"), count("altered")), (0, 0), "{what}: {summary}");
+        if !extra.contains(&"--best-effort") {
+            assert_eq!(count("lost"), 0, "{what}: {summary}");
+        }
+        talker.summary();
+    }
+}
+
+impl Drop for Lab {
+    fn drop(&mut self) {
+        for child in self.nodes.iter_mut().flatten() {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+        if std::thread::panicking() {
+            SITES.into_iter().for_each(|s| say(&format!("--- {} ---\n{}", s.name(), self.log(s))));
+        }
+        if self.apart {
+            self.remove_namespaces();
+        }
+    }
+}
+
+/// A program that is not ours.
+struct Peer {
+    child: Child,
+    stdin: Option<ChildStdin>,
+    events: Receiver<Value>,
+}
+
+impl Peer {
+    fn wait(&mut self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.events.recv_timeout(left) {
+                Ok(event) if is_it(&event) => return event,
+                Ok(event) => assert_ne!(event["event"], "summary", "ended before {what}: {event}"),
+                Err(error) => panic!("{what}: {error}"),
+            }
+        }
+    }
+
+    fn go(&mut self) {
+        self.stdin.as_mut().unwrap().write_all(b"go\n").unwrap();
+    }
+
+    fn end(&mut self) {
+        kill_process(Pid::from_child(&self.child), Signal::TERM).unwrap();
+    }
+
+    fn summary(&mut self) -> Value {
+        let deadline = Instant::now() + 2 * PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let event = self.events.recv_timeout(left).expect("a summary");
+            if event["event"] == "summary" {
+                self.child.wait().unwrap();
+                return event;
+            }
+        }
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// To the terminal, past the test harness, which shows nothing of a test that passes.
+fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "{text}");
+}
+
+fn ip(args: &[&str]) -> Result<(), String> {
+    let output = Command::new("ip").args(args).output().map_err(|e| format!("ip: {e}"))?;
+    if output.status.success() {
+        Ok(())
+    } else {
+        Err(String::from_utf8_lossy(&output.stderr).trim().to_owned())
+    }
+}
+
+fn eventually(what: &str, mut is_so: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !is_so() {
+        assert!(Instant::now() < deadline, "never: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn every_vendor_reaches_every_vendor_through_a_router() {
+    let lab = Lab::new(&["/string", "/image", "/custom"]);
+    for from in ["cyclone", "fastdds"] {
+        for to in ["cyclone", "fastdds"] {
+            lab.carries(from, to, "string", &[], 30, 20);
+            lab.carries(from, to, "custom", &[], 30, 20);
+            lab.carries(from, to, "image", &[], 15, 8);
+        }
+    }
+    lab.carries("fastdds", "cyclone", "string", &["--best-effort"], 40, 20);
+    lab.carries("cyclone", "fastdds", "image", &["--timeout", "90"], 5, 2);
+    // The router carried it all and knows none of it.
+    let cloud = lab.status(Site::Cloud);
+    assert_eq!(cloud["routes"], Value::Array(vec![]));
+    assert!(
+        cloud["names"].as_array().unwrap().iter().any(|n| n["bytes"].as_u64() > Some(1_000_000)),
+        "{cloud}"
+    );
+}
+
+#[test]
+fn late_subscribers_and_a_late_node_get_the_latched_message_once() {
+    let mut lab = Lab::new(&["/string"]);
+    lab.kill(Site::Desk);
+    let latched = ["--type", "string", "--topic", "/string", "--transient-local", "--depth", "1"];
+    for vendor in ["cyclone", "fastdds"] {
+        let publish =
+            [&latched[..], &["--count", "4", "--rate", "0", "--wait-matched", "0", "--hold", "100"]].concat();
+        let mut talker = lab.peer(Site::Robot, vendor, "pub", &publish);
+        talker.wait("all sent", |e| e["event"] == "all_sent");
+        lab.start(Site::Desk);
+        for listener in ["fastdds", "cyclone"] {
+            let listen = [&latched[..], &["--count", "1", "--linger", "1"]].concat();
+            let summary = lab.peer(Site::Desk, listener, "sub", &listen).summary();
+            let got = ["received", "last", "duplicated", "altered"].map(|key| summary[key].as_u64());
+            assert_eq!(got, [Some(1), Some(3), Some(0), Some(0)], "{vendor} to {listener}: {summary}");
+        }
+        talker.end();
+        talker.summary();
+        lab.kill(Site::Desk);
+    }
+}
+
+#[test]
+fn the_flow_resumes_after_every_kill_and_restart_without_a_duplicate() {
+    let mut lab = Lab::new(&["/string"]);
+    let common = ["--type", "string", "--topic", "/string"];
+    let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
+    listener.wait("ready", |e| e["event"] == "ready");
+    let publish = [&common[..], &["--rate", "20", "--verbose"]].concat();
+    let mut talker = lab.peer(Site::Robot, "fastdds", "pub", &publish);
+    listener.wait("the first message", |e| e["event"] == "received");
+    let orders: [&[Site]; 5] = [
+        &[Site::Robot],
+        &[Site::Cloud],
+        &[Site::Desk],
+        &[Site::Robot, Site::Cloud],
+        &[Site::Desk, Site::Cloud, Site::Robot],
+    ];
+    for order in orders {
+        order.iter().for_each(|site| lab.kill(*site));
+        order.iter().for_each(|site| lab.start(*site));
+        // Only what is sent from now on shows that it resumed.
+        while talker.events.try_recv().is_ok() {}
+        let sent = talker.wait("news", |e| e["event"] == "sent")["seq"].as_u64().unwrap();
+        listener.wait(&format!("what was sent after {order:?}"), |e| {
+            e["event"] == "received" && e["seq"].as_u64() > Some(sent)
+        });
+    }
+    talker.end();
+    talker.summary();
+    listener.end();
+    let summary = listener.summary();
+    let count = |key: &str| summary[key].as_u64().unwrap();
+    assert_eq!((count("duplicated"), count("altered"), count("reordered")), (0, 0, 0), "{summary}");
+}
+
+#[test]
+fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_once() {
+    let mut lab = Lab::new(&["/string"]);
+    let common = ["--type", "string", "--topic", "/string"];
+    // Cyclone, because Fast DDS notices the end of a Cyclone writer only when its lease is over, also without us.
+    let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
+    listener.wait("ready", |e| e["event"] == "ready");
+    for start in ["0", "1000", "2000"] {
+        let publish = [&common[..], &["--rate", "50", "--start", start]].concat();
+        let mut talker = lab.peer(Site::Robot, "cyclone", "pub", &publish);
+        let first: u64 = start.parse().unwrap();
+        for n in 1..=20 {
+            listener
+                .wait("its messages", |e| e["event"] == "received" && e["seq"].as_u64() >= Some(first + n));
+        }
+        talker.end();
+        talker.summary();
+    }
+    // One that is there when the node stops.
+    let mut talker = lab.peer(
+        Site::Robot,
+        "cyclone",
+        "pub",
+        &[&common[..], &["--rate", "50", "--start", "3000"]].concat(),
+    );
+    listener.wait("its messages", |e| e["event"] == "received" && e["seq"].as_u64() >= Some(3010));
+    let begun = Instant::now();
+    let status = lab.terminate(Site::Robot);
+    assert!(status.success(), "{status}: {}", lab.log(Site::Robot));
+    listener.wait("the end", |e| e["event"] == "matched" && e["count"] == 0);
+    assert!(begun.elapsed() < Duration::from_secs(9), "not withdrawn, but lost and held for ten seconds");
+    listener.end();
+    let summary = listener.summary();
+    assert_eq!((&summary["duplicated"], &summary["altered"]), (&0.into(), &0.into()), "{summary}");
+    talker.end();
+    talker.summary();
+}
+
+#[test]
+fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
+    let lab = Lab::new(&["/string"]);
+    let resident = || {
+        let status = fs::read_to_string(format!("/proc/{}/status", lab.pid(Site::Cloud))).unwrap();
+        let line = status.lines().find(|l| l.starts_with("VmRSS")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
+    };
+    lab.carries("cyclone", "fastdds", "string", &[], 20, 10);
+    let before = resident();
+    for args in [&["fleet", "create", "evil"][..], &["fleet", "enroll", "mallory", "--fleet", "evil.fleet"]] {
+        assert!(lab.sgc(None, args).output().unwrap().status.success());
+    }
+    let url = format!("quic://{}", lab.cloud_address(Site::Desk));
+    let args = ["run", "--identity", "mallory.identity", "--router", &url, "--use", "robot:/string"];
+    let mut command = lab.sgc(Some(Site::Desk), &args);
+    command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
+    let log = fs::File::create(lab.dir.path().join("mallory.log")).unwrap();
+    let mut mallory = command.stderr(log).spawn().unwrap();
+    let refused = |kind: &str| lab.status(Site::Cloud)["refused"][kind].as_u64().unwrap_or(0);
+    eventually("the other fleet is counted", || refused("other_ca") > 0);
+    assert!(lab.log(Site::Cloud).contains("is refused"), "{}", lab.log(Site::Cloud));
+    let told = || fs::read_to_string(lab.dir.path().join("mallory.log")).unwrap();
+    eventually("the other fleet is told", || {
+        told().contains("of another fleet") || told().contains("different fleets")
+    });
+    mallory.kill().unwrap();
+    mallory.wait().unwrap();
+    // Random datagrams, some of which look like the beginning of a connection.
+    let (host, port) =
+        url.trim_start_matches("quic://").split_once(':').map(|(h, p)| (h.to_owned(), p.to_owned())).unwrap();
+    let script = format!(
+        "import os,random,socket\nrandom.seed(7)\ns=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n\
+         for n in range(20000):\n b=random.randbytes(random.choice([1,20,60,1200,1400]))\n\
+         \x20if n%3==0: b=bytes([0xc3,0,0,0,1,8])+b\n s.sendto(b,({host:?},{port}))\n"
+    );
+    let mut python = lab.command(Some(Site::Robot), Path::new("python3"));
+    assert!(python.args(["-c", &script]).status().unwrap().success());
+    lab.carries("fastdds", "cyclone", "string", &[], 20, 10);
+    let after = resident();
+    assert!(after < before + 30_000, "{before} kB before, {after} kB after");
+}
+
+#[test]
+fn types_that_do_not_agree_and_topics_that_never_appear_are_named() {
+    let mut lab = Lab::new(&["/string", "/never"]);
+    lab.write_configs(&["/string", "/never"], "type = \"sensor_msgs/msg/Image\"\n");
+    lab.kill(Site::Desk);
+    lab.start(Site::Desk);
+    let _talker = lab.peer(Site::Robot, "cyclone", "pub", &["--type", "string", "--topic", "/string"]);
+    eventually("the mismatch is said", || {
+        let log = lab.log(Site::Desk);
+        log.contains("sensor_msgs/msg/Image") && log.contains("std_msgs/msg/String")
+    });
+    let states = |site| -> Vec<String> {
+        let status = lab.status(site);
+        let routes = status["routes"].as_array().cloned().unwrap_or_default();
+        routes
+            .iter()
+            .map(|r| format!("{} {}", r["topic"].as_str().unwrap(), r["state"].as_str().unwrap()))
+            .collect()
+    };
+    eventually("what is waited for", || {
+        states(Site::Robot).contains(&"/never waits for a local publisher".to_owned())
+    });
+    assert!(!lab.log(Site::Robot).contains("panicked") && !lab.log(Site::Desk).contains("panicked"));
+}
+
+#[test]
+fn two_nodes_on_one_network_make_no_loop() {
+    let mut lab = Lab::new(&["/string"]);
+    // The desk's node moves into the robot's network.
+    lab.kill(Site::Desk);
+    let text = fs::read_to_string(lab.path(Site::Desk, "toml")).unwrap();
+    let domain = |site: Site| format!("domain_id = {}", site.domain(lab.apart));
+    let text = text
+        .replace(&lab.cloud_address(Site::Desk), &lab.cloud_address(Site::Robot))
+        .replace(&domain(Site::Desk), &domain(Site::Robot));
+    fs::write(lab.path(Site::Desk, "toml"), text).unwrap();
+    let config = lab.path(Site::Desk, "toml");
+    let log = fs::File::create(lab.path(Site::Desk, "log")).unwrap();
+    let mut command = lab.sgc(Some(Site::Robot), &["run", "-c", config.to_str().unwrap()]);
+    lab.nodes[Site::Desk as usize] = Some(command.stderr(log).spawn().unwrap());
+    let common = ["--type", "string", "--topic", "/string"];
+    let mut listener = lab.peer(
+        Site::Robot,
+        "fastdds",
+        "sub",
+        &[&common[..], &["--count", "100", "--linger", "2"]].concat(),
+    );
+    listener.wait("ready", |e| e["event"] == "ready");
+    let mut talker = lab.peer(
+        Site::Robot,
+        "cyclone",
+        "pub",
+        &[&common[..], &["--count", "120", "--rate", "50", "--wait-go"]].concat(),
+    );
+    // The talker itself, and the desk's writer.
+    listener.wait("both writers", |e| e["event"] == "matched" && e["count"] == 2);
+    talker.go();
+    let summary = listener.summary();
+    let (received, duplicated) =
+        (summary["received"].as_u64().unwrap(), summary["duplicated"].as_u64().unwrap());
+    // Directly, and once more through the router: never a third time.
+    assert!(received >= 100 && duplicated > 0 && duplicated <= received, "{summary}");
+    assert_eq!(summary["altered"], 0, "{summary}");
+    talker.summary();
+}
+
+#[test]
+fn the_router_never_holds_what_it_carries() {
+    let lab = Lab::new(&["/string"]);
+    let common = ["--type", "string", "--topic", "/string"];
+    let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
+    let publish = [&common[..], &["--rate", "50", "--size", "4000"]].concat();
+    let mut talker = lab.peer(Site::Robot, "cyclone", "pub", &publish);
+    for _ in 0..50 {
+        listener.wait("messages", |e| e["event"] == "received");
+    }
+    // What the listener holds in plain text is what the talker said: find it there first, or finding nothing in
+    // the router would say nothing.
+    let words: [&[u8]; 4] = [b" fill=", b"std_msgs", b"rt/string", b"dds_::String_"];
+    for word in words {
+        assert!(
+            holds(lab.pid(Site::Robot), word),
+            "{:?} not even in the robot's node",
+            String::from_utf8_lossy(word)
+        );
+    }
+    for word in words.into_iter().chain([&b"robot.identity"[..], b"\"desk\""]) {
+        assert!(!holds(lab.pid(Site::Cloud), word), "the router holds {:?}", String::from_utf8_lossy(word));
+    }
+    talker.end();
+    listener.end();
+}
+
+/// True if the writable memory of a process holds these bytes.
+fn holds(pid: u32, word: &[u8]) -> bool {
+    use std::os::unix::fs::FileExt;
+    let memory = fs::File::open(format!("/proc/{pid}/mem")).expect("root may read its processes' memory");
+    let maps = fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
+    maps.lines().filter(|l| l.split_whitespace().nth(1).is_some_and(|p| p.starts_with("rw"))).any(|line| {
+        let (start, end) = line.split_whitespace().next().unwrap().split_once('-').unwrap();
+        let (start, end) = (u64::from_str_radix(start, 16).unwrap(), u64::from_str_radix(end, 16).unwrap());
+        let mut bytes = vec![0; (end - start) as usize];
+        let read = memory.read_at(&mut bytes, start).unwrap_or(0);
+        bytes.truncate(read);
+        bytes.windows(word.len()).any(|w| w == word)
+    })
+}
