@@ -29,6 +29,8 @@ use crate::links::{keep_accepting, keep_dialled};
 
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
+/// From how long before its certificate's end a node warns of it.
+const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 86_400);
 /// How long peers may take to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
@@ -169,6 +171,14 @@ pub async fn run(
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
     let identity = Arc::new(check_identity(&config)?);
+    let left = Duration::from_millis(identity.not_after().0.saturating_sub(now().unix.0));
+    if left < EXPIRY_WARNING {
+        warn!(
+            "this node's certificate ends in {} days, at {}: enroll it again before then, or nobody will let it in",
+            left.as_secs() / 86_400,
+            identity.not_after()
+        );
+    }
     let network = match &config.ros {
         Some(ros) => Some(Arc::new(CycloneNetwork::open(&dds_config(ros, &identity))?)),
         None => None,
