@@ -4,7 +4,8 @@
 //! the links: while a reliable one is full, that thread waits, and with it that topic alone.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::Ordering::{Relaxed, SeqCst};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use arc_swap::ArcSwap;
@@ -65,6 +66,8 @@ pub(crate) struct LocalShare {
     /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before it
     /// tells who wrote it.
     early: Mutex<VecDeque<Sample>>,
+    /// How many those are, to be seen without the lock, which a publisher holds while it is pushed back.
+    waiting: AtomicUsize,
     closed: AtomicBool,
     published: AtomicU64,
 }
@@ -84,6 +87,7 @@ impl LocalShare {
             alive,
             map: ArcSwap::default(),
             early: Mutex::default(),
+            waiting: AtomicUsize::new(0),
             closed: AtomicBool::new(false),
             published: AtomicU64::new(0),
         }
@@ -99,12 +103,20 @@ impl LocalShare {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::Stale);
             }
             early.push_back(sample);
+            self.waiting.store(early.len(), SeqCst);
+            // Its source may have come between the two looks; whoever puts a map in place after this one sees that
+            // something waits.
+            self.publish_early(&mut early);
         }
     }
 
     /// Puts new sources in place, and publishes what waited for them.
     pub(crate) fn set_map(self: &Arc<Self>, map: SourceMap) {
         self.map.store(Arc::new(map));
+        fence(SeqCst);
+        if self.waiting.load(SeqCst) == 0 {
+            return;
+        }
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
@@ -115,9 +127,14 @@ impl LocalShare {
 
     /// Publishes, in their order, the samples whose writers have a source by now.
     fn publish_early(&self, early: &mut VecDeque<Sample>) {
+        if early.is_empty() {
+            return;
+        }
+        fence(SeqCst);
         for sample in std::mem::take(early) {
             early.extend(self.try_publish(sample).err());
         }
+        self.waiting.store(early.len(), SeqCst);
     }
 
     /// Publishes a sample, or gives it back if its writer's source is not known yet.
