@@ -502,8 +502,12 @@ impl Endpoint {
         let join = match verify_join(self.config.identity.anchors(), signed, self.now.unix) {
             Ok(join) => join,
             Err(why) => {
-                // Answered as well as can be: the body may at least say whom to answer.
-                if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body) {
+                // Answered as well as can be: the body may at least say whom to answer. Only for a name of ours, or
+                // anybody could have anything signed.
+                if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body)
+                    && (self.shares.shares.contains_key(&name)
+                        || self.catalogue_name.is_some_and(|(n, _)| n == name))
+                {
                     self.refuse(name, sink, 1, RefuseReason::NotVerified);
                 }
                 self.outputs.push_back(Output::Dropped(Dropped::NotVerified { what: "join", why }));
@@ -536,8 +540,10 @@ impl Endpoint {
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         let content = GrantContent::Topic(share.grant.clone());
         let reply_key = granted.reply_key.clone();
-        share.sinks.insert(sink, GrantedSink { serial: 1, ..granted });
-        if self.grant(name, sink, 1, &reply_key, &content) {
+        // A request may come twice, on another way or replayed: its answers keep growing numbers.
+        let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
+        share.sinks.insert(sink, GrantedSink { serial, ..granted });
+        if self.grant(name, sink, serial, &reply_key, &content) {
             self.outputs.push_back(Output::Event(Event::SinkJoined { name, sink, peer }));
         } else if let Some(share) = self.shares.shares.get_mut(&name) {
             share.sinks.remove(&sink);
@@ -558,7 +564,8 @@ impl Endpoint {
         match refused {
             Some(reason) => self.refuse(name, sink, 1, reason),
             None => {
-                self.shares.followers.insert(sink, granted);
+                let serial = self.shares.followers.get(&sink).map_or(0, |f| f.serial);
+                self.shares.followers.insert(sink, GrantedSink { serial, ..granted });
                 self.tell_follower(sink);
             }
         }

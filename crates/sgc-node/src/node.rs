@@ -345,7 +345,8 @@ fn share_rule(share: &ShareConfig, identity: &Identity) -> ShareRule {
             Recipient::Everyone => policy.fleet = Some(identity.as_peer().ca),
             Recipient::Node(node) => policy.nodes.extend(identity.node_id_of(node.as_str())),
             Recipient::Group(group) => {
-                policy.groups.extend(identity.fleet_secret().map(|s| s.group_tag(group.as_str())));
+                let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
+                policy.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
             }
         }
     }

@@ -5,10 +5,10 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
-use sgc_wire::{Name, Packet};
+use sgc_wire::{Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
 
@@ -16,17 +16,19 @@ use crate::queue::{PushError, Queue};
 use crate::stats::DataDrop;
 
 /// Packets that may wait for one link under one name.
-pub(crate) const OUTFLOW_PACKETS_MAX: usize = 4096;
+pub(crate) const OUTFLOW_PACKETS_MAX: usize = 1024;
 /// Bytes of reliable packets that may wait before the source is pushed back.
 pub(crate) const OUTFLOW_RELIABLE_BYTES_MAX: usize = 4 << 20;
 /// How long a reliable source is pushed back by a link that takes nothing at all.
 pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
 /// Bytes of best-effort packets that may wait; of larger messages only what fits is kept, and they are lost.
-pub(crate) const OUTFLOW_BYTES_MAX: usize = 32 << 20;
+pub(crate) const OUTFLOW_BYTES_MAX: usize = 16 << 20;
+/// How long a best-effort packet may wait; then it is worth nothing.
+pub(crate) const OUTFLOW_AGE_MAX: Duration = Duration::from_secs(1);
 
 /// The queue's end that the data path sees.
 pub(crate) struct OutFlow {
-    queue: Queue<Packet>,
+    queue: Queue<(Packet, Instant)>,
     /// Complete best-effort messages of several packets in the queue.
     complete: AtomicUsize,
     ended: watch::Sender<bool>,
@@ -43,8 +45,11 @@ impl OutFlow {
         let task = flow.clone();
         tokio::spawn(async move {
             let mut sender = Sender { link, reliable: None, message: None };
-            while let Some(packet) = task.queue.pop().await {
-                if task.is_superseded(&packet) {
+            while let Some((packet, since)) = task.queue.pop().await {
+                // Judged by its beginning: a large message that is under way goes on.
+                let begins = !packet.header.reliable && packet.header.index == 0;
+                let stale = begins && since.elapsed() > OUTFLOW_AGE_MAX;
+                if task.is_superseded(&packet) || stale {
                     sender.abandon(&packet);
                     continue;
                 }
@@ -64,7 +69,11 @@ impl OutFlow {
     pub(crate) async fn push(&self, packet: Packet) -> Option<(DataDrop, u64)> {
         let bytes = packet.encoded_bytes();
         if packet.header.reliable {
-            return match self.queue.push(packet, bytes, OUTFLOW_RELIABLE_BYTES_MAX, OUTFLOW_PATIENCE).await {
+            return match self
+                .queue
+                .push((packet, Instant::now()), bytes, OUTFLOW_RELIABLE_BYTES_MAX, OUTFLOW_PATIENCE)
+                .await
+            {
                 Ok(()) => None,
                 Err(PushError::Stalled) => Some((DataDrop::Stalled, 1)),
                 Err(PushError::Closed) => Some((DataDrop::LinkClosed, 1)),
@@ -77,7 +86,7 @@ impl OutFlow {
             self.complete.fetch_add(1, Ordering::AcqRel);
         }
         let mut evicted = 0;
-        self.queue.push_evicting(packet, bytes, OUTFLOW_BYTES_MAX, |old| {
+        self.queue.push_evicting((packet, Instant::now()), bytes, OUTFLOW_BYTES_MAX, |(old, _)| {
             evicted += 1;
             if ends_large_message(&old) {
                 self.complete.fetch_sub(1, Ordering::AcqRel);
@@ -119,8 +128,8 @@ fn ends_large_message(packet: &Packet) -> bool {
 struct Sender {
     link: AnyLink,
     reliable: Option<FlowTx>,
-    /// The best-effort message in several packets that is being sent: its number, the next index, its flow.
-    message: Option<(u64, u16, FlowTx)>,
+    /// The best-effort message in several packets that is being sent: source and number, the next index, its flow.
+    message: Option<((SourceId, u64), u16, FlowTx)>,
 }
 
 impl Sender {
@@ -156,14 +165,14 @@ impl Sender {
             if let Some((.., old)) = self.message.take() {
                 old.reset(FlowEnd::Stale);
             }
-            self.message = Some((header.seq, 0, self.link.open_flow(header.class).await?));
+            self.message = Some(((header.source, header.seq), 0, self.link.open_flow(header.class).await?));
         }
         match self.message.take() {
-            Some((seq, next, mut flow)) if (seq, next) == (header.seq, header.index) => {
+            Some((id, next, mut flow)) if (id, next) == ((header.source, header.seq), header.index) => {
                 match flow.send(&packet).await {
                     Ok(()) if header.is_last() => flow.finish().await,
                     Ok(()) => {
-                        self.message = Some((seq, next + 1, flow));
+                        self.message = Some((id, next + 1, flow));
                         Ok(())
                     }
                     Err(LinkError::FlowStopped(_)) => Ok(()),
@@ -180,13 +189,19 @@ impl Sender {
 
     async fn send_alone(&mut self, packet: &Packet) -> Result<(), LinkError> {
         let mut flow = self.link.open_flow(packet.header.class).await?;
-        flow.send(packet).await?;
-        flow.finish().await
+        match flow.send(packet).await {
+            Ok(()) => flow.finish().await,
+            // The far side gave up this flow, not the link.
+            Err(LinkError::FlowStopped(_)) => Ok(()),
+            Err(error) => Err(error),
+        }
     }
 
     /// A message that is not to be sent: its packets find no flow and go nowhere.
     fn abandon(&mut self, packet: &Packet) {
-        if let Some((.., old)) = self.message.take_if(|(seq, ..)| *seq == packet.header.seq) {
+        if let Some((.., old)) =
+            self.message.take_if(|(id, ..)| *id == (packet.header.source, packet.header.seq))
+        {
             old.reset(FlowEnd::Stale);
         }
     }

@@ -30,6 +30,8 @@ pub const SINKLESS_HOLD: Duration = Duration::from_secs(10);
 /// How long a local writer outlives the way to its owner, so that a restarted router does not make the far
 /// network vanish from the local graph.
 pub const UNREACHABLE_HOLD: Duration = Duration::from_secs(10);
+/// Interfaces of an owner that may answer to one rule: types and metadata of one topic.
+const ENTRIES_PER_RULE_MAX: usize = 8;
 /// Local endpoints remembered.
 const LOCAL_ENDPOINTS_MAX: usize = 65_536;
 /// Problems remembered so that each is told once.
@@ -202,6 +204,16 @@ pub enum Problem {
         /// What is offered.
         offered: String,
     },
+    /// An owner shares one topic in more forms than are brought here.
+    #[error(
+        "{topic}: {owner} shares it in more than {ENTRIES_PER_RULE_MAX} forms; the rest is not brought here"
+    )]
+    TooManyEntries {
+        /// Topic.
+        topic: String,
+        /// Owner.
+        owner: String,
+    },
     /// More local endpoints than are looked at.
     #[error(
         "the local network has more than {LOCAL_ENDPOINTS_MAX} endpoints; those beyond are not looked at"
@@ -346,6 +358,13 @@ impl<R: RngCore> Routes<R> {
         for entry in catalogue.entries {
             let Some(rule) = self.rule_for(owner, &entry) else { continue };
             let name = derive_name(&self.secret, &owner, &entry.metadata);
+            let here = self.uses.iter().filter(|(n, u)| u.rule == rule && **n != name).count();
+            if here >= ENTRIES_PER_RULE_MAX {
+                let topic = self.use_rules[rule].topic.clone();
+                let owner = self.use_rules[rule].owner_name.clone();
+                self.report(Problem::TooManyEntries { topic, owner });
+                continue;
+            }
             listed.insert(name);
             self.entry_there(name, rule, entry);
         }

@@ -247,6 +247,9 @@ pub struct Router {
     memories: BTreeSet<(Instant, Name)>,
     expiries: BTreeSet<(Instant, Name, LinkId)>,
     pending: BTreeSet<(Instant, Name, SinkId)>,
+    /// Names that neighbours are to be told are out of reach, gathered into few frames; always sent before any other
+    /// frame to the same neighbour.
+    unreached: BTreeMap<LinkId, Vec<Name>>,
     outputs: VecDeque<Output>,
 }
 
@@ -264,6 +267,7 @@ impl Router {
             memories: BTreeSet::new(),
             expiries: BTreeSet::new(),
             pending: BTreeSet::new(),
+            unreached: BTreeMap::new(),
             outputs: VecDeque::new(),
         }
     }
@@ -344,6 +348,11 @@ impl Router {
 
     /// The next thing to do; call until it is [`Output::Timeout`].
     pub fn poll_output(&mut self) -> Output {
+        if self.outputs.is_empty() {
+            while let Some(link) = self.unreached.keys().next().copied() {
+                self.flush_unreached(link);
+            }
+        }
         self.outputs.pop_front().unwrap_or_else(|| {
             let expiry = self.expiries.first().map(|(at, ..)| *at);
             let pending = self.pending.first().map(|(at, ..)| *at);
@@ -561,6 +570,8 @@ impl Router {
     }
 
     fn handle_interest(&mut self, link: LinkId, names: &[Name]) {
+        // One advertisement speaks for many names; it is sent once.
+        let mut sent = BTreeSet::new();
         for name in names {
             let Some(state) = self.links.get_mut(&link) else { return };
             if state.interests.len() >= self.config.limits.interests_per_link_max {
@@ -572,7 +583,8 @@ impl Router {
             let entry = self.names.entry(*name).or_default();
             entry.interested.insert(link);
             let known = entry.route().cloned();
-            if let Some(route) = known.filter(|r| self.may_tell(r, link)) {
+            let told = known.filter(|r| self.may_tell(r, link));
+            if let Some(route) = told.filter(|r| sent.insert(Arc::as_ptr(&r.advert))) {
                 for frame in self.route_frames(&route) {
                     self.send(link, frame);
                 }
@@ -784,7 +796,20 @@ impl Router {
             .map(|(l, _)| *l)
             .collect();
         for link in targets {
-            self.send(link, Control::Unreach { names: vec![name] });
+            let names = self.unreached.entry(link).or_default();
+            names.push(name);
+            if names.len() >= NAMES_PER_FRAME_MAX {
+                self.flush_unreached(link);
+            }
+        }
+    }
+
+    /// Sends what [`Self::tell_unreach`] gathered for a link.
+    fn flush_unreached(&mut self, link: LinkId) {
+        if let Some(names) = self.unreached.remove(&link)
+            && self.links.contains_key(&link)
+        {
+            self.outputs.push_back(Output::Send { link, frame: Control::Unreach { names } });
         }
     }
 
@@ -800,26 +825,30 @@ impl Router {
     /// of them must be true, or routes could go in a circle: so they take the same route, unless they are told
     /// better already.
     fn tell(&mut self, route: &Route, names: &[Name]) {
-        let (link, seq) = (route.link, route.advert.seq);
-        let tells_all = link == LinkId::LOCAL || self.config.transit;
-        for name in route.advert.names.iter().copied().filter(|_| tells_all) {
-            if !self.names.get_mut(&name).is_some_and(|s| s.promise(seq, route.distance())) {
-                continue;
-            }
-            match self.reselect(name, Some(link)) {
-                Selection::Same => {}
-                Selection::Lost => self.tell_unreach(name),
-                Selection::Moved => {
-                    let state = self.names.get_mut(&name);
-                    if state.is_some_and(NameState::take_news)
-                        && self.route(&name).is_some_and(|(up, _)| up != link)
-                    {
-                        self.tell_route(name);
+        // Names that had to move to yet another link, whose advertisements speak for further names in turn: a
+        // list and not a recursion, since a peer decides how long the chain gets.
+        let mut todo = vec![(route.clone(), names.to_vec())];
+        while let Some((route, names)) = todo.pop() {
+            let (link, seq) = (route.link, route.advert.seq);
+            let tells_all = link == LinkId::LOCAL || self.config.transit;
+            for name in route.advert.names.iter().copied().filter(|_| tells_all) {
+                if !self.names.get_mut(&name).is_some_and(|s| s.promise(seq, route.distance())) {
+                    continue;
+                }
+                match self.reselect(name, Some(link)) {
+                    Selection::Same => {}
+                    Selection::Lost => self.tell_unreach(name),
+                    Selection::Moved => {
+                        let Some(state) = self.names.get_mut(&name) else { continue };
+                        let news = state.take_news();
+                        if let Some(other) = state.route().filter(|r| news && r.link != link) {
+                            todo.push((other.clone(), vec![name]));
+                        }
                     }
                 }
             }
+            self.flood(link, &names, &self.route_frames(&route));
         }
-        self.flood(link, names, &self.route_frames(route));
     }
 
     /// The frames that tell a route: its advertisement, and which of its names are out of reach from here by now.
@@ -944,6 +973,7 @@ impl Router {
     }
 
     fn send(&mut self, link: LinkId, frame: Control) {
+        self.flush_unreached(link);
         if self.links.contains_key(&link) {
             self.outputs.push_back(Output::Send { link, frame });
         }

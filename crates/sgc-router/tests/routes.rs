@@ -280,3 +280,61 @@ fn a_newer_run_supersedes_and_an_older_one_that_greets_late_does_not() {
     bench.frame(12, hello(3));
     assert_eq!(bench.route(&A), None, "what the old run said is void");
 }
+
+fn numbered(n: usize) -> Blind {
+    let mut blind = [0; 32];
+    blind[..8].copy_from_slice(&(n as u64).to_be_bytes());
+    Blind(blind)
+}
+
+impl Bench {
+    fn advert_many(&mut self, link: u32, blinds: &[Blind]) {
+        blinds.chunks(256).for_each(|some| self.advert(link, 1, 1, some));
+    }
+}
+
+#[test]
+fn a_chain_of_names_that_push_each_other_to_other_ways_needs_no_stack() {
+    const LENGTH: usize = 1500;
+    let run = || {
+        let mut b = Bench::new(Limits::default());
+        b.advert_many(1, &(0..=LENGTH).map(numbered).collect::<Vec<_>>());
+        for n in 0..LENGTH {
+            let link = 2 + (n as u32 % 2);
+            b.advert(link, 10, 2 + n as u64, &[numbered(n), numbered(n + 1)]);
+            let next = name_of(&b.owner.node_id(), &numbered(n + 1));
+            b.frame(link, Control::Unreach { names: vec![next] });
+        }
+        let first = name_of(&b.owner.node_id(), &numbered(0));
+        b.frame(1, Control::Unreach { names: vec![first] });
+    };
+    let small = std::thread::Builder::new().stack_size(256 << 10);
+    small.spawn(run).unwrap().join().unwrap();
+}
+
+#[test]
+fn the_loss_of_a_link_with_many_names_is_told_in_few_frames() {
+    let mut b = Bench::new(Limits::default());
+    b.advert_many(1, &(0..5000).map(numbered).collect::<Vec<_>>());
+    b.link_down(1);
+    let told = |link| {
+        let names = b.sent.iter().filter(|(l, _)| *l == LinkId(link)).map(|(_, frame)| match frame {
+            Control::Unreach { names } => names.len(),
+            other => panic!("{other:?}"),
+        });
+        names.collect::<Vec<_>>()
+    };
+    assert_eq!((told(2), told(3)), (vec![4096, 904], vec![4096, 904]));
+}
+
+#[test]
+fn one_advertisement_answers_an_interest_in_all_its_names() {
+    let mut b = Bench::new(Limits::default());
+    let blinds: Vec<_> = (0..256).map(numbered).collect();
+    b.advert_many(1, &blinds);
+    b.router.handle_link_up(LinkId(4), NodeId([4; 32]));
+    b.frame(4, Control::Hello(Hello { minor: 0, incarnation: 4, transit: false }));
+    let names = blinds.iter().map(|blind| name_of(&b.owner.node_id(), blind)).collect();
+    b.frame(4, Control::Interest { names });
+    assert!(matches!(&b.sent[..], [(LinkId(4), Control::Advert { .. })]), "{} frames", b.sent.len());
+}

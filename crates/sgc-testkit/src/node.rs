@@ -267,7 +267,7 @@ impl Running {
         let policy = Policy {
             fleet: sharing.fleet.then_some(own.ca),
             nodes: sharing.nodes.iter().map(id).collect(),
-            groups: sharing.groups.iter().map(|g| secret.group_tag(g)).collect(),
+            groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
         };
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {

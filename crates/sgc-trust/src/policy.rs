@@ -13,8 +13,8 @@ pub struct Policy {
     pub fleet: Option<CaFingerprint>,
     /// These nodes.
     pub nodes: BTreeSet<NodeId>,
-    /// The members of these groups.
-    pub groups: BTreeSet<GroupTag>,
+    /// The members of these groups, each of the fleet with that CA: another CA may certify the same tag.
+    pub groups: BTreeSet<(CaFingerprint, GroupTag)>,
 }
 
 /// Why a peer is not permitted.
@@ -34,7 +34,7 @@ impl Policy {
         }
         let listed = self.fleet == Some(peer.ca)
             || self.nodes.contains(&peer.node_id)
-            || peer.groups.iter().any(|g| self.groups.contains(g));
+            || peer.groups.iter().any(|g| self.groups.contains(&(peer.ca, *g)));
         if listed { Ok(()) } else { Err(Denied::NotListed) }
     }
 }
