@@ -514,8 +514,8 @@ fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
     mallory.kill().unwrap();
     mallory.wait().unwrap();
     // Random datagrams, some of which look like the beginning of a connection.
-    let (host, port) =
-        url.trim_start_matches("quic://").split_once(':').map(|(h, p)| (h.to_owned(), p.to_owned())).unwrap();
+    let address = lab.cloud_address(Site::Robot);
+    let (host, port) = address.split_once(':').unwrap();
     let script = format!(
         "import os,random,socket\nrandom.seed(7)\ns=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n\
          for n in range(20000):\n b=random.randbytes(random.choice([1,20,60,1200,1400]))\n\
