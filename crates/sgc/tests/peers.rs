@@ -249,10 +249,31 @@ impl Lab {
         Peer { stdin: child.stdin.take(), child, events }
     }
 
+    /// [`Self::try_to_carry`]. Seen once in some eighty runs: the Fast DDS peer counts as intact a message with a number
+    /// that nobody sent and the time zero. Checksum and content depend on both, so nothing on the way can make
+    /// such a message of another; it is said and the run repeated.
+    fn carries(&self, from: &str, to: &str, kind: &str, extra: &[&str], sent: u32, wanted: u32) {
+        for _ in 0..2 {
+            match self.try_to_carry(from, to, kind, extra, sent, wanted) {
+                Ok(()) => return,
+                Err(summary) => say(&format!("THE PEER COUNTS WHAT NOBODY SENT, once more: {summary}")),
+            }
+        }
+        self.try_to_carry(from, to, kind, extra, sent, wanted).unwrap();
+    }
+
     /// A publisher at the robot and a subscriber at the desk, both matched: then `sent` messages, of which all from the
     /// first one heard on must arrive. A reader may be matched a moment before it knows, so that the first few may
     /// be lost without anyone's fault; `wanted` must come.
-    fn carries(&self, from: &str, to: &str, kind: &str, extra: &[&str], sent: u32, wanted: u32) {
+    fn try_to_carry(
+        &self,
+        from: &str,
+        to: &str,
+        kind: &str,
+        extra: &[&str],
+        sent: u32,
+        wanted: u32,
+    ) -> Result<(), Value> {
         let what = format!("{kind} from {from} to {to}");
         let topic = format!("/{kind}");
         let common = ["--type", kind, "--topic", &topic, "--large"];
@@ -271,12 +292,17 @@ impl Lab {
         talker.go();
         let summary = listener.summary();
         let count = |key: &str| summary[key].as_u64().unwrap();
+        if count("altered") == 0 && count("last") >= sent.into() {
+            talker.summary();
+            return Err(summary);
+        }
         assert!(count("received") >= wanted.into(), "{what}: {summary}");
         assert_eq!((count("duplicated"), count("altered")), (0, 0), "{what}: {summary}");
         if !extra.contains(&"--best-effort") {
             assert_eq!(count("lost"), 0, "{what}: {summary}");
         }
         talker.summary();
+        Ok(())
     }
 }
 
