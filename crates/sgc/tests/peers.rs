@@ -249,7 +249,7 @@ impl Lab {
         Peer { stdin: child.stdin.take(), child, events }
     }
 
-    /// [`Self::try_to_carry`]. Seen once in some eighty runs: the Fast DDS peer counts as intact a message with a number
+    /// [`Self::try_to_carry`]. Seen once: the Fast DDS peer counted as intact a message with a number
     /// that nobody sent and the time zero. Checksum and content depend on both, so nothing on the way can make
     /// such a message of another; it is said and the run repeated.
     fn carries(&self, from: &str, to: &str, kind: &str, extra: &[&str], sent: u32, wanted: u32) {
