@@ -13,7 +13,8 @@ use sgc_trust::{
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue,
     CatalogueSource, Control, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos,
-    Recover, RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
+    Recover, RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX, SecretBytes, Signed, SinkId,
+    SourceId, TopicGrant,
 };
 
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
@@ -232,7 +233,13 @@ impl Endpoint {
         }
         let mut key = [0; 32];
         self.rng.fill_bytes(&mut key);
-        let grant = TopicGrant { epoch: 1, suite: spec.suite.id(), key };
+        let grant = TopicGrant {
+            epoch: 1,
+            suite: spec.suite.id(),
+            key: SecretBytes::new(key),
+            sources: Vec::new(),
+            entry: None,
+        };
         self.shares.shares.insert(name, Share { spec, blind, grant, sinks: BTreeMap::new() });
         self.withdrawn.remove(&blind);
         self.unadvertised.insert(blind);
@@ -351,6 +358,8 @@ impl Endpoint {
             Control::Hello(_) => self.unexpected("hello"),
             Control::Interest { .. } | Control::Uninterest { .. } => self.unexpected("interest"),
             Control::Goodbye => self.unexpected("goodbye"),
+            Control::Crl { .. } => self.unexpected("revocation list"),
+            Control::Ack { .. } => self.unexpected("acknowledgement"),
         }
     }
 
@@ -514,7 +523,8 @@ impl Endpoint {
                 return;
             }
         };
-        let JoinBody { name, sink, role, reply_key, .. } = join.body;
+        let JoinBody { name, sink, request, reply_key, .. } = join.body;
+        let role = request.role();
         let granted = GrantedSink { peer: join.peer, reply_key, serial: 0, told: None };
         if self.catalogue_name.is_some_and(|(n, _)| n == name) {
             self.handle_follow(name, sink, role, granted);
@@ -526,10 +536,10 @@ impl Endpoint {
             Some(share) => match share.spec.policy.permits(&granted.peer, role) {
                 Err(Denied::NotListed) => Some(RefuseReason::NotPermitted),
                 Err(Denied::Role) => Some(RefuseReason::RoleNotOffered),
-                Ok(()) if share.sinks.len() >= self.config.limits.sinks_per_name_max => {
+                Ok(_) if share.sinks.len() >= self.config.limits.sinks_per_name_max => {
                     Some(RefuseReason::Limit)
                 }
-                Ok(()) => None,
+                Ok(_) => None,
             },
         };
         if let Some(reason) = refused {
@@ -657,7 +667,7 @@ impl Endpoint {
         let body = JoinBody {
             name,
             sink,
-            role: Role::Subscribe,
+            request: Request::Subscribe { describe: false },
             issued_at: self.now.unix,
             chain: self.config.identity.chain_bytes(),
             reply_key,

@@ -76,6 +76,10 @@ impl Share {
     fn entry(&self) -> CatalogueEntry {
         CatalogueEntry {
             metadata: self.spec.metadata.clone(),
+            blind: self.blind,
+            subscribe: true,
+            publish: false,
+            suite: self.grant.suite,
             keyless: self.spec.keyless,
             type_hash: self.spec.type_hash.clone(),
             qos: self.spec.qos.clone(),

@@ -354,7 +354,7 @@ impl Partial {
 #[cfg(test)]
 mod tests {
     use sgc_trust::Suite;
-    use sgc_wire::{Class, SinkId};
+    use sgc_wire::{Class, SecretBytes, SinkId};
 
     use super::*;
     use crate::{FRAGMENT_BYTES, PublishError, Source, SourceConfig};
@@ -363,7 +363,13 @@ mod tests {
     const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
 
     fn grant(key: u8) -> TopicGrant {
-        TopicGrant { epoch: 1, suite: Suite::Group.id(), key: [key; 32] }
+        TopicGrant {
+            epoch: 1,
+            suite: Suite::Group.id(),
+            key: SecretBytes::new([key; 32]),
+            sources: Vec::new(),
+            entry: None,
+        }
     }
 
     fn source(history_depth: usize) -> Source {

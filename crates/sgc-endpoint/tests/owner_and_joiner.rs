@@ -8,10 +8,10 @@ use sgc_endpoint::{
     Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason, Output, ShareError, ShareSpec,
 };
 use sgc_testkit::{Clock, Member, identity};
-use sgc_trust::{Identity, Policy, ReplyKey, Suite, seal_grant};
+use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody,
-    Metadata, Name, Qos, RefuseReason, Role, SinkId, TopicGrant,
+    Metadata, Name, Qos, RefuseReason, Request, SecretBytes, SinkId, TopicGrant,
 };
 
 /// An endpoint and what came out of it since it was last asked.
@@ -73,7 +73,10 @@ impl Bench {
     }
 
     fn share_with_fleet(&mut self, topic: &str) -> Name {
-        let policy = Policy { fleet: Some(self.identity.as_peer().ca), ..Policy::default() };
+        let policy = Policy {
+            subscribe: Grantees { fleets: [self.identity.as_peer().ca].into(), ..Grantees::default() },
+            ..Policy::default()
+        };
         self.share(topic, policy).expect("within the bounds")
     }
 
@@ -114,7 +117,7 @@ fn join(bench: &Bench, who: &Identity, name: Name, sink: u8) -> (Control, ReplyK
     let body = JoinBody {
         name,
         sink: SinkId([sink; 16]),
-        role: Role::Subscribe,
+        request: Request::Subscribe { describe: false },
         issued_at: bench.clock.now().unix,
         chain: who.chain_bytes(),
         reply_key: reply_key.public().clone(),
@@ -142,7 +145,7 @@ fn an_unusable_reply_key_is_refused_and_no_sink_is_kept() {
     let body = JoinBody {
         name,
         sink: SinkId([1; 16]),
-        role: Role::Subscribe,
+        request: Request::Subscribe { describe: false },
         issued_at: bench.clock.now().unix,
         chain: desk.chain_bytes(),
         reply_key: (&b"no key"[..]).into(),
@@ -265,7 +268,13 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
 }
 
 fn grant(owner: &Identity, name: Name, sink: SinkId, reply_key: &[u8], serial: u64, key: u8) -> Control {
-    let content = GrantContent::Topic(TopicGrant { epoch: serial as u32, suite: 1, key: [key; 32] });
+    let content = GrantContent::Topic(TopicGrant {
+        epoch: serial as u32,
+        suite: 1,
+        key: SecretBytes::new([key; 32]),
+        sources: Vec::new(),
+        entry: None,
+    });
     let (enc, sealed) = seal_grant(reply_key, &name, &sink, serial, &content).expect("a usable reply key");
     let body = AnswerBody { name, sink, serial, answer: Answer::Grant { enc, sealed } };
     Control::Answer { signed: owner.sign_answer(&body) }

@@ -342,11 +342,13 @@ fn share_rule(share: &ShareConfig, identity: &Identity) -> ShareRule {
     let mut policy = Policy::default();
     for recipient in &share.to {
         match recipient {
-            Recipient::Everyone => policy.fleet = Some(identity.as_peer().ca),
-            Recipient::Node(node) => policy.nodes.extend(identity.node_id_of(node.as_str())),
+            Recipient::Everyone => {
+                policy.subscribe.fleets.insert(identity.as_peer().ca);
+            }
+            Recipient::Node(node) => policy.subscribe.nodes.extend(identity.node_id_of(node.as_str())),
             Recipient::Group(group) => {
                 let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
-                policy.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
+                policy.subscribe.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
             }
         }
     }

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use rand_core::RngCore;
 use sgc_endpoint::{LostReason, RefusedBy, ShareSpec};
-use sgc_trust::{FleetSecret, Policy, Suite, derive_name};
+use sgc_trust::{FleetSecret, Policy, Suite, derive_name, name_of};
 use sgc_wire::{
     Catalogue, CatalogueEntry, CatalogueSource, Class, ENTRY_SOURCES_MAX, Kind, Metadata, Name, NodeId, Qos,
     SinkId, SourceId,
@@ -357,7 +357,7 @@ impl<R: RngCore> Routes<R> {
         let mut listed = BTreeSet::new();
         for entry in catalogue.entries {
             let Some(rule) = self.rule_for(owner, &entry) else { continue };
-            let name = derive_name(&self.secret, &owner, &entry.metadata);
+            let name = name_of(&owner, &entry.blind);
             let here = self.uses.iter().filter(|(n, u)| u.rule == rule && **n != name).count();
             if here >= ENTRIES_PER_RULE_MAX {
                 let topic = self.use_rules[rule].topic.clone();

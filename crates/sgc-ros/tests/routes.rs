@@ -11,7 +11,7 @@ use sgc_ros::{
     Command, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes, SINKLESS_HOLD,
     ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
-use sgc_trust::{FleetSecret, Policy, Suite, derive_name};
+use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
     Catalogue, CatalogueEntry, CatalogueSource, Class, Durability, History, Metadata, Name, NodeId, Qos,
     RefuseReason, Reliability, SinkId, SourceId,
@@ -79,6 +79,10 @@ fn entry(topic: &str, type_name: &str, qos: Qos, sources: &[u8]) -> CatalogueEnt
     let source = |n: &u8| CatalogueSource { source: SourceId([*n; 16]), qos: qos.clone() };
     CatalogueEntry {
         metadata: Metadata::topic("owner", topic, type_name),
+        blind: TopicSecret::derive(&secret(), &Metadata::topic("owner", topic, type_name)).blind(),
+        subscribe: true,
+        publish: false,
+        suite: 1,
         keyless: true,
         type_hash: None,
         class: Class::Default,

@@ -312,6 +312,8 @@ impl Router {
             Control::Answer { signed } => self.handle_answer(link, signed),
             Control::Reject { name, sink, reason } => self.handle_reject(link, name, sink, reason),
             Control::Recover(recover) => self.handle_recover(link, recover),
+            Control::Crl { .. } => self.drop_frame(link, DropReason::Unknown { what: "revocation list" }),
+            Control::Ack { .. } => self.drop_frame(link, DropReason::Unknown { what: "acknowledgement" }),
             Control::Goodbye => {
                 self.outputs.push_back(Output::Close { link, reason: LinkClose::Goodbye });
                 self.forget_link(link);
@@ -660,7 +662,8 @@ impl Router {
         }
         let deadline = now.instant + limits.answer_wait;
         self.remove_branch(name, sink);
-        let branch = Branch { link, peer: join.peer.node_id, role: join.body.role, pending: Some(deadline) };
+        let branch =
+            Branch { link, peer: join.peer.node_id, role: join.body.request.role(), pending: Some(deadline) };
         self.put_branch(name, sink, branch);
         self.send(up, Control::Join { signed });
     }

@@ -15,7 +15,7 @@ use sgc_endpoint::{
     SourceConfig,
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, Router, RouterConfig};
-use sgc_trust::{Identity, Policy, Suite, derive_name};
+use sgc_trust::{Grantees, Identity, Policy, Suite, derive_name};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
@@ -265,9 +265,12 @@ impl Running {
             directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
         };
         let policy = Policy {
-            fleet: sharing.fleet.then_some(own.ca),
-            nodes: sharing.nodes.iter().map(id).collect(),
-            groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
+            subscribe: Grantees {
+                fleets: sharing.fleet.then_some(own.ca).into_iter().collect(),
+                nodes: sharing.nodes.iter().map(id).collect(),
+                groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
+            },
+            ..Policy::default()
         };
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {

@@ -8,7 +8,7 @@ use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, ide
 use sgc_trust::Identity;
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
-    RejectReason, Role, Signed, SinkId, SourceId,
+    RejectReason, Request, Role, Signed, SinkId, SourceId, SourceOffer,
 };
 
 const fn ms(n: u64) -> Duration {
@@ -221,7 +221,12 @@ fn join(identity: &Identity, world: &World, owner: NodeKey, sink: SinkId, role: 
     let body = JoinBody {
         name: world.name(owner, "/chatter"),
         sink,
-        role,
+        request: match role {
+            Role::Subscribe => Request::Subscribe { describe: false },
+            Role::Publish => {
+                Request::Publish { offer: SourceOffer { source: SourceId([9; 16]), key: Bytes::new() } }
+            }
+        },
         issued_at: world.now().unix,
         chain: identity.chain_bytes(),
         reply_key: sgc_trust::ReplyKey::generate().public().clone(),

@@ -87,14 +87,20 @@ fn info(name: &Name, sink: &SinkId) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::TopicGrant;
+    use sgc_wire::{SecretBytes, TopicGrant};
 
     use super::*;
 
     #[test]
     fn only_the_request_that_asked_opens_the_grant() {
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
-        let content = GrantContent::Topic(TopicGrant { epoch: 1, suite: 1, key: [9; 32] });
+        let content = GrantContent::Topic(TopicGrant {
+            epoch: 1,
+            suite: 1,
+            key: SecretBytes::new([9; 32]),
+            sources: Vec::new(),
+            entry: None,
+        });
         let asked = ReplyKey::generate();
         let (enc, sealed) = seal_grant(asked.public(), &name, &sink, 4, &content).unwrap();
         assert_eq!(asked.open(&name, &sink, 4, &enc, &sealed), Ok(content.clone()));

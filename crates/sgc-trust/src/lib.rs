@@ -27,13 +27,13 @@ pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use names::{TopicSecret, derive_name, name_of};
 pub use pem::PemError;
-pub use policy::{Denied, Policy};
+pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
 pub use seal::{OpenError, SourceKey, Suite, TAG_BYTES, opened_bytes};
 pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, verify_advert, verify_answer, verify_join,
 };
 pub use verify::{
-    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, GROUPS_MAX, SignatureError, TrustAnchors,
+    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, SignatureError, TrustAnchors,
     VerifiedPeer, node_id,
 };

@@ -1,4 +1,4 @@
-//! Who may join a share: closed unless it says otherwise.
+//! Who may join a share, and as what: closed unless it says otherwise.
 
 use std::collections::BTreeSet;
 
@@ -6,35 +6,72 @@ use sgc_wire::{GroupTag, NodeId, Role};
 
 use crate::{CaFingerprint, VerifiedPeer};
 
-/// Who may join one share, and as what.
+/// A set of peers, by what their certificates prove.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Policy {
-    /// Every member of the fleet with this CA.
-    pub fleet: Option<CaFingerprint>,
+pub struct Grantees {
+    /// Every node of the fleets with these CAs.
+    pub fleets: BTreeSet<CaFingerprint>,
     /// These nodes.
     pub nodes: BTreeSet<NodeId>,
     /// The members of these groups, each of the fleet with that CA: another CA may certify the same tag.
     pub groups: BTreeSet<(CaFingerprint, GroupTag)>,
 }
 
-/// Why a peer is not permitted.
+/// Why a peer is in a set of grantees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Listed {
+    /// It is named itself.
+    Node,
+    /// A group of it is named.
+    Group(GroupTag),
+    /// Its whole fleet is named.
+    Fleet,
+}
+
+impl Grantees {
+    /// How `peer` is among them, if it is.
+    pub fn find(&self, peer: &VerifiedPeer) -> Option<Listed> {
+        if self.nodes.contains(&peer.node_id) {
+            return Some(Listed::Node);
+        }
+        let group = peer.groups.iter().find(|g| self.groups.contains(&(peer.ca, **g)));
+        group.map(|g| Listed::Group(*g)).or(self.fleets.contains(&peer.ca).then_some(Listed::Fleet))
+    }
+
+    /// True if nobody is.
+    pub fn is_empty(&self) -> bool {
+        self.fleets.is_empty() && self.nodes.is_empty() && self.groups.is_empty()
+    }
+}
+
+/// Who may join one share.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Policy {
+    /// Who may receive what is published.
+    pub subscribe: Grantees,
+    /// Who may publish, besides the owner.
+    pub publish: Grantees,
+}
+
+/// Why a peer is not permitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Denied {
-    /// Neither it nor a group of it is named.
+    /// Neither it, nor a group of it, nor its fleet is named.
+    #[error("neither the node, nor a group that its certificate puts it into, nor its fleet is named")]
     NotListed,
-    /// The share does not offer that role.
+    /// The share offers that role to nobody.
+    #[error("nobody is named for that role")]
     Role,
 }
 
 impl Policy {
-    /// Whether `peer` may join as `role`.
-    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<(), Denied> {
-        if role != Role::Subscribe {
-            return Err(Denied::Role);
-        }
-        let listed = self.fleet == Some(peer.ca)
-            || self.nodes.contains(&peer.node_id)
-            || peer.groups.iter().any(|g| self.groups.contains(&(peer.ca, *g)));
-        if listed { Ok(()) } else { Err(Denied::NotListed) }
+    /// Whether `peer` may join as `role`, and because of what.
+    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<Listed, Denied> {
+        let grantees = match role {
+            Role::Subscribe => &self.subscribe,
+            Role::Publish if self.publish.is_empty() => return Err(Denied::Role),
+            Role::Publish => &self.publish,
+        };
+        grantees.find(peer).ok_or(Denied::NotListed)
     }
 }

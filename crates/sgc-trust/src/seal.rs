@@ -69,7 +69,7 @@ impl SourceKey {
         let suite = Suite::from_id(grant.suite)?;
         let mut bytes = Zeroizing::new([0; 32]);
         hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc source v1")
-            .extract(&grant.key)
+            .extract(grant.key.expose())
             .expand(
                 &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes()],
                 hkdf::HKDF_SHA256,
@@ -144,12 +144,18 @@ fn nonce(header: &PacketHeader) -> Nonce {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::{Class, MessageKind};
+    use sgc_wire::{Class, MessageKind, SecretBytes};
 
     use super::*;
 
     fn grant() -> TopicGrant {
-        TopicGrant { epoch: 1, suite: Suite::Group.id(), key: [7; 32] }
+        TopicGrant {
+            epoch: 1,
+            suite: Suite::Group.id(),
+            key: SecretBytes::new([7; 32]),
+            sources: Vec::new(),
+            entry: None,
+        }
     }
 
     fn key(source: u8) -> SourceKey {

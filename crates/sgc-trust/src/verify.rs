@@ -21,6 +21,8 @@ pub const ANCHORS_MAX: usize = 64;
 
 pub(crate) const NODE_URI: &str = "sgc:node:";
 pub(crate) const GROUP_URI: &str = "sgc:group:";
+/// In certificates of nodes that may carry others' names.
+pub(crate) const ROUTER_URI: &str = "sgc:role:router";
 
 /// What certificates may be signed with.
 const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
@@ -168,6 +170,23 @@ impl fmt::Debug for CaFingerprint {
     }
 }
 
+/// One certificate: its CA and the serial number that the CA gave it. What revocation lists name.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct CertId {
+    /// The CA.
+    pub ca: CaFingerprint,
+    /// The serial number, big-endian, without leading zeros (RFC 5280, 4.1.2.2).
+    pub serial: Arc<[u8]>,
+}
+
+impl fmt::Debug for CertId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "CertId({:?}, ", self.ca)?;
+        self.serial.iter().take(4).try_for_each(|byte| write!(f, "{byte:02x}"))?;
+        f.write_str(")")
+    }
+}
+
 /// Who a verified certificate chain speaks for. Cloning shares.
 #[derive(Clone, Debug)]
 pub struct VerifiedPeer {
@@ -183,6 +202,10 @@ pub struct VerifiedPeer {
     pub not_after: UnixMillis,
     /// The CA that vouches for it.
     pub ca: CaFingerprint,
+    /// The certificate.
+    pub cert: CertId,
+    /// True if its certificate lets it carry others' names (`sgc:role:router`).
+    pub may_route: bool,
     key: Arc<[u8]>,
     algorithm: &'static dyn SignatureVerificationAlgorithm,
 }
@@ -208,6 +231,7 @@ impl VerifiedPeer {
     fn of_leaf(leaf: &EndEntityCert<'_>, der: &[u8], ca: &Anchor) -> Result<Self, CertError> {
         let mut pseudonym = None;
         let mut groups = Vec::new();
+        let mut may_route = false;
         // URIs that are unknown here are for later versions.
         for uri in leaf.valid_uri_names() {
             if let Some(hex) = uri.strip_prefix(NODE_URI) {
@@ -221,11 +245,16 @@ impl VerifiedPeer {
                 }
                 let tag = hex.parse::<GroupTag>();
                 groups.push(tag.map_err(|_| CertError::Malformed("a group tag is no hash".into()))?);
+            } else if uri == ROUTER_URI {
+                may_route = true;
             }
         }
         groups.sort_unstable();
         groups.dedup();
         let pseudonym = pseudonym.ok_or(CertError::NoPseudonym)?;
+        let serial = leaf.serial();
+        let zeros = serial.iter().take_while(|b| **b == 0).count();
+        let serial = serial.get(zeros..).unwrap_or_default().into();
         let Validity { not_before, not_after } =
             Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
         let spki = leaf.subject_public_key_info();
@@ -241,6 +270,8 @@ impl VerifiedPeer {
             not_before,
             not_after,
             ca: ca.fingerprint,
+            cert: CertId { ca: ca.fingerprint, serial },
+            may_route,
             key: key.into(),
             algorithm,
         })

@@ -1,9 +1,10 @@
 //! What a grant holds once it is unsealed: a topic's key, or an owner's catalogue.
 
-use std::fmt;
+use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::SourceId;
+use crate::control::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, SOURCE_KEY_BYTES_MAX};
+use crate::ids::{Blind, SecretBytes, SourceId};
 use crate::metadata::Metadata;
 use crate::packet::Class;
 use crate::qos::Qos;
@@ -13,33 +14,67 @@ pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
 /// Most sources listed for one entry.
 pub const ENTRY_SOURCES_MAX: usize = 128;
 
+/// Most sources of one topic.
+pub const GRANT_SOURCES_MAX: usize = 1024;
+/// Most generations of a fleet's secret that are in use at one time.
+pub const SECRET_GENERATIONS_MAX: usize = 8;
+
 /// The content of a grant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum GrantContent {
-    /// The key of a topic.
+    /// The key of a topic, and who publishes on it.
     Topic(TopicGrant),
     /// The list of what its owner shares with the one who asked.
     Catalogue(Catalogue),
+    /// What a member needs to stay one; from its fleet's authority.
+    Credentials(Credentials),
 }
 
-/// The key of one epoch of one topic.
-#[derive(Clone, PartialEq, Eq)]
+/// One epoch of one topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicGrant {
-    /// Epoch that the key is for.
+    /// Number of the epoch, from 1.
     pub epoch: u32,
     /// Cipher suite id.
     pub suite: u8,
-    /// The key.
-    pub key: [u8; 32],
+    /// The topic key of the epoch.
+    pub key: SecretBytes,
+    /// Who publishes: nobody else is believed.
+    pub sources: Vec<SourceAnnounce>,
+    /// What the name stands for, if that was asked for.
+    pub entry: Option<Box<CatalogueEntry>>,
 }
 
-impl fmt::Debug for TopicGrant {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("TopicGrant")
-            .field("epoch", &self.epoch)
-            .field("suite", &self.suite)
-            .finish_non_exhaustive()
-    }
+/// A source, as the owner vouches for it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SourceAnnounce {
+    /// Its id.
+    pub source: SourceId,
+    /// What its messages verify with: an Ed25519 public key of 32 bytes, or the SubjectPublicKeyInfo of an RSA key;
+    /// empty if the suite has no signatures.
+    pub key: Bytes,
+    /// The oldest message that it may be asked for when this was said; its next one if it keeps none.
+    pub oldest: u64,
+    /// The number of its next message when this was said: what is older than it and was not asked for is a replay.
+    pub next: u64,
+}
+
+/// What a member needs to stay one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Credentials {
+    /// Its new certificates, leaf first, DER.
+    pub chain: Vec<Bytes>,
+    /// The fleet's naming secrets in use, newest first; none for a router.
+    pub secrets: Vec<SecretGeneration>,
+}
+
+/// One generation of the secret that names are derived from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SecretGeneration {
+    /// Its number, from 1.
+    pub generation: u32,
+    /// The secret.
+    pub secret: SecretBytes,
 }
 
 /// What an owner shares with one node.
@@ -54,8 +89,16 @@ pub struct Catalogue {
 /// One shared interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CatalogueEntry {
-    /// Metadata; the name follows from it and the topic secret.
+    /// What it is.
     pub metadata: Metadata,
+    /// The name is that of the owner and this.
+    pub blind: Blind,
+    /// True if the one who asked may subscribe to it.
+    pub subscribe: bool,
+    /// True if the one who asked may publish on it.
+    pub publish: bool,
+    /// Cipher suite id.
+    pub suite: u8,
     /// True if the DDS type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash, if the owner's side knows it.
@@ -101,12 +144,22 @@ impl Encode for GrantContent {
                 w.u8(0);
                 w.u32(grant.epoch);
                 w.u8(grant.suite);
-                w.raw(&grant.key);
+                grant.key.encode(w);
+                w.list(&grant.sources, |w, s| s.encode(w));
+                w.option(grant.entry.as_ref(), |w, e| e.encode(w));
             }
             Self::Catalogue(catalogue) => {
                 w.u8(1);
                 w.u64(catalogue.version);
                 w.list(&catalogue.entries, |w, e| e.encode(w));
+            }
+            Self::Credentials(credentials) => {
+                w.u8(2);
+                w.list(&credentials.chain, |w, c| w.bytes(c));
+                w.list(&credentials.secrets, |w, s| {
+                    w.u32(s.generation);
+                    s.secret.encode(w);
+                });
             }
         }
     }
@@ -115,19 +168,57 @@ impl Encode for GrantContent {
 impl Decode for GrantContent {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         match r.u8()? {
-            0 => Ok(Self::Topic(TopicGrant { epoch: r.u32()?, suite: r.u8()?, key: r.array("key")? })),
+            0 => Ok(Self::Topic(TopicGrant {
+                epoch: r.u32()?,
+                suite: r.u8()?,
+                key: SecretBytes::decode(r)?,
+                sources: r.list("sources", GRANT_SOURCES_MAX, SourceAnnounce::decode)?,
+                entry: r.option("entry", |r| CatalogueEntry::decode(r).map(Box::new))?,
+            })),
             1 => Ok(Self::Catalogue(Catalogue {
                 version: r.u64()?,
                 entries: r.list("catalogue", CATALOGUE_ENTRIES_MAX, CatalogueEntry::decode)?,
+            })),
+            2 => Ok(Self::Credentials(Credentials {
+                chain: r.list("certificate chain", CHAIN_CERTS_MAX, |r| {
+                    r.bytes("certificate", CERT_BYTES_MAX).map(Bytes::copy_from_slice)
+                })?,
+                secrets: r.list("secrets", SECRET_GENERATIONS_MAX, |r| {
+                    Ok(SecretGeneration { generation: r.u32()?, secret: SecretBytes::decode(r)? })
+                })?,
             })),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }
 }
 
+impl Encode for SourceAnnounce {
+    fn encode(&self, w: &mut Writer) {
+        self.source.encode(w);
+        w.bytes(&self.key);
+        w.u64(self.oldest);
+        w.u64(self.next);
+    }
+}
+
+impl Decode for SourceAnnounce {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            source: SourceId::decode(r)?,
+            key: r.bytes("source key", SOURCE_KEY_BYTES_MAX).map(Bytes::copy_from_slice)?,
+            oldest: r.u64()?,
+            next: r.u64()?,
+        })
+    }
+}
+
 impl Encode for CatalogueEntry {
     fn encode(&self, w: &mut Writer) {
         self.metadata.encode(w);
+        self.blind.encode(w);
+        w.bool(self.subscribe);
+        w.bool(self.publish);
+        w.u8(self.suite);
         w.bool(self.keyless);
         w.option(self.type_hash.as_ref(), |w, h| w.str(h));
         self.qos.encode(w);
@@ -143,6 +234,10 @@ impl Decode for CatalogueEntry {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Ok(Self {
             metadata: Metadata::decode(r)?,
+            blind: Blind::decode(r)?,
+            subscribe: r.bool("subscribe")?,
+            publish: r.bool("publish")?,
+            suite: r.u8()?,
             keyless: r.bool("keyless")?,
             type_hash: r.option("type hash", |r| r.str("type hash", 128))?,
             qos: Qos::decode(r)?,
@@ -160,19 +255,40 @@ mod tests {
 
     #[test]
     fn grants_round_trip_and_keys_stay_out_of_debug() {
-        let topic = TopicGrant { epoch: 3, suite: 1, key: [0xab; 32] };
-        assert!(!format!("{topic:?}").contains("171"), "{topic:?}");
         let entry = CatalogueEntry {
             metadata: Metadata::topic("arm-1", "/a", "p/msg/T"),
+            blind: Blind([7; 32]),
+            subscribe: true,
+            publish: false,
+            suite: 3,
             keyless: true,
             type_hash: Some("RIHS01_00".into()),
             qos: Qos { partitions: vec!["x".into()], ..Qos::default() },
             class: Class::Bulk,
             sources: vec![CatalogueSource { source: SourceId([1; 16]), qos: Qos::default() }],
         };
+        let announce = SourceAnnounce {
+            source: SourceId([2; 16]),
+            key: Bytes::from_static(&[5; 32]),
+            oldest: 3,
+            next: 9,
+        };
+        let topic = TopicGrant {
+            epoch: 3,
+            suite: 1,
+            key: SecretBytes::new([0xab; 32]),
+            sources: vec![announce],
+            entry: Some(Box::new(entry.clone())),
+        };
+        let credentials = Credentials {
+            chain: vec![Bytes::from_static(b"leaf")],
+            secrets: vec![SecretGeneration { generation: 2, secret: SecretBytes::new([0xab; 32]) }],
+        };
+        assert!(!format!("{topic:?}{credentials:?}").contains("171"), "{topic:?}{credentials:?}");
         for content in [
             GrantContent::Topic(topic),
             GrantContent::Catalogue(Catalogue { version: 8, entries: vec![entry] }),
+            GrantContent::Credentials(credentials),
         ] {
             assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));
         }

@@ -23,6 +23,12 @@ pub const CERT_BYTES_MAX: usize = 4096;
 pub const SIGNATURE_BYTES_MAX: usize = 512;
 /// Longest public key for replies, bytes (room for hybrid post-quantum keys).
 pub const REPLY_KEY_BYTES_MAX: usize = 2048;
+/// Longest certificate revocation list, bytes: some 6000 entries.
+pub const CRL_BYTES_MAX: usize = 256 * 1024;
+/// Longest certificate signing request, bytes.
+pub const CSR_BYTES_MAX: usize = 4096;
+/// Longest public key that messages are signed with, bytes (SubjectPublicKeyInfo of RSA 4096).
+pub const SOURCE_KEY_BYTES_MAX: usize = 640;
 /// Longest sealed content of an answer, bytes.
 pub const SEALED_BYTES_MAX: usize = 768 * 1024;
 
@@ -83,6 +89,21 @@ pub enum Control {
     Recover(Recover),
     /// The sender closes in good order: all it advertised is withdrawn.
     Goodbye,
+    /// A certificate revocation list (RFC 5280, 5), DER, signed by its CA. First behind the greeting, and again
+    /// whenever a newer one is known.
+    Crl {
+        /// The list.
+        der: Bytes,
+    },
+    /// A sink holds what the answer with this serial granted; travels towards the owner.
+    Ack {
+        /// Name.
+        name: Name,
+        /// Sink.
+        sink: SinkId,
+        /// Serial of the answer.
+        serial: u64,
+    },
 }
 
 /// The first frame of a link.
@@ -124,6 +145,12 @@ pub enum RejectReason {
     TimedOut,
     /// The branch is cut because the way to the owner changed or broke.
     RouteLost,
+    /// The clocks of requester and router are too far apart.
+    Clock,
+    /// The requester's certificate is over, or not valid yet.
+    Expired,
+    /// The requester's certificate is revoked.
+    Revoked,
 }
 
 /// Bytes and a signature over them.
@@ -161,6 +188,45 @@ pub enum Role {
     Publish,
 }
 
+/// What a joiner asks for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Request {
+    /// To receive what is published under the name.
+    Subscribe {
+        /// True if the grant is to say what the name stands for: for one who cannot see the owner's catalogue.
+        describe: bool,
+    },
+    /// To publish under the name.
+    Publish {
+        /// The source that it will publish as.
+        offer: SourceOffer,
+    },
+    /// A fresh certificate, and whatever else a member needs; of a fleet's authority.
+    Renew {
+        /// Certificate signing request (PKCS #10), DER.
+        csr: Bytes,
+    },
+}
+
+impl Request {
+    /// Which way data flows over the branch.
+    pub fn role(&self) -> Role {
+        match self {
+            Self::Publish { .. } => Role::Publish,
+            Self::Subscribe { .. } | Self::Renew { .. } => Role::Subscribe,
+        }
+    }
+}
+
+/// A source that wants to publish under another's name.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SourceOffer {
+    /// Its random id.
+    pub source: SourceId,
+    /// What its messages verify with; empty if the suite has no signatures.
+    pub key: Bytes,
+}
+
 /// A request to join.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct JoinBody {
@@ -168,8 +234,8 @@ pub struct JoinBody {
     pub name: Name,
     /// This incarnation of the joiner.
     pub sink: SinkId,
-    /// Role.
-    pub role: Role,
+    /// What is asked for.
+    pub request: Request,
     /// When it was signed.
     pub issued_at: UnixMillis,
     /// Certificates of the joiner, leaf first, DER.
@@ -221,6 +287,12 @@ pub enum RefuseReason {
     RoleNotOffered,
     /// A limit of the owner is reached.
     Limit,
+    /// The clocks of requester and owner are too far apart.
+    Clock,
+    /// The requester's certificate is over, or not valid yet.
+    Expired,
+    /// The requester's certificate is revoked.
+    Revoked,
 }
 
 macro_rules! tags {
@@ -242,8 +314,18 @@ macro_rules! tags {
     };
 }
 
-tags!(Role, "role", Subscribe = 0, Publish = 1);
-tags!(RejectReason, "reject reason", NoRoute = 0, NotVerified = 1, Limit = 2, TimedOut = 3, RouteLost = 4);
+tags!(
+    RejectReason,
+    "reject reason",
+    NoRoute = 0,
+    NotVerified = 1,
+    Limit = 2,
+    TimedOut = 3,
+    RouteLost = 4,
+    Clock = 5,
+    Expired = 6,
+    Revoked = 7
+);
 tags!(
     RefuseReason,
     "refuse reason",
@@ -251,7 +333,10 @@ tags!(
     NotShared = 1,
     NotVerified = 2,
     RoleNotOffered = 3,
-    Limit = 4
+    Limit = 4,
+    Clock = 5,
+    Expired = 6,
+    Revoked = 7
 );
 
 impl std::fmt::Display for RejectReason {
@@ -262,6 +347,9 @@ impl std::fmt::Display for RejectReason {
             Self::Limit => "a limit of the router is reached",
             Self::TimedOut => "the owner did not answer in time",
             Self::RouteLost => "the way to the owner broke",
+            Self::Clock => "the clocks of this node and the router are more than ten minutes apart: set them",
+            Self::Expired => "the certificate of this node does not hold now, says the router",
+            Self::Revoked => "the certificate of this node is revoked, says the router",
         })
     }
 }
@@ -274,6 +362,9 @@ impl std::fmt::Display for RefuseReason {
             Self::NotVerified => "the owner could not verify the request",
             Self::RoleNotOffered => "the owner does not offer that role",
             Self::Limit => "a limit of the owner is reached",
+            Self::Clock => "the clocks of this node and the owner are more than ten minutes apart: set them",
+            Self::Expired => "the certificate of this node does not hold now, says the owner",
+            Self::Revoked => "the certificate of this node is revoked, says the owner",
         })
     }
 }
@@ -314,6 +405,42 @@ impl Decode for Signed {
     }
 }
 
+impl Encode for Request {
+    fn encode(&self, w: &mut Writer) {
+        match self {
+            Self::Subscribe { describe } => {
+                w.u8(0);
+                w.bool(*describe);
+            }
+            Self::Publish { offer } => {
+                w.u8(1);
+                offer.source.encode(w);
+                w.bytes(&offer.key);
+            }
+            Self::Renew { csr } => {
+                w.u8(2);
+                w.bytes(csr);
+            }
+        }
+    }
+}
+
+impl Decode for Request {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(match r.u8()? {
+            0 => Self::Subscribe { describe: r.bool("describe")? },
+            1 => Self::Publish {
+                offer: SourceOffer {
+                    source: SourceId::decode(r)?,
+                    key: blob(r, "source key", SOURCE_KEY_BYTES_MAX)?,
+                },
+            },
+            2 => Self::Renew { csr: blob(r, "signing request", CSR_BYTES_MAX)? },
+            v => return Err(DecodeError::value("request", v.into())),
+        })
+    }
+}
+
 impl Encode for AdvertBody {
     fn encode(&self, w: &mut Writer) {
         encode_chain(w, &self.chain);
@@ -342,7 +469,7 @@ impl Encode for JoinBody {
     fn encode(&self, w: &mut Writer) {
         self.name.encode(w);
         self.sink.encode(w);
-        self.role.encode(w);
+        self.request.encode(w);
         self.issued_at.encode(w);
         encode_chain(w, &self.chain);
         w.bytes(&self.reply_key);
@@ -354,7 +481,7 @@ impl Decode for JoinBody {
         Ok(Self {
             name: Name::decode(r)?,
             sink: SinkId::decode(r)?,
-            role: Role::decode(r)?,
+            request: Request::decode(r)?,
             issued_at: UnixMillis::decode(r)?,
             chain: decode_chain(r)?,
             reply_key: blob(r, "reply key", REPLY_KEY_BYTES_MAX)?,
@@ -453,6 +580,16 @@ impl Encode for Control {
                 w.u64(recover.to);
             }
             Self::Goodbye => w.u8(11),
+            Self::Crl { der } => {
+                w.u8(12);
+                w.bytes(der);
+            }
+            Self::Ack { name, sink, serial } => {
+                w.u8(13);
+                name.encode(w);
+                sink.encode(w);
+                w.u64(*serial);
+            }
         }
     }
 }
@@ -481,6 +618,8 @@ impl Decode for Control {
                 to: r.u64()?,
             }),
             11 => Self::Goodbye,
+            12 => Self::Crl { der: blob(r, "revocation list", CRL_BYTES_MAX)? },
+            13 => Self::Ack { name: Name::decode(r)?, sink: SinkId::decode(r)?, serial: r.u64()? },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -505,6 +644,8 @@ mod tests {
             Control::Reject { name, sink, reason: RejectReason::RouteLost },
             Control::Recover(Recover { name, sink, source: SourceId([3; 16]), from: 1, to: 9 }),
             Control::Goodbye,
+            Control::Crl { der: Bytes::from_static(b"list") },
+            Control::Ack { name, sink, serial: 7 },
         ]
     }
 
@@ -534,15 +675,22 @@ mod tests {
             blinds: vec![Blind([4; 32]); 2],
         };
         assert_eq!(AdvertBody::from_slice(&advert.to_vec()), Ok(advert));
-        let join = JoinBody {
-            name: Name([1; 32]),
-            sink: SinkId([2; 16]),
-            role: Role::Publish,
-            issued_at: UnixMillis(78),
-            chain,
-            reply_key: Bytes::from_static(b"key"),
-        };
-        assert_eq!(JoinBody::from_slice(&join.to_vec()), Ok(join));
+        let offer = SourceOffer { source: SourceId([6; 16]), key: Bytes::from_static(b"public") };
+        for request in [
+            Request::Subscribe { describe: true },
+            Request::Publish { offer },
+            Request::Renew { csr: Bytes::from_static(b"csr") },
+        ] {
+            let join = JoinBody {
+                name: Name([1; 32]),
+                sink: SinkId([2; 16]),
+                request,
+                issued_at: UnixMillis(78),
+                chain: chain.clone(),
+                reply_key: Bytes::from_static(b"key"),
+            };
+            assert_eq!(JoinBody::from_slice(&join.to_vec()), Ok(join));
+        }
         for answer in [
             Answer::Grant { enc: Bytes::from_static(b"e"), sealed: Bytes::from_static(b"s") },
             Answer::Refuse { reason: RefuseReason::NotPermitted },

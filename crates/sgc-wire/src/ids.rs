@@ -87,6 +87,50 @@ id!(
     SinkId, 16, "sink id"
 );
 
+/// 256 secret bits: a key, or what keys are derived from. Wiped when dropped, compared in constant time, never
+/// printed.
+#[derive(Clone, zeroize::Zeroize, zeroize::ZeroizeOnDrop)]
+pub struct SecretBytes([u8; 32]);
+
+impl SecretBytes {
+    /// Takes the bytes.
+    pub fn new(bytes: [u8; 32]) -> Self {
+        Self(bytes)
+    }
+
+    /// The bytes, for deriving from them. They belong in no log, and on no wire but sealed.
+    pub fn expose(&self) -> &[u8; 32] {
+        &self.0
+    }
+}
+
+impl PartialEq for SecretBytes {
+    fn eq(&self, other: &Self) -> bool {
+        use subtle::ConstantTimeEq;
+        self.0.ct_eq(&other.0).into()
+    }
+}
+
+impl Eq for SecretBytes {}
+
+impl fmt::Debug for SecretBytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("SecretBytes(..)")
+    }
+}
+
+impl Encode for SecretBytes {
+    fn encode(&self, w: &mut Writer) {
+        w.raw(&self.0);
+    }
+}
+
+impl Decode for SecretBytes {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        r.array("secret").map(Self)
+    }
+}
+
 /// Text that is not an identifier.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{found:?} is not {expected} hexadecimal digits")]

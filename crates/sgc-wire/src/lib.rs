@@ -15,16 +15,19 @@ mod packet;
 mod qos;
 
 pub use catalogue::{
-    CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, ENTRY_SOURCES_MAX, GrantContent,
-    TopicGrant,
+    CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
+    GRANT_SOURCES_MAX, GrantContent, SECRET_GENERATIONS_MAX, SecretGeneration, SourceAnnounce, TopicGrant,
 };
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX,
-    CONTROL_FRAME_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover,
-    RefuseReason, RejectReason, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, Signed,
+    CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX,
+    REPLY_KEY_BYTES_MAX, Recover, RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX,
+    SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed, SourceOffer,
 };
-pub use ids::{Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SinkId, SourceId, UnixMillis};
+pub use ids::{
+    Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SecretBytes, SinkId, SourceId, UnixMillis,
+};
 pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use packet::{

@@ -7,7 +7,8 @@ use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
     Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Qos, Recover,
-    RefuseReason, RejectReason, Role, Signed, SinkId, SourceId, TopicGrant, UnixMillis,
+    RefuseReason, RejectReason, Request, SecretBytes, Signed, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -79,7 +80,8 @@ fn signed_bodies_and_grants_survive_mutation() {
     };
     survives::<AdvertBody>(&[advert.to_vec()], 2);
     let reply_key = Bytes::from_static(&[5; 32]);
-    let join = JoinBody { name, sink, role: Role::Subscribe, issued_at, chain, reply_key };
+    let join =
+        JoinBody { name, sink, request: Request::Subscribe { describe: false }, issued_at, chain, reply_key };
     survives::<JoinBody>(&[join.to_vec()], 3);
     let answers = [
         Answer::Grant { enc: Bytes::from_static(&[6; 32]), sealed: Bytes::from_static(&[7; 80]) },
@@ -91,6 +93,10 @@ fn signed_bodies_and_grants_survive_mutation() {
     survives::<Metadata>(&[metadata.to_vec()], 5);
     let entry = CatalogueEntry {
         metadata,
+        blind: Blind([4; 32]),
+        subscribe: true,
+        publish: false,
+        suite: 1,
         keyless: true,
         type_hash: Some("RIHS01_ab".into()),
         qos: Qos { partitions: vec!["p".into()], ..Qos::default() },
@@ -98,7 +104,18 @@ fn signed_bodies_and_grants_survive_mutation() {
         sources: vec![CatalogueSource { source: SourceId([8; 16]), qos: Qos::default() }],
     };
     let contents = [
-        GrantContent::Topic(TopicGrant { epoch: 1, suite: 1, key: [9; 32] }),
+        GrantContent::Topic(TopicGrant {
+            epoch: 1,
+            suite: 1,
+            key: SecretBytes::new([9; 32]),
+            sources: vec![SourceAnnounce {
+                source: SourceId([8; 16]),
+                key: Bytes::new(),
+                oldest: 1,
+                next: 2,
+            }],
+            entry: Some(Box::new(entry.clone())),
+        }),
         GrantContent::Catalogue(Catalogue { version: 2, entries: vec![entry] }),
     ];
     survives::<GrantContent>(&contents.map(|c| c.to_vec()), 6);
