@@ -25,7 +25,7 @@ pub use fleet::{
 pub use grant::{GrantError, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
-pub use names::{TopicSecret, derive_name, name_of};
+pub use names::{TopicSecret, derive_name, name_of, renewal_blind};
 pub use pem::PemError;
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
