@@ -5,6 +5,7 @@
 //! The normative text is `docs/spec/names.md` and `docs/spec/trust.md`.
 #![forbid(unsafe_code)]
 
+mod crl;
 mod fleet;
 mod grant;
 mod identity;
@@ -19,8 +20,10 @@ mod signed;
 mod verify;
 mod x509;
 
+pub use crl::CrlError;
 pub use fleet::{
-    CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT,
+    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
+    LEAF_VALIDITY_DEFAULT,
 };
 pub use grant::{GrantError, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
