@@ -12,6 +12,8 @@ use sgc_wire::{
     RefuseReason, RejectReason, Signed, SinkId, SourceId,
 };
 
+#[allow(unused)]
+use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::joins::{Join, JoinState, LostReason, RefusedBy, Wish};
 
@@ -286,7 +288,14 @@ impl Endpoint {
         }
     }
 
-    fn granted_content(&mut self, owner: NodeId, name: Name, sink: SinkId, serial: u64, content: GrantContent) {
+    fn granted_content(
+        &mut self,
+        owner: NodeId,
+        name: Name,
+        sink: SinkId,
+        serial: u64,
+        content: GrantContent,
+    ) {
         let wish = self.joins.get(&name).map(|j| &j.wish);
         match (content, wish) {
             (GrantContent::Catalogue(catalogue), Some(Wish::Follow)) => {

@@ -145,7 +145,12 @@ impl Join {
     }
 
     /// Asks now: a fresh sink id and reply key.
-    pub(crate) fn ask(&mut self, now: Instant, reply_key: ReplyKey, rng: &mut impl RngCore) -> (SinkId, Bytes) {
+    pub(crate) fn ask(
+        &mut self,
+        now: Instant,
+        reply_key: ReplyKey,
+        rng: &mut impl RngCore,
+    ) -> (SinkId, Bytes) {
         let mut id = [0; 16];
         rng.fill_bytes(&mut id);
         let sink = SinkId(id);

@@ -9,14 +9,18 @@
 //! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
+mod compat;
 mod endpoint;
+mod joiner;
 mod joins;
+mod owner;
 mod shares;
 mod sink;
 mod source;
 
+pub use compat::SourceProgress;
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
-pub use joins::{JoinStatus, LostReason, RefusedBy};
+pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
 pub use shares::{ShareError, ShareSpec};
 pub use sink::{Delivery, Message, Sink, SinkDrop, SinkLimits};
 pub use source::{FRAGMENT_BYTES, PublishError, Source, SourceConfig};

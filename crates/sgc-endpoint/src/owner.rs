@@ -7,14 +7,16 @@ use std::time::Instant;
 
 use sgc_trust::{Denied, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
-    Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials, Decode,
-    Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
+    Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
+    Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
     SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
 };
 
+use crate::SourceProgress;
+#[allow(unused)]
+use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
-use crate::source::SourceProgress;
 
 impl Endpoint {
     /// Shares an interface under the name that its metadata gives with the newest secret.
@@ -157,7 +159,8 @@ impl Endpoint {
     pub(crate) fn end_catalogue(&mut self, name: Name, blind: Blind) {
         self.unadvertised.remove(&blind);
         self.withdrawn.insert(blind);
-        let sinks: Vec<_> = self.shares.followers.keys().filter(|(n, _)| *n == name).map(|(_, s)| *s).collect();
+        let sinks: Vec<_> =
+            self.shares.followers.keys().filter(|(n, _)| *n == name).map(|(_, s)| *s).collect();
         for sink in sinks {
             if let Some(granted) = self.shares.followers.remove(&(name, sink)) {
                 self.refuse(name, sink, granted.serial + 1, RefuseReason::NotShared);
@@ -208,7 +211,7 @@ impl Endpoint {
 
     /// Why a peer whose certificate was good when it asked may not have anything any more.
     fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
-        if self.anchors.is_revoked(&peer.cert) {
+        if self.anchors.is_peer_revoked(peer) {
             Some(RefuseReason::Revoked)
         } else if peer.not_after < self.now.unix {
             Some(RefuseReason::Expired)
@@ -293,7 +296,9 @@ impl Endpoint {
     }
 
     pub(crate) fn handle_ack(&mut self, name: Name, sink: SinkId, serial: u64) {
-        let Some(share) = self.shares.shares.get_mut(&name) else { return self.unexpected("acknowledgement") };
+        let Some(share) = self.shares.shares.get_mut(&name) else {
+            return self.unexpected("acknowledgement");
+        };
         if let Some(rotation) = &mut share.rotation
             && rotation.waiting.get(&sink).is_some_and(|granted| *granted <= serial)
         {

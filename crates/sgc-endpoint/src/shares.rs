@@ -135,7 +135,8 @@ impl Share {
 
     /// True if `source` publishes here already, other than by the request of `sink`.
     pub(crate) fn has_source(&self, source: &SourceId, sink: &SinkId) -> bool {
-        let offered = |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);
+        let offered =
+            |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);
         self.own.iter().any(|s| s.announce().source == *source)
             || self.sinks.iter().any(|(id, s)| id != sink && offered(s))
     }

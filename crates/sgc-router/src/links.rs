@@ -1,6 +1,7 @@
 //! One neighbour: who it is, what it said of itself, and what depends on it.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
@@ -16,8 +17,8 @@ const ROUTER_FACTOR: u32 = 16;
 pub struct Neighbour {
     /// Who it is.
     pub node: NodeId,
-    /// Its certificate.
-    pub cert: CertId,
+    /// Its certificate, and those between it and the CA.
+    pub certs: Arc<[CertId]>,
     /// True if its certificate lets it carry others' names.
     pub may_route: bool,
     /// Last moment at which its certificate holds.
@@ -26,8 +27,8 @@ pub struct Neighbour {
 
 impl From<&VerifiedPeer> for Neighbour {
     fn from(peer: &VerifiedPeer) -> Self {
-        let VerifiedPeer { node_id, cert, may_route, not_after, .. } = peer;
-        Self { node: *node_id, cert: cert.clone(), may_route: *may_route, not_after: *not_after }
+        let VerifiedPeer { node_id, path, may_route, not_after, .. } = peer;
+        Self { node: *node_id, certs: path.clone(), may_route: *may_route, not_after: *not_after }
     }
 }
 
@@ -36,8 +37,8 @@ impl From<&VerifiedPeer> for Neighbour {
 pub(crate) struct LinkState {
     /// The authenticated node at the other end.
     pub(crate) node: NodeId,
-    /// Its certificate; `None` for this node itself.
-    pub(crate) cert: Option<CertId>,
+    /// Its certificates; none for this node itself.
+    pub(crate) certs: Arc<[CertId]>,
     may_route: bool,
     /// When its certificate ends.
     pub(crate) expires: Option<Instant>,
@@ -59,7 +60,7 @@ impl LinkState {
     pub(crate) fn new(now: Now, neighbour: Neighbour, limits: &Limits) -> Self {
         let left = Duration::from_millis(neighbour.not_after.0.saturating_sub(now.unix.0));
         Self {
-            cert: Some(neighbour.cert),
+            certs: neighbour.certs,
             may_route: neighbour.may_route,
             // One that outlasts the clock never ends.
             expires: now.instant.checked_add(left),
@@ -71,7 +72,7 @@ impl LinkState {
     pub(crate) fn local(node: NodeId, limits: &Limits) -> Self {
         Self {
             node,
-            cert: None,
+            certs: Arc::new([]),
             may_route: false,
             expires: None,
             hello: None,
@@ -92,7 +93,7 @@ impl LinkState {
     /// Takes one from what the link may ask for; false if there is none left. This node asks as it likes.
     pub(crate) fn may_ask(&mut self, now: Instant) -> bool {
         let factor = if self.is_transit() { ROUTER_FACTOR } else { 1 };
-        self.cert.is_none() || self.joins.take(now, factor)
+        self.certs.is_empty() || self.joins.take(now, factor)
     }
 
     /// Takes one from what the link may get wrong; false if there is none left.

@@ -46,8 +46,8 @@ impl Route {
 pub(crate) struct Branch {
     pub(crate) link: LinkId,
     pub(crate) peer: NodeId,
-    /// The certificate of its request.
-    pub(crate) cert: CertId,
+    /// The certificates of its request.
+    pub(crate) certs: Arc<[CertId]>,
     pub(crate) role: Role,
     /// Until when the owner must answer; `None` once it granted.
     pub(crate) pending: Option<Instant>,

@@ -310,7 +310,7 @@ impl Router {
         let of_node = self.links.values().filter(|l| l.node == neighbour.node).count();
         let refused = if neighbour.node == self.config.node {
             Some(LinkClose::Loop)
-        } else if self.is_untrusted(&neighbour.cert) {
+        } else if self.is_untrusted(&neighbour.certs) {
             Some(LinkClose::Revoked)
         } else if of_node >= self.config.limits.links_per_node_max {
             Some(LinkClose::TooMany)

@@ -398,7 +398,6 @@ impl Router {
     }
 }
 
-
 fn advert_frame(route: &Route) -> Control {
     Control::Advert { hops: route.distance(), signed: route.advert.signed.clone() }
 }

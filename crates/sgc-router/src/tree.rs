@@ -1,7 +1,9 @@
 //! Trees: who receives what, over which branches.
 
 use sgc_trust::{SignedError, verify_answer, verify_join};
-use sgc_wire::{Answer, AnswerBody, Control, Decode, JoinBody, Name, Now, Recover, RejectReason, Signed, SinkId};
+use sgc_wire::{
+    Answer, AnswerBody, Control, Decode, JoinBody, Name, Now, Recover, RejectReason, Signed, SinkId,
+};
 
 use crate::rib::{Branch, NameState};
 use crate::router::{DropReason, LinkId, Output, Router};
@@ -43,11 +45,18 @@ impl Router {
             self.drop_frame(link, DropReason::Limit { what: "branches" });
             return reject(self, RejectReason::Limit);
         }
-        let deadline = now.instant + limits.answer_wait;
-        self.remove_branch(name, sink);
-        let branch =
-            Branch { link, peer: join.peer.node_id, role: join.body.request.role(), pending: Some(deadline) };
-        self.put_branch(name, sink, branch);
+        // The same sink asks again under a new certificate: what it is granted goes on meanwhile.
+        let granted = state.branches.get(&sink).is_some_and(|b| b.pending.is_none());
+        let pending = (!granted).then(|| now.instant + limits.answer_wait);
+        let role = join.body.request.role();
+        let branch = Branch { link, peer: join.peer.node_id, certs: join.peer.path, role, pending };
+        match self.names.get_mut(&name).and_then(|s| s.branches.get_mut(&sink)) {
+            Some(known) if granted && known.role == role => *known = branch,
+            _ => {
+                self.remove_branch(name, sink);
+                self.put_branch(name, sink, branch);
+            }
+        }
         self.send(up, Control::Join { signed });
     }
 

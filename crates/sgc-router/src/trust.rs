@@ -21,7 +21,7 @@ impl Router {
         let links: Vec<_> = self
             .links
             .iter()
-            .filter(|(l, s)| **l != LinkId::LOCAL && s.cert.as_ref().is_some_and(|c| self.is_untrusted(c)))
+            .filter(|(l, s)| **l != LinkId::LOCAL && self.is_untrusted(&s.certs))
             .map(|(l, _)| *l)
             .collect();
         for link in links {
@@ -31,9 +31,9 @@ impl Router {
         let mut branches = Vec::new();
         let mut routes = Vec::new();
         for (name, state) in &self.names {
-            let cut = state.branches.iter().filter(|(_, b)| self.is_untrusted(&b.cert));
+            let cut = state.branches.iter().filter(|(_, b)| self.is_untrusted(&b.certs));
             branches.extend(cut.map(|(sink, _)| (*name, *sink)));
-            let ended = state.routes().filter(|r| self.is_untrusted(&r.advert.owner.cert));
+            let ended = state.routes().filter(|r| self.is_untrusted(&r.advert.owner.path));
             routes.extend(ended.map(|r| (*name, r.link)));
         }
         for (name, sink) in branches {
@@ -64,16 +64,17 @@ impl Router {
         let anchors = Arc::new(anchors);
         self.outputs.push_back(Output::Trust(anchors.clone()));
         self.set_anchors(anchors);
-        let others: Vec<_> = self.links.keys().filter(|l| **l != from && **l != LinkId::LOCAL).copied().collect();
+        let others: Vec<_> =
+            self.links.keys().filter(|l| **l != from && **l != LinkId::LOCAL).copied().collect();
         for link in others {
             self.send(link, Control::Crl { der: der.clone() });
         }
         Ok(true)
     }
 
-    pub(crate) fn is_untrusted(&self, cert: &CertId) -> bool {
+    pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
         let anchors = &self.config.anchors;
-        anchors.is_revoked(cert) || anchors.ca_spki(&cert.ca).is_none()
+        certs.iter().any(|c| anchors.is_revoked(c) || anchors.ca_spki(&c.ca).is_none())
     }
 
     /// Closes the links of nodes whose certificates have ended.

@@ -12,10 +12,10 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
     Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkLimits, Source,
-    SourceConfig,
+    SourceConfig, Wish,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, Router, RouterConfig};
-use sgc_trust::{Grantees, Identity, Policy, Suite, derive_name};
+use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
+use sgc_trust::{Grantees, Identity, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
@@ -141,6 +141,8 @@ pub(crate) struct Running {
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
     identity: Arc<Identity>,
+    /// Whom it believes by now.
+    pub(crate) anchors: Arc<TrustAnchors>,
     next_link: u32,
     /// Wire and side of each link that is up.
     pub(crate) links: BTreeMap<LinkId, (usize, usize)>,
@@ -184,13 +186,18 @@ impl Node {
             anchors: Arc::new(self.identity.anchors().clone()),
             limits: self.router_limits.clone(),
         });
-        let config = EndpointConfig { identity: self.identity.clone(), limits: self.endpoint_limits.clone() };
+        let config = EndpointConfig {
+            identity: self.identity.clone(),
+            authority: false,
+            limits: self.endpoint_limits.clone(),
+        };
         let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
         let mut running = Running {
             run: self.runs,
             router,
             endpoint,
             identity: self.identity.clone(),
+            anchors: Arc::new(self.identity.anchors().clone()),
             next_link: 1,
             links: BTreeMap::new(),
             fib: BTreeMap::new(),
@@ -215,11 +222,11 @@ impl Node {
 }
 
 impl Running {
-    pub(crate) fn new_link(&mut self, wire: usize, side: usize, peer: NodeId) -> LinkId {
+    pub(crate) fn new_link(&mut self, now: Now, wire: usize, side: usize, peer: Neighbour) -> LinkId {
         let link = LinkId(self.next_link);
         self.next_link += 1;
         self.links.insert(link, (wire, side));
-        self.router.handle_link_up(link, peer);
+        self.router.handle_link_up(now, link, peer);
         link
     }
 
@@ -297,7 +304,7 @@ impl Running {
             history_bytes_max: HISTORY_BYTES_MAX,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
-        let source = Source::new(config, grant).expect("the group suite is in every build");
+        let source = Source::new(config, &grant).expect("the group suite is in every build");
         self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
         Some(name)
     }
@@ -320,13 +327,12 @@ impl Running {
         self.reconcile(now, owner);
     }
 
-    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str) {
         self.uses.remove(&(owner, topic.to_owned()));
         self.reconcile(now, owner);
         if self.uses.iter().all(|(o, _)| *o != owner) {
-            if let (Some(secret), Some(id)) = (self.identity.fleet_secret(), self.owners.remove(&owner)) {
-                let name = derive_name(secret, &id, &Metadata::catalogue(&directory.names[owner.0]));
-                self.endpoint.leave(now, &name);
+            if let Some(id) = self.owners.remove(&owner) {
+                self.endpoint.unfollow(now, &id);
             }
             self.catalogues.remove(&owner);
         }
@@ -382,6 +388,11 @@ impl Running {
                 }
                 sgc_router::Output::Close { link, reason } => {
                     self.effects.push(Effect::Close(link, reason));
+                }
+                sgc_router::Output::Trust(anchors) => {
+                    self.anchors = anchors.clone();
+                    self.endpoint.set_anchors(now, anchors);
+                    self.drain_endpoint(now);
                 }
                 sgc_router::Output::Dropped(dropped) => {
                     self.effects.push(Effect::Log(What::RouterDrop(dropped)));
@@ -450,14 +461,11 @@ impl Running {
 
     /// Joins what is wanted and in the owner's catalogue, leaves what is not.
     fn reconcile(&mut self, now: Now, owner: NodeKey) {
-        let (Some(secret), Some(owner_id)) = (self.identity.fleet_secret(), self.owners.get(&owner).copied())
-        else {
-            return;
-        };
+        let Some(owner_id) = self.owners.get(&owner).copied() else { return };
         let mut wanted = BTreeMap::new();
         for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries) {
             if self.uses.contains(&(owner, entry.metadata.ros_name.clone())) {
-                wanted.insert(derive_name(secret, &owner_id, &entry.metadata), entry.clone());
+                wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
             }
         }
         let gone: Vec<_> = self
@@ -493,7 +501,7 @@ impl Running {
                 retry_at: None,
             };
             self.sinks.insert(name, local);
-            self.endpoint.join(now, name, owner_id);
+            self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
         }
     }
 

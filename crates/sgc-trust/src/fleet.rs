@@ -187,6 +187,11 @@ impl Fleet {
         for group in groups {
             params.subject_alt_names.push(uri(GROUP_URI, &self.secret.group_tag(group.as_str()))?);
         }
+        if request.router {
+            params.subject_alt_names.push(SanType::URI(
+                crate::verify::ROUTER_URI.to_owned().try_into().map_err(FleetError::making)?,
+            ));
+        }
         params.is_ca = IsCa::ExplicitNoCa;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages =
