@@ -119,7 +119,7 @@ impl Join {
     pub(crate) fn ask(&mut self, now: Instant, rng: &mut impl RngCore) -> (SinkId, bytes::Bytes) {
         let mut id = [0; 16];
         rng.fill_bytes(&mut id);
-        let (sink, reply_key) = (SinkId(id), ReplyKey::generate());
+        let (sink, reply_key) = (SinkId(id), ReplyKey::generate(sgc_trust::Kem::default()));
         let public = reply_key.public().clone();
         self.attempts = self.attempts.saturating_add(1);
         self.state = JoinState::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };

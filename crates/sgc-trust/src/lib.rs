@@ -7,6 +7,7 @@
 
 mod fleet;
 mod grant;
+mod hpke;
 mod identity;
 mod key;
 mod label;
@@ -18,11 +19,12 @@ mod seal;
 mod signed;
 mod verify;
 mod x509;
+mod xwing;
 
 pub use fleet::{
     CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT,
 };
-pub use grant::{GrantError, ReplyKey, seal_grant};
+pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use names::{TopicSecret, derive_name, name_of};
