@@ -5,6 +5,7 @@
 //! The normative text is `docs/spec/names.md` and `docs/spec/trust.md`.
 #![forbid(unsafe_code)]
 
+mod crl;
 mod fleet;
 mod grant;
 mod hpke;
@@ -21,8 +22,10 @@ mod verify;
 mod x509;
 mod xwing;
 
+pub use crl::CrlError;
 pub use fleet::{
-    CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT,
+    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
+    LEAF_VALIDITY_DEFAULT,
 };
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
