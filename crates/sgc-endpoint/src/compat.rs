@@ -5,7 +5,7 @@ pub(crate) struct NamingSecret {
 }
 pub(crate) trait IdentityExt {
     fn naming_secrets(&self) -> &'static [NamingSecret];
-    fn authority(&self) -> Option<NodeId>;
+    fn authority(&self) -> Option<NodeId>; fn post_quantum(&self) -> bool;
 }
 impl IdentityExt for Identity {
     fn naming_secrets(&self) -> &'static [NamingSecret] {
@@ -19,7 +19,7 @@ impl IdentityExt for Identity {
     }
     fn authority(&self) -> Option<NodeId> {
         None
-    }
+    } fn post_quantum(&self) -> bool { false }
 }
 pub(crate) trait SuiteExt {
     fn is_signed(&self) -> bool;

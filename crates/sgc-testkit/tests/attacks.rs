@@ -229,7 +229,7 @@ fn join(identity: &Identity, world: &World, owner: NodeKey, sink: SinkId, role: 
         },
         issued_at: world.now().unix,
         chain: identity.chain_bytes(),
-        reply_key: sgc_trust::ReplyKey::generate().public().clone(),
+        reply_key: sgc_trust::ReplyKey::generate(sgc_trust::Kem::default()).public().clone(),
     };
     Control::Join { signed: identity.sign_join(&body) }
 }

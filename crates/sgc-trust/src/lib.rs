@@ -8,6 +8,7 @@
 mod crl;
 mod fleet;
 mod grant;
+mod hpke;
 mod identity;
 mod key;
 mod label;
@@ -19,13 +20,14 @@ mod seal;
 mod signed;
 mod verify;
 mod x509;
+mod xwing;
 
 pub use crl::CrlError;
 pub use fleet::{
     CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
     LEAF_VALIDITY_DEFAULT,
 };
-pub use grant::{GrantError, ReplyKey, seal_grant};
+pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use names::{TopicSecret, derive_name, name_of, renewal_blind};
