@@ -1,11 +1,12 @@
-use sgc_trust::{FleetSecret, Identity, Suite};
-use sgc_wire::{NodeId, SourceAnnounce};
+use sgc_trust::{FleetSecret, Identity};
+use sgc_wire::NodeId;
 pub(crate) struct NamingSecret {
     pub(crate) secret: FleetSecret,
 }
 pub(crate) trait IdentityExt {
     fn naming_secrets(&self) -> &'static [NamingSecret];
-    fn authority(&self) -> Option<NodeId>; fn post_quantum(&self) -> bool;
+    fn authority(&self) -> Option<NodeId>;
+    fn post_quantum(&self) -> bool;
 }
 impl IdentityExt for Identity {
     fn naming_secrets(&self) -> &'static [NamingSecret] {
@@ -19,21 +20,8 @@ impl IdentityExt for Identity {
     }
     fn authority(&self) -> Option<NodeId> {
         None
-    } fn post_quantum(&self) -> bool { false }
-}
-pub(crate) trait SuiteExt {
-    fn is_signed(&self) -> bool;
-}
-impl SuiteExt for Suite {
-    fn is_signed(&self) -> bool {
-        false
     }
-}
-/// x
-#[derive(Debug)]
-pub struct SourceProgress(pub SourceAnnounce);
-impl SourceProgress {
-    pub fn announce(&self) -> SourceAnnounce {
-        self.0.clone()
+    fn post_quantum(&self) -> bool {
+        false
     }
 }
