@@ -303,7 +303,7 @@ impl Endpoint {
                 self.event(Event::Catalogue { owner, catalogue });
             }
             (GrantContent::Topic(grant), Some(Wish::Subscribe { .. } | Wish::Publish(_))) => {
-                self.event(Event::Granted { name, grant });
+                self.event(Event::Granted { name, sink, grant });
                 if serial > 1 {
                     // A new epoch waits for it.
                     self.send(Control::Ack { name, sink, serial });

@@ -11,11 +11,11 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkLimits, Source,
-    SourceConfig, Wish,
+    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkDrop, SinkLimits,
+    Source, SourceConfig, Wish,
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
-use sgc_trust::{Grantees, Identity, Policy, Suite, TrustAnchors, name_of};
+use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
@@ -28,6 +28,8 @@ const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
 /// How long a history is waited for before it is asked for again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
+/// How long packets of past epochs may take.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A node of a world.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -52,6 +54,8 @@ pub struct Sharing {
     pub depth: usize,
     /// True if links may lose it.
     pub best_effort: bool,
+    /// How it is protected, unless as usual.
+    pub suite: Option<Suite>,
 }
 
 impl Sharing {
@@ -172,6 +176,8 @@ pub(crate) struct LocalSink {
     sources: Vec<SourceId>,
     sink: Option<Sink>,
     retry_at: Option<Instant>,
+    /// When the keys of past epochs are dropped.
+    retire_at: Option<Instant>,
 }
 
 impl Node {
@@ -257,6 +263,13 @@ impl Running {
         for name in due {
             self.ask_history(now, name);
         }
+        for local in self.sinks.values_mut() {
+            if local.retire_at.take_if(|at| *at <= now.instant).is_some()
+                && let Some(sink) = &mut local.sink
+            {
+                sink.retire_epochs();
+            }
+        }
     }
 
     pub(crate) fn share(
@@ -279,6 +292,7 @@ impl Running {
             },
             ..Policy::default()
         };
+        let suite = sharing.suite.unwrap_or(Suite::DEFAULT);
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {
             0 => Vec::new(),
@@ -287,7 +301,7 @@ impl Running {
         let spec = ShareSpec {
             metadata: metadata(self.identity.node_name().as_str(), topic),
             policy,
-            suite: Suite::Group,
+            suite,
             class: Class::Default,
             keyless: true,
             type_hash: None,
@@ -304,7 +318,9 @@ impl Running {
             history_bytes_max: HISTORY_BYTES_MAX,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
-        let source = Source::new(config, &grant).expect("the group suite is in every build");
+        let message_key = MessageKey::generate(suite);
+        let source = Source::new(config, &grant, message_key).expect("a key of that suite");
+        self.endpoint.set_sources(now, &name, vec![source.progress()]);
         self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
         Some(name)
     }
@@ -345,7 +361,10 @@ impl Running {
         let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
         let source = local.source.id();
         let mut packets = Vec::new();
-        local.source.publish(&head, &payload, |p| packets.push(p)).expect("tests publish what fits");
+        local
+            .source
+            .publish(&head, payload.into(), false, |p| packets.push(p))
+            .expect("tests publish what fits");
         for packet in packets {
             // As in the driver: what nobody asked for is not sent.
             if self.fib.contains_key(&packet.header.name) {
@@ -368,7 +387,8 @@ impl Running {
         if let sgc_endpoint::Output::Timeout(Some(at)) = self.endpoint.poll_output() {
             wake = Some(wake.map_or(at, |w: Instant| w.min(at)));
         }
-        self.wake = self.sinks.values().filter_map(|s| s.retry_at).chain(wake).min();
+        let sinks = self.sinks.values().flat_map(|s| [s.retry_at, s.retire_at]).flatten();
+        self.wake = sinks.chain(wake).min();
         std::mem::take(&mut self.effects)
     }
 
@@ -425,16 +445,29 @@ impl Running {
 
     fn handle_event(&mut self, now: Now, event: Event) {
         match event {
-            Event::Granted { name, grant } => {
-                if let Some(local) = self.sinks.get_mut(&name) {
-                    match &mut local.sink {
-                        Some(sink) => sink.regrant(grant),
-                        None => {
-                            let limits = SinkLimits::default();
-                            local.sink = Some(Sink::new(name, grant, local.transient_local, limits));
-                        }
+            Event::Granted { name, sink: id, grant } => {
+                let Some(local) = self.sinks.get_mut(&name) else { return };
+                let mut released = Vec::new();
+                match &mut local.sink {
+                    Some(sink) => sink.regrant(id, grant, |delivery| released.push(delivery)),
+                    None => {
+                        let limits = SinkLimits::default();
+                        local.sink = Some(Sink::new(name, id, grant, local.transient_local, limits));
                     }
-                    self.ask_history(now, name);
+                }
+                local.retire_at = Some(now.instant + EPOCH_GRACE);
+                for delivery in released {
+                    self.delivered(now, name, delivery);
+                }
+                self.ask_history(now, name);
+            }
+            Event::Rekeyed { name, grant } => {
+                let mut packets = Vec::new();
+                if let Some(local) = self.sources.get_mut(&name) {
+                    let _ = local.source.rekey(&grant, |p| packets.push(p));
+                }
+                for packet in packets {
+                    self.forward(now, LinkId::LOCAL, packet);
                 }
             }
             Event::Catalogue { owner, catalogue } => {
@@ -446,7 +479,7 @@ impl Running {
             }
             Event::Recover(recover) => {
                 let mut packets = Vec::new();
-                if let Some(local) = self.sources.get(&recover.name)
+                if let Some(local) = self.sources.get_mut(&recover.name)
                     && local.source.id() == recover.source
                 {
                     local.source.replay(recover.sink, recover.from, recover.to, |p| packets.push(p));
@@ -499,6 +532,7 @@ impl Running {
                 sources,
                 sink: None,
                 retry_at: None,
+                retire_at: None,
             };
             self.sinks.insert(name, local);
             self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
@@ -552,13 +586,17 @@ impl Running {
 
     fn deliver(&mut self, now: Now, packet: &Packet) {
         let name = packet.header.name;
-        let Some(local) = self.sinks.get_mut(&name) else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        let Some(sink) = &mut local.sink else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        match sink.handle_packet(packet) {
+        let sink = self.sinks.get_mut(&name).and_then(|local| local.sink.as_mut());
+        match sink.map(|sink| sink.handle_packet(packet)) {
+            Some(delivery) => self.delivered(now, name, delivery),
+            None => self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted),
+        }
+    }
+
+    /// What a packet came to.
+    fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
+        let Some(local) = self.sinks.get_mut(&name) else { return };
+        match delivery {
             Ok(Delivery::Message(message)) => {
                 let (owner, topic, use_number) = (local.owner, local.topic.clone(), local.use_number);
                 self.effects.push(Effect::Delivered { owner, topic, id: number(&message), use_number });
@@ -568,11 +606,11 @@ impl Running {
                 self.endpoint.recover(name, source, 1, u64::MAX);
             }
             Ok(Delivery::Synced(_)) => {
-                if sink.unsynced().next().is_none() {
+                if local.sink.as_ref().is_none_or(|sink| sink.unsynced().next().is_none()) {
                     local.retry_at = None;
                 }
             }
-            Ok(Delivery::Incomplete) => {}
+            Ok(Delivery::Incomplete | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }
     }
