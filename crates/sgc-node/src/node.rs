@@ -14,7 +14,9 @@ use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Router, RouterConfig};
-use sgc_transport::{CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics};
+use sgc_transport::{
+    CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
+};
 use sgc_trust::{Identity, IdentityError, Policy};
 use sgc_wire::Metadata;
 use tokio::io::AsyncWriteExt;
@@ -215,8 +217,7 @@ pub async fn run_on<N: RosNetwork>(
         anchors: Arc::new(identity.anchors().clone()),
         limits: sgc_router::Limits::default(),
     });
-    let endpoint_config =
-        EndpointConfig {
+    let endpoint_config = EndpointConfig {
         identity: identity.clone(),
         authority: false,
         limits: sgc_endpoint::Limits::default(),

@@ -54,6 +54,8 @@ pub struct Sharing {
     pub depth: usize,
     /// True if links may lose it.
     pub best_effort: bool,
+    /// These nodes may publish too.
+    pub publishers: BTreeSet<NodeKey>,
     /// How it is protected, unless as usual.
     pub suite: Option<Suite>,
 }
@@ -109,6 +111,10 @@ pub(crate) struct Node {
     pub(crate) runs: u64,
     /// What arrived while it was stopped in its tracks; `None` while it is not.
     pub(crate) frozen: Option<VecDeque<Arrival>>,
+    /// By how much its clock is ahead, milliseconds.
+    pub(crate) skew_ms: i64,
+    /// Whom it believes, revocations included; kept over restarts. `None` for what its identity says.
+    pub(crate) anchors: Option<Arc<TrustAnchors>>,
 }
 
 /// What may arrive at a node.
@@ -128,6 +134,8 @@ pub(crate) enum Effect {
     Close(LinkId, LinkClose),
     /// A message came through.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
+    /// Remember whom it believes.
+    Trust(Arc<TrustAnchors>),
     /// Something a test may want to see.
     Log(What),
 }
@@ -185,11 +193,13 @@ impl Node {
     pub(crate) fn start(&mut self, now: Now, seed: u64, directory: &Directory) {
         self.runs += 1;
         self.frozen = None;
+        let own = || Arc::new(self.identity.anchors().clone());
+        let anchors = self.anchors.clone().unwrap_or_else(own);
         let router = Router::new(RouterConfig {
             node: self.identity.node_id(),
             transit: self.transit,
             incarnation: seed,
-            anchors: Arc::new(self.identity.anchors().clone()),
+            anchors: anchors.clone(),
             limits: self.router_limits.clone(),
         });
         let config = EndpointConfig {
@@ -197,13 +207,14 @@ impl Node {
             authority: false,
             limits: self.endpoint_limits.clone(),
         };
-        let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        let mut endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        endpoint.set_anchors(now, anchors.clone());
         let mut running = Running {
             run: self.runs,
             router,
             endpoint,
             identity: self.identity.clone(),
-            anchors: Arc::new(self.identity.anchors().clone()),
+            anchors,
             next_link: 1,
             links: BTreeMap::new(),
             fib: BTreeMap::new(),
@@ -279,20 +290,9 @@ impl Running {
         sharing: &Sharing,
         directory: &Directory,
     ) -> Option<Name> {
-        let secret = self.identity.fleet_secret()?;
-        let own = self.identity.as_peer();
-        let id = |node: &NodeKey| {
-            directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
-        };
-        let policy = Policy {
-            subscribe: Grantees {
-                fleets: sharing.fleet.then_some(own.ca).into_iter().collect(),
-                nodes: sharing.nodes.iter().map(id).collect(),
-                groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
-            },
-            ..Policy::default()
-        };
+        self.identity.fleet_secret()?;
         let suite = sharing.suite.unwrap_or(Suite::DEFAULT);
+        let policy = policy(&self.identity, sharing, directory);
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {
             0 => Vec::new(),
@@ -411,6 +411,7 @@ impl Running {
                 }
                 sgc_router::Output::Trust(anchors) => {
                     self.anchors = anchors.clone();
+                    self.effects.push(Effect::Trust(anchors.clone()));
                     self.endpoint.set_anchors(now, anchors);
                     self.drain_endpoint(now);
                 }
@@ -617,6 +618,23 @@ impl Running {
 
     fn drop_packet(&mut self, name: Name, ingress: LinkId, why: DataDrop) {
         self.effects.push(Effect::Log(What::DataDrop { name, ingress, why }));
+    }
+}
+
+/// Who may join, as a node's policy says it.
+pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory) -> Policy {
+    let ca = owner.as_peer().ca;
+    let id = |node: &NodeKey| {
+        directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
+    };
+    let group = |g: &String| owner.fleet_secret().map(|s| (ca, s.group_tag(g)));
+    Policy {
+        subscribe: Grantees {
+            fleets: sharing.fleet.then_some(ca).into_iter().collect(),
+            nodes: sharing.nodes.iter().map(id).collect(),
+            groups: sharing.groups.iter().filter_map(group).collect(),
+        },
+        publish: Grantees { nodes: sharing.publishers.iter().map(id).collect(), ..Grantees::default() },
     }
 }
 
