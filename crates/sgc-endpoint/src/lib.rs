@@ -9,8 +9,11 @@
 //! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
+mod compat;
 mod endpoint;
+mod joiner;
 mod joins;
+mod owner;
 mod parking;
 mod partial;
 mod shares;
@@ -18,7 +21,7 @@ mod sink;
 mod source;
 
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
-pub use joins::{JoinStatus, LostReason, RefusedBy};
+pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
 pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
 pub use sink::{Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits};

@@ -11,11 +11,11 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkLimits, Source,
-    SourceConfig,
+    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkDrop, SinkLimits,
+    Source, SourceConfig, Wish,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, Router, RouterConfig};
-use sgc_trust::{Grantees, Identity, Policy, Suite, derive_name};
+use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
+use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
@@ -141,6 +141,8 @@ pub(crate) struct Running {
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
     identity: Arc<Identity>,
+    /// Whom it believes by now.
+    pub(crate) anchors: Arc<TrustAnchors>,
     next_link: u32,
     /// Wire and side of each link that is up.
     pub(crate) links: BTreeMap<LinkId, (usize, usize)>,
@@ -184,13 +186,18 @@ impl Node {
             anchors: Arc::new(self.identity.anchors().clone()),
             limits: self.router_limits.clone(),
         });
-        let config = EndpointConfig { identity: self.identity.clone(), limits: self.endpoint_limits.clone() };
+        let config = EndpointConfig {
+            identity: self.identity.clone(),
+            authority: false,
+            limits: self.endpoint_limits.clone(),
+        };
         let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
         let mut running = Running {
             run: self.runs,
             router,
             endpoint,
             identity: self.identity.clone(),
+            anchors: Arc::new(self.identity.anchors().clone()),
             next_link: 1,
             links: BTreeMap::new(),
             fib: BTreeMap::new(),
@@ -215,11 +222,11 @@ impl Node {
 }
 
 impl Running {
-    pub(crate) fn new_link(&mut self, wire: usize, side: usize, peer: NodeId) -> LinkId {
+    pub(crate) fn new_link(&mut self, now: Now, wire: usize, side: usize, peer: Neighbour) -> LinkId {
         let link = LinkId(self.next_link);
         self.next_link += 1;
         self.links.insert(link, (wire, side));
-        self.router.handle_link_up(link, peer);
+        self.router.handle_link_up(now, link, peer);
         link
     }
 
@@ -297,7 +304,9 @@ impl Running {
             history_bytes_max: HISTORY_BYTES_MAX,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
-        let source = Source::new(config, grant).expect("the group suite is in every build");
+        let key = MessageKey::generate(Suite::Group);
+        let source = Source::new(config, &grant, key).expect("the group suite is in every build");
+        self.endpoint.set_sources(now, &name, vec![source.progress()]);
         self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
         Some(name)
     }
@@ -320,13 +329,12 @@ impl Running {
         self.reconcile(now, owner);
     }
 
-    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str) {
         self.uses.remove(&(owner, topic.to_owned()));
         self.reconcile(now, owner);
         if self.uses.iter().all(|(o, _)| *o != owner) {
-            if let (Some(secret), Some(id)) = (self.identity.fleet_secret(), self.owners.remove(&owner)) {
-                let name = derive_name(secret, &id, &Metadata::catalogue(&directory.names[owner.0]));
-                self.endpoint.leave(now, &name);
+            if let Some(id) = self.owners.remove(&owner) {
+                self.endpoint.unfollow(now, &id);
             }
             self.catalogues.remove(&owner);
         }
@@ -339,7 +347,10 @@ impl Running {
         let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
         let source = local.source.id();
         let mut packets = Vec::new();
-        local.source.publish(&head, &payload, |p| packets.push(p)).expect("tests publish what fits");
+        local
+            .source
+            .publish(&head, payload.into(), false, |p| packets.push(p))
+            .expect("tests publish what fits");
         for packet in packets {
             // As in the driver: what nobody asked for is not sent.
             if self.fib.contains_key(&packet.header.name) {
@@ -383,6 +394,11 @@ impl Running {
                 sgc_router::Output::Close { link, reason } => {
                     self.effects.push(Effect::Close(link, reason));
                 }
+                sgc_router::Output::Trust(anchors) => {
+                    self.anchors = anchors.clone();
+                    self.endpoint.set_anchors(now, anchors);
+                    self.drain_endpoint(now);
+                }
                 sgc_router::Output::Dropped(dropped) => {
                     self.effects.push(Effect::Log(What::RouterDrop(dropped)));
                 }
@@ -414,16 +430,29 @@ impl Running {
 
     fn handle_event(&mut self, now: Now, event: Event) {
         match event {
-            Event::Granted { name, grant } => {
+            Event::Granted { name, sink: id, grant } => {
                 if let Some(local) = self.sinks.get_mut(&name) {
+                    let mut released = Vec::new();
                     match &mut local.sink {
-                        Some(sink) => sink.regrant(grant),
+                        Some(sink) => sink.regrant(id, grant, |result| released.push(result)),
                         None => {
                             let limits = SinkLimits::default();
-                            local.sink = Some(Sink::new(name, grant, local.transient_local, limits));
+                            local.sink = Some(Sink::new(name, id, grant, local.transient_local, limits));
                         }
                     }
+                    for result in released {
+                        self.handle_delivery(now, name, result);
+                    }
                     self.ask_history(now, name);
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                let mut packets = Vec::new();
+                if let Some(local) = self.sources.get_mut(&name) {
+                    let _ = local.source.rekey(&grant, |p| packets.push(p));
+                }
+                for packet in packets {
+                    self.forward(now, LinkId::LOCAL, packet);
                 }
             }
             Event::Catalogue { owner, catalogue } => {
@@ -435,7 +464,7 @@ impl Running {
             }
             Event::Recover(recover) => {
                 let mut packets = Vec::new();
-                if let Some(local) = self.sources.get(&recover.name)
+                if let Some(local) = self.sources.get_mut(&recover.name)
                     && local.source.id() == recover.source
                 {
                     local.source.replay(recover.sink, recover.from, recover.to, |p| packets.push(p));
@@ -450,14 +479,11 @@ impl Running {
 
     /// Joins what is wanted and in the owner's catalogue, leaves what is not.
     fn reconcile(&mut self, now: Now, owner: NodeKey) {
-        let (Some(secret), Some(owner_id)) = (self.identity.fleet_secret(), self.owners.get(&owner).copied())
-        else {
-            return;
-        };
+        let Some(owner_id) = self.owners.get(&owner).copied() else { return };
         let mut wanted = BTreeMap::new();
         for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries) {
             if self.uses.contains(&(owner, entry.metadata.ros_name.clone())) {
-                wanted.insert(derive_name(secret, &owner_id, &entry.metadata), entry.clone());
+                wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
             }
         }
         let gone: Vec<_> = self
@@ -493,7 +519,7 @@ impl Running {
                 retry_at: None,
             };
             self.sinks.insert(name, local);
-            self.endpoint.join(now, name, owner_id);
+            self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
         }
     }
 
@@ -550,7 +576,14 @@ impl Running {
         let Some(sink) = &mut local.sink else {
             return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
         };
-        match sink.handle_packet(packet) {
+        let result = sink.handle_packet(packet);
+        self.handle_delivery(now, name, result);
+    }
+
+    /// What a packet came to, at once or when a grant explained it.
+    fn handle_delivery(&mut self, now: Now, name: Name, result: Result<Delivery, SinkDrop>) {
+        let Some(local) = self.sinks.get_mut(&name) else { return };
+        match result {
             Ok(Delivery::Message(message)) => {
                 let (owner, topic, use_number) = (local.owner, local.topic.clone(), local.use_number);
                 self.effects.push(Effect::Delivered { owner, topic, id: number(&message), use_number });
@@ -560,11 +593,11 @@ impl Running {
                 self.endpoint.recover(name, source, 1, u64::MAX);
             }
             Ok(Delivery::Synced(_)) => {
-                if sink.unsynced().next().is_none() {
+                if local.sink.as_ref().is_some_and(|sink| sink.unsynced().next().is_none()) {
                     local.retry_at = None;
                 }
             }
-            Ok(Delivery::Incomplete) => {}
+            Ok(Delivery::Incomplete | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }
     }

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{Event, JoinStatus};
-use sgc_router::{LinkId, RouterStats};
+use sgc_endpoint::{Event, JoinStatus, Wish};
+use sgc_router::{LinkId, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
@@ -328,7 +328,7 @@ impl World {
         let Node { uses, running, .. } = &mut self.nodes[node.0];
         uses.remove(&(owner, topic.to_owned()));
         if let Some(running) = running {
-            running.stop_using(now, owner, topic, &self.directory);
+            running.stop_using(now, owner, topic);
         }
         self.settle(node);
     }
@@ -338,7 +338,7 @@ impl World {
         self.note(format!("join blindly {node:?} {owner:?}:{topic}"));
         let (now, name, id) = (self.clock.now(), self.name(owner, topic), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
-            running.endpoint.join(now, name, id);
+            running.endpoint.join(now, name, id, Wish::Subscribe { describe: false });
         }
         self.settle(node);
     }
@@ -697,13 +697,13 @@ impl World {
         }
         let wire = self.wires.len();
         self.cables[cable].wire = Some(wire);
-        let now = self.clock.instant();
+        let (instant, now) = (self.clock.instant(), self.clock.now());
         let ends = [0, 1].map(|side| {
-            let peer = self.identity(ends[1 - side]).node_id();
+            let peer = Neighbour::from(self.identity(ends[1 - side]).as_peer());
             let running = self.nodes[ends[side].0].running.as_mut().expect("checked above");
-            let link = running.new_link(wire, side, peer);
+            let link = running.new_link(now, wire, side, peer);
             let (run, data) = (running.run, BTreeMap::new());
-            WireEnd { node: ends[side], run, link, up: true, control: now, data }
+            WireEnd { node: ends[side], run, link, up: true, control: instant, data }
         });
         let nodes = [ends[0].node, ends[1].node];
         self.wires.push(Wire { cable, carries: true, ends });

@@ -4,13 +4,15 @@
 //! and groups by keyed hashes, so that whoever sees one (a router, the network) learns no name.
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::{digest, hmac};
 use rand_core::CryptoRng;
 use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer,
-    KeyUsagePurpose, PublicKeyData as _, SanType, SerialNumber,
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DistinguishedName, DnType,
+    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyUsagePurpose, PublicKeyData as _,
+    RevokedCertParams, SanType, SerialNumber,
 };
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{DecodeError, GroupTag, Pseudonym, Reader, UnixMillis, Writer};
@@ -27,6 +29,8 @@ use crate::x509::Validity;
 pub const LEAF_VALIDITY_DEFAULT: Duration = Duration::from_secs(90 * 86_400);
 /// How long the CA's certificate holds.
 pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
+/// When a revocation list says that the next one is to be expected; nodes keep to it for longer.
+pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
 /// How long before its making a certificate begins to hold: clocks of machines differ by minutes.
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
 
@@ -183,6 +187,11 @@ impl Fleet {
         for group in groups {
             params.subject_alt_names.push(uri(GROUP_URI, &self.secret.group_tag(group.as_str()))?);
         }
+        if request.router {
+            params.subject_alt_names.push(SanType::URI(
+                crate::verify::ROUTER_URI.to_owned().try_into().map_err(FleetError::making)?,
+            ));
+        }
         params.is_ca = IsCa::ExplicitNoCa;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages =
@@ -208,6 +217,34 @@ impl Fleet {
             reset_key: Some(reset_key),
         };
         Identity::assemble(parts).map_err(FleetError::making)
+    }
+
+    /// Signs a list of certificates that no longer hold, by serial number, and since when: DER, to be handed to every
+    /// node. It replaces lists with a smaller number.
+    pub fn revocation_list_of(
+        &self,
+        revoked: &[(Arc<[u8]>, UnixMillis)],
+        number: u64,
+        now: UnixMillis,
+    ) -> Result<Vec<u8>, FleetError> {
+        let entry = |(serial, at): &(Arc<[u8]>, UnixMillis)| RevokedCertParams {
+            serial_number: SerialNumber::from_slice(serial),
+            revocation_time: date_time!(*at),
+            reason_code: None,
+            invalidity_date: None,
+        };
+        let next_update = after(now, CRL_VALIDITY)?;
+        let params = CertificateRevocationListParams {
+            this_update: date_time!(now),
+            next_update: date_time!(next_update),
+            crl_number: SerialNumber::from(number),
+            issuing_distribution_point: None,
+            revoked_certs: revoked.iter().map(entry).collect(),
+            key_identifier_method: KeyIdMethod::Sha256,
+        };
+        let ca_params = ca_params(&self.key);
+        let issuer = Issuer::from_params(&ca_params, &self.key);
+        Ok(params.signed_by(&issuer).map_err(FleetError::making)?.der().to_vec())
     }
 
     /// Its name, for people.

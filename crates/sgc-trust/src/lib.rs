@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod batch;
+mod crl;
 mod fleet;
 mod grant;
 mod identity;
@@ -23,14 +24,16 @@ mod verify;
 mod x509;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
+pub use crl::CrlError;
 pub use fleet::{
-    CA_VALIDITY, CLOCK_SKEW, EnrollRequest, Fleet, FleetError, FleetSecret, LEAF_VALIDITY_DEFAULT,
+    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
+    LEAF_VALIDITY_DEFAULT,
 };
 pub use grant::{GrantError, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use message_key::{MessageKey, MessageKeyError};
-pub use names::{TopicSecret, derive_name, name_of};
+pub use names::{TopicSecret, derive_name, name_of, renewal_blind};
 pub use pem::PemError;
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};

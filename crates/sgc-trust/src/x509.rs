@@ -1,16 +1,27 @@
-//! The few fields of a certificate that `webpki` checks but does not hand out: validity and the bare public key.
+//! The few fields of certificates and revocation lists that `webpki` checks but does not hand out.
 //!
-//! It verifies nothing and is called only on certificates that `webpki` has parsed, or whose chain it is about
-//! to verify; anything unexpected is `None`.
+//! It verifies nothing and is called only on what `webpki` has parsed, or whose chain it is about to verify;
+//! anything unexpected is `None`.
 
 use sgc_wire::UnixMillis;
 
 const INTEGER: u8 = 0x02;
+const BOOLEAN: u8 = 0x01;
 const BIT_STRING: u8 = 0x03;
+const OCTET_STRING: u8 = 0x04;
+const OBJECT_ID: u8 = 0x06;
 const UTC_TIME: u8 = 0x17;
 const GENERALIZED_TIME: u8 = 0x18;
 const SEQUENCE: u8 = 0x30;
 const VERSION: u8 = 0xa0;
+const CERT_EXTENSIONS: u8 = 0xa3;
+const CRL_EXTENSIONS: u8 = 0xa0;
+
+const KEY_USAGE: &[u8] = &[0x55, 0x1d, 0x0f];
+const CRL_NUMBER: &[u8] = &[0x55, 0x1d, 0x14];
+const DISTRIBUTION_POINT: &[u8] = &[0x55, 0x1d, 0x1c];
+/// Bit 6 of a key usage: the key may sign revocation lists (RFC 5280, 4.2.1.3).
+const CRL_SIGN: u8 = 0x02;
 
 /// From when until when a certificate holds, both inclusive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,11 +56,103 @@ pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
     }
 }
 
+/// True unless a DER certificate has a key usage that leaves out the signing of revocation lists.
+pub(crate) fn may_sign_lists(certificate: &[u8]) -> Option<bool> {
+    let mut certificate = Der(certificate).enter(SEQUENCE)?;
+    let mut tbs = certificate.enter(SEQUENCE)?;
+    while tbs.peek().is_some_and(|tag| tag != CERT_EXTENSIONS) {
+        tbs.skip()?;
+    }
+    if tbs.peek().is_none() {
+        return Some(true);
+    }
+    let extensions = tbs.enter(CERT_EXTENSIONS)?.enter(SEQUENCE)?;
+    match extensions.find_extension(KEY_USAGE)? {
+        None => Some(true),
+        Some(usage) => {
+            let (_unused_bits, bits) = Der(usage).enter(BIT_STRING)?.0.split_first()?;
+            Some(bits.first().is_some_and(|b| b & CRL_SIGN != 0))
+        }
+    }
+}
+
+/// The fields of a DER CertificateList (RFC 5280, 5.1) that decide about it.
+pub(crate) struct ListFields<'a> {
+    /// What is signed: the whole first element.
+    pub(crate) tbs: &'a [u8],
+    /// The outer algorithm identifier without its tag.
+    pub(crate) algorithm: &'a [u8],
+    pub(crate) signature: &'a [u8],
+    /// The issuer's name without its outer tag.
+    pub(crate) issuer: &'a [u8],
+    pub(crate) this_update: UnixMillis,
+    /// Big-endian, without leading zeros; absent in lists of another profile.
+    pub(crate) number: Option<&'a [u8]>,
+    /// True if it has an issuing distribution point: it may speak of some certificates only.
+    pub(crate) is_scoped: bool,
+}
+
+impl<'a> ListFields<'a> {
+    pub(crate) fn of(list: &'a [u8]) -> Option<Self> {
+        let mut list = Der(list).enter(SEQUENCE)?;
+        let from = list.0;
+        let mut fields = list.enter(SEQUENCE)?;
+        let tbs = from.get(..from.len() - list.0.len())?;
+        let algorithm = list.enter(SEQUENCE)?.0;
+        let (0, signature) = list.enter(BIT_STRING)?.0.split_first()? else { return None };
+        fields.enter(INTEGER)?; // version
+        fields.enter(SEQUENCE)?; // signature algorithm
+        let issuer = fields.enter(SEQUENCE)?.0;
+        let this_update = fields.time()?;
+        while fields.peek().is_some_and(|tag| tag != CRL_EXTENSIONS) {
+            fields.skip()?; // next update, revoked certificates
+        }
+        let (mut number, mut is_scoped) = (None, false);
+        if fields.peek().is_some() {
+            let extensions = fields.enter(CRL_EXTENSIONS)?.enter(SEQUENCE)?;
+            is_scoped = extensions.find_extension(DISTRIBUTION_POINT)?.is_some();
+            if let Some(content) = extensions.find_extension(CRL_NUMBER)? {
+                number = Some(without_zeros(Der(content).enter(INTEGER)?.0));
+            }
+        }
+        Some(Self { tbs, algorithm, signature, issuer, this_update, number, is_scoped })
+    }
+}
+
+/// An unsigned big-endian number without leading zeros.
+pub(crate) fn without_zeros(number: &[u8]) -> &[u8] {
+    let zeros = number.iter().take_while(|b| **b == 0).count();
+    number.get(zeros..).unwrap_or_default()
+}
+
+#[derive(Clone, Copy)]
 struct Der<'a>(&'a [u8]);
 
 impl<'a> Der<'a> {
     fn peek(&self) -> Option<u8> {
         self.0.first().copied()
+    }
+
+    /// Steps over one element, whatever it is.
+    fn skip(&mut self) -> Option<()> {
+        let tag = self.peek()?;
+        self.enter(tag).map(drop)
+    }
+
+    /// The value of one extension, if it is among these.
+    fn find_extension(mut self, id: &[u8]) -> Option<Option<&'a [u8]>> {
+        while self.peek().is_some() {
+            let mut extension = self.enter(SEQUENCE)?;
+            let found = extension.enter(OBJECT_ID)?.0;
+            if extension.peek()? == BOOLEAN {
+                extension.enter(BOOLEAN)?; // critical
+            }
+            let value = extension.enter(OCTET_STRING)?.0;
+            if found == id {
+                return Some(Some(value));
+            }
+        }
+        Some(None)
     }
 
     /// Steps over one element with this tag and returns its content.
