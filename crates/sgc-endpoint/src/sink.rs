@@ -452,6 +452,9 @@ impl Sink {
         };
         let Some(source) = self.sources.get_mut(&header.source) else { return Err(SinkDrop::UnknownSource) };
         if header.seq == 0 {
+            if head.is_none() || header.total > 0 {
+                return Err(SinkDrop::Head);
+            }
             source.synced = true;
             return Ok(Delivery::Synced(header.source));
         }
