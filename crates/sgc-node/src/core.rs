@@ -748,6 +748,7 @@ impl<N: RosNetwork> Core<N> {
                 peer: entry.link.peer().node_id.to_string(),
                 remote: entry.link.remote().to_string(),
                 url: entry.url.clone(),
+                kex: stats.key_exchange.label(),
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,

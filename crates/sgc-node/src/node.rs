@@ -21,7 +21,7 @@ use sgc_trust::{Identity, IdentityError, Policy};
 use sgc_wire::Metadata;
 use tokio::io::AsyncWriteExt;
 use tokio::net::UnixListener;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
@@ -260,8 +260,14 @@ pub async fn run_on<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
+    let (_redial, on_redial) = watch::channel(());
     for url in &config.routers {
-        tasks.push(tokio::spawn(keep_dialled(url.clone(), dialer.clone(), events.clone())));
+        tasks.push(tokio::spawn(keep_dialled(
+            url.clone(),
+            dialer.clone(),
+            events.clone(),
+            on_redial.clone(),
+        )));
     }
     let mut accepting = Vec::new();
     for listener in listeners {
