@@ -16,6 +16,7 @@ mod policy;
 mod replay;
 mod seal;
 mod signed;
+mod token;
 mod verify;
 mod x509;
 
@@ -33,6 +34,7 @@ pub use seal::{OpenError, SourceKey, Suite, TAG_BYTES, opened_bytes};
 pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, verify_advert, verify_answer, verify_join,
 };
+pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};
 pub use verify::{
     ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, SignatureError, TrustAnchors,
     VerifiedPeer, node_id,
