@@ -43,6 +43,7 @@ pub struct Identity {
 }
 
 /// What an identity consists of.
+#[derive(Clone)]
 pub(crate) struct IdentityParts {
     pub(crate) node: NodeName,
     pub(crate) fleet: FleetName,
@@ -145,6 +146,12 @@ impl Identity {
     /// The CAs that this node trusts.
     pub fn anchors(&self) -> &TrustAnchors {
         &self.parts.anchors
+    }
+
+    /// The same identity, believing these CAs.
+    pub fn with_anchors(&self, anchors: TrustAnchors) -> Self {
+        let parts = IdentityParts { anchors, ..self.parts.clone() };
+        Self { parts, certified: Arc::clone(&self.certified), own: self.own.clone() }
     }
 
     /// The fleet secret; a router has none.

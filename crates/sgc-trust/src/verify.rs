@@ -113,6 +113,20 @@ impl TrustAnchors {
         self.anchors.iter().map(|a| &a.der)
     }
 
+    /// With more CAs; those that are known already count once.
+    pub fn with_anchors(
+        &self,
+        more: impl IntoIterator<Item = CertificateDer<'static>>,
+    ) -> Result<Self, AnchorError> {
+        let mut certificates: Vec<_> = self.certificates().cloned().collect();
+        for certificate in more {
+            if !certificates.contains(&certificate) {
+                certificates.push(certificate);
+            }
+        }
+        Self::new(certificates)
+    }
+
     /// The CAs, by their public keys, in the order of [`TrustAnchors::certificates`].
     pub fn fingerprints(&self) -> impl Iterator<Item = CaFingerprint> {
         self.anchors.iter().map(|a| a.fingerprint)
