@@ -259,6 +259,17 @@ impl Endpoint {
         }
     }
 
+    /// Changes who may join a share.
+    pub fn update_policy(&mut self, now: Now, name: &Name, policy: sgc_trust::Policy) {
+        self.now = now;
+        if let Some(share) = self.shares.shares.get_mut(name)
+            && share.spec.policy != policy
+        {
+            share.spec.policy = policy;
+            self.catalogue_dirty = true;
+        }
+    }
+
     /// Ends a share: withdrawn everywhere, its sinks told.
     pub fn unshare(&mut self, now: Now, name: &Name) {
         self.now = now;
@@ -294,6 +305,12 @@ impl Endpoint {
         self.followed.insert(name, owner);
         self.join(now, name, owner);
         true
+    }
+
+    /// Follows an owner no longer.
+    pub fn unfollow(&mut self, now: Now, owner: &NodeId) {
+        let names: Vec<_> = self.followed.iter().filter(|(_, o)| *o == owner).map(|(n, _)| *n).collect();
+        names.iter().for_each(|name| self.leave(now, name));
     }
 
     /// Joins a name of `owner`; waits for it if need be, and joins again whenever it must.

@@ -427,10 +427,11 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::Granted { name, grant } => {
                 debug!(name = %name.short(), "granted");
+                let entry = grant.entry.as_deref().cloned();
                 if let Some(sink) = self.sinks.get(&name) {
                     sink.grant(grant);
                 }
-                routes.handle_granted(&name);
+                routes.handle_granted(&name, entry);
                 self.ask_histories(name);
             }
             Event::Refused { name, by } => {
@@ -487,7 +488,13 @@ impl<N: RosNetwork> Core<N> {
                     drop_elsewhere(reader);
                 }
             }
-            Command::Join { name, owner, transient_local } => {
+            Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
+            Command::Follow { owner_name } => {
+                self.endpoint.follow(now, &owner_name);
+            }
+            Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
+            // What `describe` asks for is in the join's request.
+            Command::Join { name, owner, transient_local, describe: _ } => {
                 let sink = LocalSink::new(name, transient_local, self.requests.clone());
                 self.sinks.insert(name, Arc::new(sink));
                 self.endpoint.join(now, name, owner);

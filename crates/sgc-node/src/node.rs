@@ -346,6 +346,7 @@ fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),
         type_name: rule.type_name.clone(),
+        token: None,
     })
 }
 
