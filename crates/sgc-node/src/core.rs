@@ -474,11 +474,12 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::Granted { name, sink: id, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
                 if let Some(sink) = self.sinks.get(&name) {
                     sink.grant(id, grant);
                     self.retire_due.insert(name, now.instant + EPOCH_GRACE);
                 }
-                routes.handle_granted(&name);
+                routes.handle_granted(&name, entry);
                 self.ask_histories(name);
             }
             Event::Refused { name, by } => {
@@ -535,10 +536,15 @@ impl<N: RosNetwork> Core<N> {
                     drop_elsewhere(reader);
                 }
             }
-            Command::Join { name, owner, transient_local } => {
+            Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
+            Command::Follow { owner_name } => {
+                self.endpoint.follow(now, &owner_name);
+            }
+            Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
+            Command::Join { name, owner, transient_local, describe } => {
                 let sink = LocalSink::new(name, transient_local, self.requests.clone());
                 self.sinks.insert(name, Arc::new(sink));
-                self.endpoint.join(now, name, owner, Wish::Subscribe { describe: false });
+                self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
             }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
