@@ -15,8 +15,6 @@ use sgc_wire::{
     Recover, RefuseReason, SinkId, SourceId, TopicGrant,
 };
 
-#[allow(unused)]
-use crate::compat::*;
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
 

@@ -13,8 +13,6 @@ use sgc_wire::{
 };
 
 use crate::SourceProgress;
-#[allow(unused)]
-use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 

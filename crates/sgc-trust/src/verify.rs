@@ -416,7 +416,10 @@ pub enum CertError {
     #[error("the certificate cannot be used: {0}")]
     Malformed(String),
     /// The leaf does not say which node it is for.
-    #[error("the certificate names no SGC node: it was not made by `sgc fleet enroll`")]
+    #[error(
+        "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign a \
+         request that `sgc fleet request` made, with its subject alternative names"
+    )]
     NoPseudonym,
     /// The leaf names too many groups.
     #[error("the certificate names more than {GROUPS_MAX} groups")]
