@@ -75,9 +75,9 @@ fn take(text: &str, label: &str) -> (Vec<u8>, String) {
 fn the_roster_knows_who_was_enrolled_and_as_what() {
     let mut fleet = fleet();
     let groups = vec!["b".parse().unwrap(), "a".parse().unwrap(), "b".parse().unwrap()];
-    let arm = fleet.issue(&EnrollRequest { groups, ..request("arm-1") }, &mut rng(2)).unwrap();
-    let cloud = fleet.issue(&EnrollRequest { router: true, ..request("cloud") }, &mut rng(3)).unwrap();
-    let relay = fleet.issue(&EnrollRequest { may_route: true, ..request("relay") }, &mut rng(4)).unwrap();
+    let arm = fleet.enroll(&EnrollRequest { groups, ..request("arm-1") }, &mut rng(2)).unwrap();
+    let cloud = fleet.enroll(&EnrollRequest { router: true, ..request("cloud") }, &mut rng(3)).unwrap();
+    let relay = fleet.enroll(&EnrollRequest { may_route: true, ..request("relay") }, &mut rng(4)).unwrap();
     let fleet = again(&fleet);
     let nodes: Vec<_> = fleet.nodes().collect();
     assert_eq!(nodes.iter().map(|n| n.name.as_str()).collect::<Vec<_>>(), ["arm-1", "cloud", "relay"]);
@@ -102,7 +102,7 @@ fn the_roster_knows_who_was_enrolled_and_as_what() {
 #[test]
 fn no_flipped_bit_of_a_roster_is_accepted() {
     let mut fleet = fleet();
-    fleet.issue(&request("arm-1"), &mut rng(2)).unwrap();
+    fleet.enroll(&request("arm-1"), &mut rng(2)).unwrap();
     let (roster, rest) = take(&fleet.to_text(), "SGC ROSTER");
     assert!(Fleet::parse(&format!("{rest}{}", block("SGC ROSTER", &roster))).is_ok());
     for bit in 0..roster.len() * 8 {
@@ -141,9 +141,9 @@ fn a_file_from_before_rosters_is_read_and_gets_one_when_it_changes() {
 #[test]
 fn revoking_a_node_takes_back_all_of_its_certificates() {
     let mut fleet = fleet();
-    let first = fleet.issue(&request("arm-1"), &mut rng(2)).unwrap();
+    let first = fleet.enroll(&request("arm-1"), &mut rng(2)).unwrap();
     let second = fleet.renew(&name("arm-1"), VALID, at(1), &mut rng(3)).unwrap();
-    let desk = fleet.issue(&request("desk"), &mut rng(4)).unwrap();
+    let desk = fleet.enroll(&request("desk"), &mut rng(4)).unwrap();
     let error = fleet.revoke(&[name("desk"), name("nobody")], at(2)).unwrap_err();
     assert!(matches!(error, FleetError::UnknownNode { node } if node == "nobody"));
     assert!(fleet.nodes().all(|n| n.revoked.is_none()), "all or none");
@@ -161,9 +161,9 @@ fn revoking_a_node_takes_back_all_of_its_certificates() {
     let renewed = fleet.renew_csr(&csr, &pseudonym, VALID, now, &mut rng(5));
     assert!(matches!(renewed, Err(FleetError::NodeRevoked { .. })));
     assert!(matches!(fleet.credentials_for(&name("arm-1"), vec![]), Err(FleetError::NodeRevoked { .. })));
-    let enrolled = fleet.issue(&request("arm-1"), &mut rng(5));
+    let enrolled = fleet.enroll(&request("arm-1"), &mut rng(5));
     assert!(matches!(enrolled, Err(FleetError::NodeRevoked { .. })));
-    let third = fleet.issue(&EnrollRequest { again: true, ..request("arm-1") }, &mut rng(5)).unwrap();
+    let third = fleet.enroll(&EnrollRequest { again: true, ..request("arm-1") }, &mut rng(5)).unwrap();
     assert!(refused(&fleet, &first) && refused(&fleet, &second) && !refused(&fleet, &third));
     // Numbers grow also where the clock was set back.
     fleet.revoke(&[name("desk")], NOW).unwrap();
@@ -221,8 +221,8 @@ fn credentials_renew_an_identity_and_nothing_else() {
     fleet.set_authority(Some(name("desk")), NOW).unwrap();
     fleet.set_post_quantum(true, NOW).unwrap();
     let groups = vec!["operators".parse().unwrap()];
-    let arm = fleet.issue(&EnrollRequest { groups, ..request("arm-1") }, &mut rng(2)).unwrap();
-    let desk = fleet.issue(&request("desk"), &mut rng(3)).unwrap();
+    let arm = fleet.enroll(&EnrollRequest { groups, ..request("arm-1") }, &mut rng(2)).unwrap();
+    let desk = fleet.enroll(&request("desk"), &mut rng(3)).unwrap();
     assert_eq!(arm.authority(), Some(desk.node_id()));
     assert!(arm.post_quantum());
     assert_eq!(fleet.rotate_secret(at(30), &mut rng(4)).unwrap(), 2);
@@ -266,7 +266,7 @@ fn credentials_renew_an_identity_and_nothing_else() {
     assert!(matches!(with(&|c| c.chain.clear()), Err(IdentityError::Missing(_))));
     assert!(matches!(with(&|c| c.chain = vec![Bytes::from_static(b"x")]), Err(IdentityError::Chain(_))));
     // A router gets certificates and no secret, and takes none.
-    let cloud = fleet.issue(&EnrollRequest { router: true, ..request("cloud") }, &mut rng(7)).unwrap();
+    let cloud = fleet.enroll(&EnrollRequest { router: true, ..request("cloud") }, &mut rng(7)).unwrap();
     let own = fleet.renew_csr(&cloud.csr(), &cloud.pseudonym(), short, at(1), &mut rng(8)).unwrap();
     assert!(own.secrets.is_empty() && cloud.with_credentials(&own).is_ok());
     let given = Credentials { secrets: credentials.secrets.clone(), ..own };
@@ -276,7 +276,7 @@ fn credentials_renew_an_identity_and_nothing_else() {
 #[test]
 fn secrets_rotate_and_nobody_becomes_another() {
     let mut fleet = fleet();
-    let before = fleet.issue(&request("arm-1"), &mut rng(2)).unwrap();
+    let before = fleet.enroll(&request("arm-1"), &mut rng(2)).unwrap();
     assert!(matches!(fleet.retire_secrets(2), Err(FleetError::NewestGeneration { newest: 1 })));
     for generation in 2..=SECRET_GENERATIONS_MAX as u32 {
         assert_eq!(fleet.rotate_secret(NOW, &mut rng(10)).unwrap(), generation);
@@ -287,7 +287,7 @@ fn secrets_rotate_and_nobody_becomes_another() {
     assert_eq!(fleet.generations().iter().map(|g| g.number).collect::<Vec<_>>(), [7, 8]);
     // Numbers are not used twice.
     assert_eq!(fleet.rotate_secret(NOW, &mut rng(10)).unwrap(), 9);
-    let after = fleet.issue(&request("arm-1"), &mut rng(3)).unwrap();
+    let after = fleet.enroll(&request("arm-1"), &mut rng(3)).unwrap();
     let after = Identity::parse(&after.to_text()).unwrap();
     assert_eq!(after.naming_secrets().iter().map(|n| n.generation).collect::<Vec<_>>(), [9, 8, 7]);
     assert_eq!((after.node_id(), after.pseudonym()), (before.node_id(), before.pseudonym()));
@@ -347,7 +347,7 @@ fn a_fleet_can_be_made_around_a_ca_that_exists() {
             )
         };
         let mut fleet = again(&import(&certificate, &key).unwrap());
-        let arm = fleet.issue(&request("arm-1"), &mut rng(2)).unwrap();
+        let arm = fleet.enroll(&request("arm-1"), &mut rng(2)).unwrap();
         assert!(fleet.anchors().verify(arm.chain(), NOW).is_ok());
         fleet.revoke(&[name("arm-1")], NOW).unwrap();
         let fleet = again(&fleet);
