@@ -12,7 +12,7 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
-use sgc_ros::{RosError, RosNetwork, Routes, UseRule};
+use sgc_ros::{Direction, RosError, RosNetwork, Routes, UseRule};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
@@ -382,6 +382,7 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
 
 fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
     Some(UseRule {
+        direction: Direction::Bring,
         owner: identity.node_id_of(rule.from.as_str())?,
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),
