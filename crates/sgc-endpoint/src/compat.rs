@@ -6,6 +6,7 @@ pub(crate) struct NamingSecret {
 pub(crate) trait IdentityExt {
     fn naming_secrets(&self) -> &'static [NamingSecret];
     fn authority(&self) -> Option<NodeId>;
+    fn post_quantum(&self) -> bool;
 }
 impl IdentityExt for Identity {
     fn naming_secrets(&self) -> &'static [NamingSecret] {
@@ -19,5 +20,8 @@ impl IdentityExt for Identity {
     }
     fn authority(&self) -> Option<NodeId> {
         None
+    }
+    fn post_quantum(&self) -> bool {
+        false
     }
 }

@@ -150,13 +150,13 @@ pub enum Event {
     },
     /// A granted sink asks one of this node's sources for messages.
     Recover(Recover),
-    /// A join was granted.
+    /// A join was granted, or what was granted changed.
     Granted {
         /// The name.
         name: Name,
-        /// The sink that asked; what is sent to it alone is sealed for it alone.
+        /// The sink that it was granted to; another one after the way to the owner changed.
         sink: SinkId,
-        /// Its key.
+        /// Key and sources.
         grant: TopicGrant,
     },
     /// A join was refused; it will be tried again.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use sgc_trust::{
-    Identity, ReplyKey, TopicSecret, VerifiedPeer, name_of, renewal_blind, verify_advert, verify_answer,
+    Identity, Kem, ReplyKey, TopicSecret, VerifiedPeer, name_of, renewal_blind, verify_advert, verify_answer,
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Recover,
@@ -222,7 +222,8 @@ impl Endpoint {
             join.state = JoinState::ExpectAdvert;
             return;
         }
-        let (sink, reply_key) = join.ask(self.now.instant, ReplyKey::generate(), &mut self.rng);
+        let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
+        let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
         let wish = join.wish.clone();
         let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
         self.send(frame);

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_trust::{Denied, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
+use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
     Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
@@ -395,6 +395,12 @@ impl Endpoint {
             }
         };
         let JoinBody { name, sink, request, reply_key, .. } = join.body;
+        // In a post-quantum fleet nothing is granted that a recording could be made to tell later.
+        let identity = &self.config.identity;
+        let own_fleet = join.peer.ca == identity.as_peer().ca;
+        if identity.post_quantum() && own_fleet && reply_key.len() != Kem::XWing.reply_key_bytes() {
+            return self.refuse(name, sink, 1, RefuseReason::NotVerified);
+        }
         let asked = GrantedSink { peer: join.peer, request, reply_key, serial: 0, told: None };
         if self.is_catalogue(&name) {
             self.handle_follow(name, sink, asked);

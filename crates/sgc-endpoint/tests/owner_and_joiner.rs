@@ -114,7 +114,7 @@ fn owner() -> Bench {
 }
 
 fn join(bench: &Bench, who: &Identity, name: Name, sink: u8) -> (Control, ReplyKey) {
-    let reply_key = ReplyKey::generate();
+    let reply_key = ReplyKey::generate(sgc_trust::Kem::default());
     let body = JoinBody {
         name,
         sink: SinkId([sink; 16]),

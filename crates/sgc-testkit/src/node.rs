@@ -28,6 +28,8 @@ const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
 /// How long a history is waited for before it is asked for again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
+/// How long packets of past epochs may take.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A node of a world.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -52,6 +54,10 @@ pub struct Sharing {
     pub depth: usize,
     /// True if links may lose it.
     pub best_effort: bool,
+    /// These nodes may publish too.
+    pub publishers: BTreeSet<NodeKey>,
+    /// How it is protected, unless as usual.
+    pub suite: Option<Suite>,
 }
 
 impl Sharing {
@@ -105,6 +111,10 @@ pub(crate) struct Node {
     pub(crate) runs: u64,
     /// What arrived while it was stopped in its tracks; `None` while it is not.
     pub(crate) frozen: Option<VecDeque<Arrival>>,
+    /// By how much its clock is ahead, milliseconds.
+    pub(crate) skew_ms: i64,
+    /// Whom it believes, revocations included; kept over restarts. `None` for what its identity says.
+    pub(crate) anchors: Option<Arc<TrustAnchors>>,
 }
 
 /// What may arrive at a node.
@@ -124,6 +134,8 @@ pub(crate) enum Effect {
     Close(LinkId, LinkClose),
     /// A message came through.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
+    /// Remember whom it believes.
+    Trust(Arc<TrustAnchors>),
     /// Something a test may want to see.
     Log(What),
 }
@@ -172,6 +184,8 @@ pub(crate) struct LocalSink {
     sources: Vec<SourceId>,
     sink: Option<Sink>,
     retry_at: Option<Instant>,
+    /// When the keys of past epochs are dropped.
+    retire_at: Option<Instant>,
 }
 
 impl Node {
@@ -179,11 +193,13 @@ impl Node {
     pub(crate) fn start(&mut self, now: Now, seed: u64, directory: &Directory) {
         self.runs += 1;
         self.frozen = None;
+        let own = || Arc::new(self.identity.anchors().clone());
+        let anchors = self.anchors.clone().unwrap_or_else(own);
         let router = Router::new(RouterConfig {
             node: self.identity.node_id(),
             transit: self.transit,
             incarnation: seed,
-            anchors: Arc::new(self.identity.anchors().clone()),
+            anchors: anchors.clone(),
             limits: self.router_limits.clone(),
         });
         let config = EndpointConfig {
@@ -191,13 +207,14 @@ impl Node {
             authority: false,
             limits: self.endpoint_limits.clone(),
         };
-        let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        let mut endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        endpoint.set_anchors(now, anchors.clone());
         let mut running = Running {
             run: self.runs,
             router,
             endpoint,
             identity: self.identity.clone(),
-            anchors: Arc::new(self.identity.anchors().clone()),
+            anchors,
             next_link: 1,
             links: BTreeMap::new(),
             fib: BTreeMap::new(),
@@ -257,6 +274,13 @@ impl Running {
         for name in due {
             self.ask_history(now, name);
         }
+        for local in self.sinks.values_mut() {
+            if local.retire_at.take_if(|at| *at <= now.instant).is_some()
+                && let Some(sink) = &mut local.sink
+            {
+                sink.retire_epochs();
+            }
+        }
     }
 
     pub(crate) fn share(
@@ -266,19 +290,9 @@ impl Running {
         sharing: &Sharing,
         directory: &Directory,
     ) -> Option<Name> {
-        let secret = self.identity.fleet_secret()?;
-        let own = self.identity.as_peer();
-        let id = |node: &NodeKey| {
-            directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
-        };
-        let policy = Policy {
-            subscribe: Grantees {
-                fleets: sharing.fleet.then_some(own.ca).into_iter().collect(),
-                nodes: sharing.nodes.iter().map(id).collect(),
-                groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
-            },
-            ..Policy::default()
-        };
+        self.identity.fleet_secret()?;
+        let suite = sharing.suite.unwrap_or(Suite::DEFAULT);
+        let policy = policy(&self.identity, sharing, directory);
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {
             0 => Vec::new(),
@@ -287,7 +301,7 @@ impl Running {
         let spec = ShareSpec {
             metadata: metadata(self.identity.node_name().as_str(), topic),
             policy,
-            suite: Suite::Group,
+            suite,
             class: Class::Default,
             keyless: true,
             type_hash: None,
@@ -304,8 +318,8 @@ impl Running {
             history_bytes_max: HISTORY_BYTES_MAX,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
-        let key = MessageKey::generate(Suite::Group);
-        let source = Source::new(config, &grant, key).expect("the group suite is in every build");
+        let message_key = MessageKey::generate(suite);
+        let source = Source::new(config, &grant, message_key).expect("a key of that suite");
         self.endpoint.set_sources(now, &name, vec![source.progress()]);
         self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
         Some(name)
@@ -373,7 +387,8 @@ impl Running {
         if let sgc_endpoint::Output::Timeout(Some(at)) = self.endpoint.poll_output() {
             wake = Some(wake.map_or(at, |w: Instant| w.min(at)));
         }
-        self.wake = self.sinks.values().filter_map(|s| s.retry_at).chain(wake).min();
+        let sinks = self.sinks.values().flat_map(|s| [s.retry_at, s.retire_at]).flatten();
+        self.wake = sinks.chain(wake).min();
         std::mem::take(&mut self.effects)
     }
 
@@ -396,6 +411,7 @@ impl Running {
                 }
                 sgc_router::Output::Trust(anchors) => {
                     self.anchors = anchors.clone();
+                    self.effects.push(Effect::Trust(anchors.clone()));
                     self.endpoint.set_anchors(now, anchors);
                     self.drain_endpoint(now);
                 }
@@ -431,20 +447,20 @@ impl Running {
     fn handle_event(&mut self, now: Now, event: Event) {
         match event {
             Event::Granted { name, sink: id, grant } => {
-                if let Some(local) = self.sinks.get_mut(&name) {
-                    let mut released = Vec::new();
-                    match &mut local.sink {
-                        Some(sink) => sink.regrant(id, grant, |result| released.push(result)),
-                        None => {
-                            let limits = SinkLimits::default();
-                            local.sink = Some(Sink::new(name, id, grant, local.transient_local, limits));
-                        }
+                let Some(local) = self.sinks.get_mut(&name) else { return };
+                let mut released = Vec::new();
+                match &mut local.sink {
+                    Some(sink) => sink.regrant(id, grant, |delivery| released.push(delivery)),
+                    None => {
+                        let limits = SinkLimits::default();
+                        local.sink = Some(Sink::new(name, id, grant, local.transient_local, limits));
                     }
-                    for result in released {
-                        self.handle_delivery(now, name, result);
-                    }
-                    self.ask_history(now, name);
                 }
+                local.retire_at = Some(now.instant + EPOCH_GRACE);
+                for delivery in released {
+                    self.delivered(now, name, delivery);
+                }
+                self.ask_history(now, name);
             }
             Event::Rekeyed { name, grant } => {
                 let mut packets = Vec::new();
@@ -517,6 +533,7 @@ impl Running {
                 sources,
                 sink: None,
                 retry_at: None,
+                retire_at: None,
             };
             self.sinks.insert(name, local);
             self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
@@ -570,20 +587,17 @@ impl Running {
 
     fn deliver(&mut self, now: Now, packet: &Packet) {
         let name = packet.header.name;
-        let Some(local) = self.sinks.get_mut(&name) else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        let Some(sink) = &mut local.sink else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        let result = sink.handle_packet(packet);
-        self.handle_delivery(now, name, result);
+        let sink = self.sinks.get_mut(&name).and_then(|local| local.sink.as_mut());
+        match sink.map(|sink| sink.handle_packet(packet)) {
+            Some(delivery) => self.delivered(now, name, delivery),
+            None => self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted),
+        }
     }
 
-    /// What a packet came to, at once or when a grant explained it.
-    fn handle_delivery(&mut self, now: Now, name: Name, result: Result<Delivery, SinkDrop>) {
+    /// What a packet came to.
+    fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
         let Some(local) = self.sinks.get_mut(&name) else { return };
-        match result {
+        match delivery {
             Ok(Delivery::Message(message)) => {
                 let (owner, topic, use_number) = (local.owner, local.topic.clone(), local.use_number);
                 self.effects.push(Effect::Delivered { owner, topic, id: number(&message), use_number });
@@ -593,7 +607,7 @@ impl Running {
                 self.endpoint.recover(name, source, 1, u64::MAX);
             }
             Ok(Delivery::Synced(_)) => {
-                if local.sink.as_ref().is_some_and(|sink| sink.unsynced().next().is_none()) {
+                if local.sink.as_ref().is_none_or(|sink| sink.unsynced().next().is_none()) {
                     local.retry_at = None;
                 }
             }
@@ -604,6 +618,23 @@ impl Running {
 
     fn drop_packet(&mut self, name: Name, ingress: LinkId, why: DataDrop) {
         self.effects.push(Effect::Log(What::DataDrop { name, ingress, why }));
+    }
+}
+
+/// Who may join, as a node's policy says it.
+pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory) -> Policy {
+    let ca = owner.as_peer().ca;
+    let id = |node: &NodeKey| {
+        directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
+    };
+    let group = |g: &String| owner.fleet_secret().map(|s| (ca, s.group_tag(g)));
+    Policy {
+        subscribe: Grantees {
+            fleets: sharing.fleet.then_some(ca).into_iter().collect(),
+            nodes: sharing.nodes.iter().map(id).collect(),
+            groups: sharing.groups.iter().filter_map(group).collect(),
+        },
+        publish: Grantees { nodes: sharing.publishers.iter().map(id).collect(), ..Grantees::default() },
     }
 }
 

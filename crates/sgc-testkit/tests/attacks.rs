@@ -5,7 +5,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};
 use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, identity};
-use sgc_trust::Identity;
+use sgc_trust::{Identity, Suite};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
     RejectReason, Request, Role, Signed, SinkId, SourceId, SourceOffer,
@@ -229,7 +229,7 @@ fn join(identity: &Identity, world: &World, owner: NodeKey, sink: SinkId, role: 
         },
         issued_at: world.now().unix,
         chain: identity.chain_bytes(),
-        reply_key: sgc_trust::ReplyKey::generate().public().clone(),
+        reply_key: sgc_trust::ReplyKey::generate(sgc_trust::Kem::default()).public().clone(),
     };
     Control::Join { signed: identity.sign_join(&body) }
 }
@@ -296,22 +296,22 @@ fn a_captured_join_does_not_move_or_take_a_sinks_place() {
     assert!(world.all_received().iter().all(|r| r.node == *desk));
 }
 
-fn packet(world: &World, owner: NodeKey, to: Option<SinkId>) -> Packet {
+fn packet(world: &World, owner: NodeKey, source: SourceId, to: Option<SinkId>) -> Packet {
     let header = PacketHeader {
         reliable: true,
         class: Class::Default,
         hops: 30,
-        suite: 1,
+        suite: Suite::DEFAULT.id(),
         epoch: 1,
         name: world.name(owner, "/chatter"),
-        source: SourceId([9; 16]),
+        source,
         seq: 1,
         total: 8,
         index: 0,
         grid: 16 * 1024,
         to,
     };
-    Packet::new(header, Bytes::from(vec![0; 8 + 12 + 16]).into()).expect("far below the bound")
+    Packet::new(header, Bytes::from(vec![0; 8 + 12 + 16 + 4 + 64]).into()).expect("far below the bound")
 }
 
 #[test]

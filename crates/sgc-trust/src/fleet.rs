@@ -187,7 +187,7 @@ impl Fleet {
         for group in groups {
             params.subject_alt_names.push(uri(GROUP_URI, &self.secret.group_tag(group.as_str()))?);
         }
-        if request.router {
+        if request.router || request.may_route {
             params.subject_alt_names.push(SanType::URI(
                 crate::verify::ROUTER_URI.to_owned().try_into().map_err(FleetError::making)?,
             ));
@@ -309,6 +309,8 @@ pub struct EnrollRequest {
     /// For a node that only routes: its identity lacks the fleet secret, so that it can derive no name and open
     /// no payload.
     pub router: bool,
+    /// For a member that also carries others' names.
+    pub may_route: bool,
     /// How long the certificate is to hold; never longer than the CA.
     pub valid: Duration,
     /// The time.
@@ -318,7 +320,7 @@ pub struct EnrollRequest {
 impl EnrollRequest {
     /// A node in no group, for [`LEAF_VALIDITY_DEFAULT`].
     pub fn new(node: NodeName, now: UnixMillis) -> Self {
-        Self { node, groups: Vec::new(), router: false, valid: LEAF_VALIDITY_DEFAULT, now }
+        Self { node, groups: Vec::new(), router: false, may_route: false, valid: LEAF_VALIDITY_DEFAULT, now }
     }
 }
 

@@ -9,6 +9,7 @@ mod batch;
 mod crl;
 mod fleet;
 mod grant;
+mod hpke;
 mod identity;
 mod key;
 mod label;
@@ -22,6 +23,7 @@ mod signed;
 mod suite;
 mod verify;
 mod x509;
+mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
 pub use crl::CrlError;
@@ -29,7 +31,7 @@ pub use fleet::{
     CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
     LEAF_VALIDITY_DEFAULT,
 };
-pub use grant::{GrantError, ReplyKey, seal_grant};
+pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use message_key::{MessageKey, MessageKeyError};
