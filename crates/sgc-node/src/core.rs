@@ -4,7 +4,7 @@
 //! happens in tasks and threads of its own.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
@@ -320,6 +320,10 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
         }
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
         for name in over {
@@ -475,7 +479,7 @@ impl<N: RosNetwork> Core<N> {
             Event::Granted { name, sink: id, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
                 if let Some(sink) = self.sinks.get(&name) {
-                    sink.grant(id, grant);
+                    sink.grant(id, grant, &self.data);
                     self.retire_due.insert(name, now.instant + EPOCH_GRACE);
                 }
                 routes.handle_granted(&name);
@@ -583,8 +587,8 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
             };
-            let source = Arc::new(Mutex::new(Source::new(config, &grant, message_key.clone())?));
-            Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
+            let source = Source::new(config, &grant, message_key.clone())?;
+            Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
         let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
