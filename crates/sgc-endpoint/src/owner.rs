@@ -415,6 +415,7 @@ impl Endpoint {
 
     fn handle_subscribe_or_publish(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let peer = asked.peer.node_id;
+        self.replace_publisher(&name, &sink, &asked);
         if let Err(reason) = self.admit(&name, &sink, &asked) {
             self.refuse(name, sink, 1, reason);
             self.event(Event::SinkRefused { name, peer, reason });
@@ -422,7 +423,8 @@ impl Endpoint {
         }
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         let reply_key = asked.reply_key.clone();
-        let publishes = matches!(asked.request, Request::Publish { .. });
+        let role = asked.request.role();
+        let publishes = role == Role::Publish;
         // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
         let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
@@ -440,10 +442,24 @@ impl Endpoint {
             self.grant_again(name, sink);
         }
         if !known {
-            self.event(Event::SinkJoined { name, sink, peer });
+            self.event(Event::SinkJoined { name, sink, peer, role });
         }
         if publishes && !known {
             self.regrant(name);
+        }
+    }
+
+    /// A publisher that asks anew, because the way here changed, may come before its old place is given up.
+    fn replace_publisher(&mut self, name: &Name, sink: &SinkId, asked: &GrantedSink) {
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        let Request::Publish { offer } = &asked.request else { return };
+        let same = |s: &GrantedSink| {
+            let peer = s.peer.node_id == asked.peer.node_id;
+            peer && matches!(&s.request, Request::Publish { offer: o } if o.source == offer.source)
+        };
+        let old = share.sinks.iter().find(|(id, s)| *id != sink && same(s)).map(|(id, _)| *id);
+        if let Some(old) = old {
+            self.handle_leave(*name, old);
         }
     }
 

@@ -3,9 +3,12 @@
 //! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
 //! happens in tasks and threads of its own.
 
+mod publish;
+mod trust;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
@@ -13,15 +16,15 @@ use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConf
 use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
-use sgc_trust::{CrlError, Identity, MessageKey, Suite, TrustAnchors, VerifiedPeer};
+use sgc_trust::{CrlError, Identity, MessageKey, Suite};
 use sgc_wire::{
-    Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, SinkId, SourceId, UnixMillis,
+    Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, Role, SinkId, SourceId, UnixMillis,
 };
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
-use crate::authority;
-use crate::credentials::{Keeper, renew_at, renewed};
+use crate::core::publish::Publishing;
+use crate::credentials::Keeper;
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
 use crate::outflow::OutFlow;
@@ -146,6 +149,9 @@ pub(crate) struct Core<N: RosNetwork> {
     retire_due: BTreeMap<Name, Instant>,
     /// What the messages of this node are signed with, by suite.
     message_keys: BTreeMap<Suite, MessageKey>,
+    publishing: BTreeMap<Name, Publishing>,
+    /// Messages of one source under one key.
+    epoch_messages_max: u64,
     credentials: CredentialStore,
     /// The fleet's file, if this node is the authority of its fleet.
     authority: Option<PathBuf>,
@@ -172,6 +178,8 @@ pub(crate) struct CoreParts<N> {
     pub credentials: CredentialStore,
     /// The fleet's file, if this node is the authority of its fleet.
     pub authority: Option<PathBuf>,
+    /// Messages of one source under one key.
+    pub epoch_messages_max: u64,
     /// Writes what outlives the process.
     pub(crate) keeper: Keeper,
     /// Tells the dialling tasks that there is another certificate.
@@ -219,6 +227,8 @@ impl<N: RosNetwork> Core<N> {
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
             message_keys: BTreeMap::new(),
+            publishing: BTreeMap::new(),
+            epoch_messages_max: parts.epoch_messages_max,
             credentials: parts.credentials,
             authority: parts.authority,
             keeper: parts.keeper,
@@ -365,6 +375,11 @@ impl<N: RosNetwork> Core<N> {
         if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
             self.ask_renewal();
         }
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
+        self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
         for name in over {
@@ -402,10 +417,9 @@ impl<N: RosNetwork> Core<N> {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
-                return [router, endpoint, routes, history, retire, self.renew_due]
-                    .into_iter()
-                    .flatten()
-                    .min();
+                let rekey = self.rekey_deadline();
+                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due];
+                return all.into_iter().flatten().min();
             }
         }
     }
@@ -485,12 +499,54 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn endpoint_event(&mut self, now: Now, event: Event) {
+        match event {
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name) {
+                    share.replay(recover, &self.replays);
+                }
+            }
+            Event::Granted { name, sink, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
+                if self.publishing_granted(now, name, &grant) {
+                    debug!(name = %name.short(), "publishing under it");
+                } else if let Some(local) = self.sinks.get(&name) {
+                    local.grant(sink, grant, &self.data);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                }
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_granted(&name, entry);
+                }
+                self.ask_histories(name);
+            }
+            event => self.route_event(now, event),
+        }
+    }
+
+    /// What concerns the routes alone.
+    fn route_event(&mut self, now: Now, event: Event) {
         let Some(routes) = &mut self.routes else { return };
         match event {
-            Event::SinkJoined { name, sink, peer } => {
+            Event::SinkJoined { name, sink, peer, role } => {
                 info!(peer = %peer.short(), "granted a subscriber");
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
-                routes.handle_sink_joined(&name, sink);
+                if role == Role::Subscribe {
+                    routes.handle_sink_joined(&name, sink);
+                }
             }
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
@@ -501,40 +557,11 @@ impl<N: RosNetwork> Core<N> {
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 routes.handle_sink_left(now.instant, &name, &sink);
             }
-            Event::Rekeyed { name, grant } => {
-                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
-                if let Some(share) = self.shares.get(&name) {
-                    share.rekey(grant);
-                }
-            }
-            Event::OwnGrant { .. } => {}
-            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
-            Event::Renewed { credentials } => self.take_credentials(credentials),
-            Event::RenewRefused { by } => {
-                if self.control_drops.count("renewal_refused") {
-                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
-                }
-            }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 if self.control_drops.count_from("join_refused", peer.short()) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
-            }
-            Event::Recover(recover) => {
-                if let Some(share) = self.shares.get(&recover.name) {
-                    share.replay(recover, &self.replays);
-                }
-            }
-            Event::Granted { name, sink: id, grant } => {
-                debug!(name = %name.short(), epoch = grant.epoch, "granted");
-                let entry = grant.entry.as_deref().cloned();
-                if let Some(sink) = self.sinks.get(&name) {
-                    sink.grant(id, grant);
-                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
-                }
-                routes.handle_granted(&name, entry);
-                self.ask_histories(name);
             }
             Event::Refused { name, by } => {
                 warn!(reason = %by, "a topic is refused to this node; asking again later");
@@ -557,6 +584,13 @@ impl<N: RosNetwork> Core<N> {
                 warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
                 routes.handle_owner_refused(owner, by);
             }
+            Event::RenewAsked { .. }
+            | Event::Renewed { .. }
+            | Event::RenewRefused { .. }
+            | Event::Rekeyed { .. }
+            | Event::OwnGrant { .. }
+            | Event::Recover(_)
+            | Event::Granted { .. } => {}
         }
     }
 
@@ -568,7 +602,12 @@ impl<N: RosNetwork> Core<N> {
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
                         debug!(%topic, %name, "shared");
-                        let share = LocalShare::new(name, self.data.clone(), self.alive.clone());
+                        let share = LocalShare::new(
+                            name,
+                            self.data.clone(),
+                            self.alive.clone(),
+                            self.epoch_messages_max,
+                        );
                         self.shares.insert(name, Arc::new(share));
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
@@ -581,6 +620,9 @@ impl<N: RosNetwork> Core<N> {
                 self.endpoint.unshare(now, &name);
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();
+                }
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
                 }
             }
             Command::MapSources { name, qos, class, own } => self.map_sources(name, &qos, class, own),
@@ -600,8 +642,12 @@ impl<N: RosNetwork> Core<N> {
                 self.sinks.insert(name, Arc::new(sink));
                 self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
             }
+            Command::Publish { name, owner, suite, class, reliable } => {
+                self.publish_under(name, owner, suite, class, reliable);
+            }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
+                self.stop_publishing(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
                     sink.close();
                 }
@@ -643,8 +689,8 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
             };
-            let source = Arc::new(Mutex::new(Source::new(config, &grant, message_key.clone())?));
-            Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
+            let source = Source::new(config, &grant, message_key.clone())?;
+            Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
         let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
@@ -664,69 +710,6 @@ impl<N: RosNetwork> Core<N> {
     fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
         let suite = Suite::from_id(suite)?;
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
-    }
-
-    /// Asks the authority for what this node needs, if its identity names one.
-    fn ask_renewal(&mut self) {
-        let now = now();
-        if self.endpoint.renew(now, self.identity.csr().into()) {
-            self.renew_due = Some(renew_at(&self.identity, now));
-        }
-    }
-
-    /// Looks a member up in the fleet's file, where that may block.
-    fn answer_renewal(&self, sink: SinkId, peer: VerifiedPeer, csr: bytes::Bytes) {
-        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
-        let alive = self.alive.clone();
-        tokio::task::spawn_blocking(move || {
-            let _alive = alive;
-            let answer = authority::answer(&file, &peer, &csr, now());
-            let _ = events.blocking_send(CoreEvent::RenewalReady { sink, answer });
-        });
-    }
-
-    /// Answers every member once more: the fleet's file may have changed.
-    fn answer_renewals(&self) {
-        let asked: Vec<_> = self.endpoint.renewing().map(|(s, p, csr)| (s, p.clone(), csr.clone())).collect();
-        for (sink, peer, csr) in asked {
-            self.answer_renewal(sink, peer, csr);
-        }
-    }
-
-    fn take_credentials(&mut self, credentials: Credentials) {
-        match renewed(&self.identity, credentials) {
-            Ok(None) => {}
-            Ok(Some(identity)) => {
-                let identity = Arc::new(identity);
-                info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
-                self.keeper.identity(identity.clone());
-                self.set_identity(identity);
-            }
-            Err(why) => {
-                warn!(%why, "credentials from the fleet's authority are not usable");
-                self.control_drops.count("credentials_unusable");
-            }
-        }
-    }
-
-    /// Is this from here on: with another certificate, or other secrets for names made later.
-    fn set_identity(&mut self, identity: Arc<Identity>) {
-        let now = now();
-        self.identity = identity.clone();
-        self.renew_due = Some(renew_at(&identity, now));
-        if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
-            routes.set_secret(newest.secret.clone());
-        }
-        self.credentials.set_identity(identity.clone());
-        self.endpoint.set_identity(now, identity);
-        self.redial.send_replace(());
-    }
-
-    /// Believes others from here on, everywhere.
-    fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
-        self.keeper.anchors(anchors.clone());
-        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
-        self.endpoint.set_anchors(now(), anchors);
     }
 
     fn open_reader(&mut self, name: Name, spec: EndpointSpec) {

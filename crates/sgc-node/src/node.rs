@@ -228,7 +228,10 @@ pub async fn run_on<N: RosNetwork>(
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
         authority: config.authority.is_some(),
-        limits: sgc_endpoint::Limits::default(),
+        limits: sgc_endpoint::Limits {
+            rotate_every: config.rotation.every,
+            ..sgc_endpoint::Limits::default()
+        },
     };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
     endpoint.set_anchors(now(), Arc::new(anchors));
@@ -251,6 +254,7 @@ pub async fn run_on<N: RosNetwork>(
     let (redial, on_redial) = watch::channel(());
     let (core, requested) = Core::new(CoreParts {
         authority: config.authority.clone(),
+        epoch_messages_max: config.rotation.messages,
         keeper: Keeper::spawn(state, config.identity.clone(), alive.clone()),
         redial,
         alive,
