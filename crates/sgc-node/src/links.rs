@@ -412,7 +412,7 @@ mod tests {
 
     fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
         let request = EnrollRequest::new(node.parse().unwrap(), now().unix);
-        Arc::new(fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+        Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
     impl Bench {

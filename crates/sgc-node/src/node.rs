@@ -12,20 +12,23 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
-use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
+use sgc_ros::{RosError, RosNetwork, Routes, UseRule};
 use sgc_router::{Router, RouterConfig};
-use sgc_transport::{CloseReason, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics};
-use sgc_trust::{Identity, IdentityError, Policy};
-use sgc_wire::Metadata;
+use sgc_transport::{
+    CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
+};
+use sgc_trust::{Identity, IdentityError};
 use tokio::io::AsyncWriteExt;
 use tokio::net::UnixListener;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::config::{Config, DiscoveryRange, Recipient, RosConfig, ShareConfig, UseConfig};
+use crate::config::{Config, DiscoveryRange, RosConfig, UseConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::links::{keep_accepting, keep_dialled};
+use crate::partners::Partners;
+use crate::policy;
 
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
@@ -194,31 +197,36 @@ pub async fn run_on<N: RosNetwork>(
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
+    let partners = Partners::default();
     let transport = Arc::new(TransportMetrics::default());
+    let credentials = CredentialStore::new(identity.clone());
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, identity.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), LinkOptions::default(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(identity.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), LinkOptions::default(), transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
-        transit: !config.listen.is_empty(),
+        transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
         anchors: Arc::new(identity.anchors().clone()),
         limits: sgc_router::Limits::default(),
     });
-    let endpoint_config =
-        EndpointConfig { identity: identity.clone(), limits: sgc_endpoint::Limits::default() };
+    let endpoint_config = EndpointConfig {
+        identity: identity.clone(),
+        authority: false,
+        limits: sgc_endpoint::Limits::default(),
+    };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
-        let shares = config.shares.iter().map(|s| share_rule(s, &identity)).collect();
+        let shares = config.shares.iter().map(|s| policy::share_rule(s, &identity, &partners)).collect();
         let uses: Vec<_> = config.uses.iter().filter_map(|u| use_rule(u, &identity)).collect();
         let mut followed = std::collections::BTreeSet::new();
         for rule in &uses {
@@ -235,6 +243,7 @@ pub async fn run_on<N: RosNetwork>(
     let (core, requested) = Core::new(CoreParts {
         alive,
         identity: identity.clone(),
+        credentials,
         router,
         endpoint,
         routes,
@@ -344,44 +353,13 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
     }
 }
 
-fn share_rule(share: &ShareConfig, identity: &Identity) -> ShareRule {
-    let mut policy = Policy::default();
-    for recipient in &share.to {
-        match recipient {
-            Recipient::Everyone => {
-                policy.subscribe.fleets.insert(identity.as_peer().ca);
-            }
-            Recipient::Node(node) => policy.subscribe.nodes.extend(identity.node_id_of(node.as_str())),
-            Recipient::Group(group) => {
-                let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
-                policy.subscribe.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
-            }
-        }
-    }
-    let extra = share.metadata.clone();
-    let type_name = share.type_name.clone().unwrap_or_default();
-    ShareRule {
-        metadata: Metadata {
-            node: extra.node,
-            author: extra.author,
-            maintainer: extra.maintainer,
-            interface: extra.interface,
-            description: extra.description,
-            unique: extra.unique,
-            ..Metadata::topic(identity.node_name().as_str(), &share.topic, &type_name)
-        },
-        policy,
-        suite: share.suite,
-        class: share.priority,
-    }
-}
-
 fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
     Some(UseRule {
         owner: identity.node_id_of(rule.from.as_str())?,
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),
         type_name: rule.type_name.clone(),
+        token: None,
     })
 }
 

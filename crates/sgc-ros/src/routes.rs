@@ -6,7 +6,11 @@
 //!
 //! A *share route* is one shared topic with one type: it exists from the first local writer of that type
 //! until the last one has been gone for a while. A *use route* is one entry of a followed owner's catalogue
-//! that a rule asks for: it exists from the catalogue that lists it until one that does not.
+//! that a rule asks for: it exists from the catalogue that lists it until one that does not. A *token route* is a use
+//! route whose one entry comes with the grant, from an owner of another fleet whose catalogue this node cannot read.
+
+mod reconfigure;
+mod tokens;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -61,6 +65,20 @@ pub struct UseRule {
     pub topic: String,
     /// ROS type; `None` for whatever the owner shares.
     pub type_name: Option<String>,
+    /// The name that a token leads to, and what it says of it; the catalogue is not looked at then.
+    pub token: Option<(Name, Metadata)>,
+}
+
+impl UseRule {
+    fn is_of_catalogue(&self, owner: &NodeId) -> bool {
+        self.owner == *owner && self.token.is_none()
+    }
+
+    /// Whether it asks for the same as another, whatever the type.
+    fn is_same_place(&self, other: &Self) -> bool {
+        let name = |rule: &Self| rule.token.as_ref().map(|(name, _)| *name);
+        self.owner == other.owner && self.topic == other.topic && name(self) == name(other)
+    }
 }
 
 /// What the driver has to do.
@@ -76,6 +94,13 @@ pub enum Command {
         qos: Qos,
         /// Its transient-local writers.
         sources: Vec<CatalogueSource>,
+    },
+    /// Tell the endpoint who may join the share now; who may no longer is to be cut off.
+    UpdatePolicy {
+        /// The share.
+        name: Name,
+        /// Who may join.
+        policy: Policy,
     },
     /// End the share.
     Unshare {
@@ -105,6 +130,16 @@ pub enum Command {
         /// The share.
         name: Name,
     },
+    /// Follow an owner's catalogue.
+    Follow {
+        /// Its name in the fleet.
+        owner_name: String,
+    },
+    /// Follow it no longer.
+    Unfollow {
+        /// Whose.
+        owner: NodeId,
+    },
     /// Join a name.
     Join {
         /// Which.
@@ -113,6 +148,8 @@ pub enum Command {
         owner: NodeId,
         /// True if histories are to be asked for.
         transient_local: bool,
+        /// True if the grant has to say what the name stands for.
+        describe: bool,
     },
     /// Leave a name.
     Leave {
@@ -214,6 +251,16 @@ pub enum Problem {
         /// Owner.
         owner: String,
     },
+    /// What came for a token is not what the token says.
+    #[error(
+        "{topic}: {owner} gives something else for the token than it says; it is not brought here. Ask for a new token"
+    )]
+    TokenEntry {
+        /// Topic.
+        topic: String,
+        /// Owner.
+        owner: String,
+    },
     /// More local endpoints than are looked at.
     #[error(
         "the local network has more than {LOCAL_ENDPOINTS_MAX} endpoints; those beyond are not looked at"
@@ -269,6 +316,14 @@ struct UseRoute {
     unreachable_until: Option<Instant>,
 }
 
+/// A name that a token leads to, joined.
+#[derive(Debug)]
+struct TokenJoin {
+    rule: usize,
+    transient_local: bool,
+    refused: Option<RefusedBy>,
+}
+
 /// The machine.
 pub struct Routes<R> {
     secret: FleetSecret,
@@ -279,6 +334,10 @@ pub struct Routes<R> {
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,
     shares: BTreeMap<Name, ShareRoute>,
     uses: BTreeMap<Name, UseRoute>,
+    /// Names of tokens; there is a route besides from the first grant on.
+    tokens: BTreeMap<Name, TokenJoin>,
+    /// What followed owners said last, for rules that come later.
+    catalogues: BTreeMap<NodeId, Catalogue>,
     /// Owners that are out of reach or refuse, for status.
     owners: BTreeMap<NodeId, String>,
     told: BTreeSet<Problem>,
@@ -294,7 +353,7 @@ impl<R: RngCore> Routes<R> {
         use_rules: Vec<UseRule>,
         rng: R,
     ) -> Self {
-        Self {
+        let mut routes = Self {
             secret,
             node,
             rng,
@@ -303,10 +362,14 @@ impl<R: RngCore> Routes<R> {
             endpoints: BTreeMap::new(),
             shares: BTreeMap::new(),
             uses: BTreeMap::new(),
+            tokens: BTreeMap::new(),
+            catalogues: BTreeMap::new(),
             owners: BTreeMap::new(),
             told: BTreeSet::new(),
             commands: VecDeque::new(),
-        }
+        };
+        routes.join_tokens();
+        routes
     }
 
     /// The local graph changed.
@@ -355,6 +418,7 @@ impl<R: RngCore> Routes<R> {
     pub fn handle_catalogue(&mut self, owner: NodeId, catalogue: Catalogue) {
         self.owners.remove(&owner);
         let mut listed = BTreeSet::new();
+        self.catalogues.insert(owner, catalogue.clone());
         for entry in catalogue.entries {
             let Some(rule) = self.rule_for(owner, &entry) else { continue };
             let name = name_of(&owner, &entry.blind);
@@ -371,7 +435,7 @@ impl<R: RngCore> Routes<R> {
         let gone: Vec<_> = self
             .uses
             .iter()
-            .filter(|(n, u)| self.use_rules[u.rule].owner == owner && !listed.contains(n))
+            .filter(|(n, u)| self.use_rules[u.rule].is_of_catalogue(&owner) && !listed.contains(n))
             .map(|(n, _)| *n)
             .collect();
         for name in gone {
@@ -384,10 +448,13 @@ impl<R: RngCore> Routes<R> {
         let names: Vec<_> = self
             .uses
             .iter()
-            .filter(|(_, u)| self.use_rules[u.rule].owner == owner)
+            .filter(|(_, u)| self.use_rules[u.rule].is_of_catalogue(&owner))
             .map(|(n, _)| *n)
             .collect();
         let gone = matches!(reason, LostReason::Withdrawn | LostReason::Refused(_));
+        if gone {
+            self.catalogues.remove(&owner);
+        }
         self.owners.insert(owner, if gone { "has gone".into() } else { "is out of reach".into() });
         for name in names {
             if gone {
@@ -403,8 +470,11 @@ impl<R: RngCore> Routes<R> {
         self.owners.insert(owner, format!("refuses its catalogue: {by}"));
     }
 
-    /// A join was granted.
-    pub fn handle_granted(&mut self, name: &Name) {
+    /// A join was granted. `entry` is what the name stands for, where that was asked for.
+    pub fn handle_granted(&mut self, name: &Name, entry: Option<CatalogueEntry>) {
+        if let (Some(entry), true) = (entry, self.tokens.contains_key(name)) {
+            self.handle_described(*name, entry);
+        }
         if let Some(route) = self.uses.get_mut(name) {
             route.granted = true;
             route.refused = None;
@@ -417,6 +487,9 @@ impl<R: RngCore> Routes<R> {
     pub fn handle_refused(&mut self, name: &Name, by: RefusedBy) {
         if let Some(route) = self.uses.get_mut(name) {
             route.refused = Some(by);
+        }
+        if let Some(token) = self.tokens.get_mut(name) {
+            token.refused = Some(by);
         }
     }
 
@@ -496,7 +569,14 @@ impl<R: RngCore> Routes<R> {
                 owner: rule.owner_name.clone(),
                 state,
             };
-            if routes.is_empty() {
+            if let Some((name, metadata)) = rule.token.as_ref().filter(|_| routes.is_empty()) {
+                let refused = self.tokens.get(name).and_then(|token| token.refused);
+                let state = match refused {
+                    Some(by) => format!("refused: {by}"),
+                    None => "waits for the owner's grant".into(),
+                };
+                all.push(status(Some(metadata.type_name.clone()), Some(*name), state));
+            } else if routes.is_empty() {
                 let state = match self.owners.get(&rule.owner) {
                     Some(state) => format!("{} {state}", rule.owner_name),
                     None => format!("{} does not share it with this node (yet)", rule.owner_name),
@@ -661,7 +741,7 @@ impl<R: RngCore> Routes<R> {
     fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<usize> {
         let metadata = &entry.metadata;
         let (index, rule) = self.use_rules.iter().enumerate().find(|(_, r)| {
-            r.owner == owner && r.topic == metadata.ros_name && metadata.kind == Kind::Topic
+            r.is_of_catalogue(&owner) && r.topic == metadata.ros_name && metadata.kind == Kind::Topic
         })?;
         match &rule.type_name {
             Some(expected) if *expected != metadata.type_name => {
@@ -701,7 +781,7 @@ impl<R: RngCore> Routes<R> {
                     unreachable_until: None,
                 };
                 self.uses.insert(name, route);
-                self.commands.push_back(Command::Join { name, owner, transient_local });
+                self.commands.push_back(Command::Join { name, owner, transient_local, describe: false });
                 for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
                     self.check_local(&endpoint);
                 }
@@ -719,11 +799,20 @@ impl<R: RngCore> Routes<R> {
     }
 
     fn drop_use(&mut self, name: Name) {
+        let is_token = self.tokens.remove(&name).is_some();
+        let joined = is_token || self.uses.contains_key(&name);
+        self.close_use(name);
+        if joined {
+            self.commands.push_back(Command::Leave { name });
+        }
+    }
+
+    /// Ends what a use has on the local network; its name stays joined.
+    fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
             }
-            self.commands.push_back(Command::Leave { name });
         }
     }
 

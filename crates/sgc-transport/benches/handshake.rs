@@ -26,7 +26,7 @@ fn main() {
     let fleet = Fleet::create("bench".parse().unwrap(), now, &mut rng).unwrap();
     let mut enroll = |node: &str| {
         let request = EnrollRequest::new(node.parse().unwrap(), now);
-        Arc::new(fleet.enroll(&request, &mut rng).unwrap())
+        Arc::new(fleet.issue(&request, &mut rng).unwrap())
     };
     let (router, arm) = (enroll("router"), enroll("arm-1"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();

@@ -21,7 +21,7 @@ use tokio::net::UdpSocket;
 /// The node's next certificate.
 fn renew(fleet: &Fleet, node: &str) -> Arc<Identity> {
     let request = EnrollRequest::new(node.parse().unwrap(), now());
-    Arc::new(fleet.enroll(&request, &mut ChaCha20Rng::seed_from_u64(99)).unwrap())
+    Arc::new(fleet.issue(&request, &mut ChaCha20Rng::seed_from_u64(99)).unwrap())
 }
 
 /// Revokes a certificate for all who share this store.

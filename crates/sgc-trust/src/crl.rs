@@ -57,6 +57,15 @@ impl TrustAnchors {
         peer.path.iter().any(|cert| self.is_revoked(cert))
     }
 
+    /// True if the key of the first CA made this signature, with any algorithm that it has.
+    pub(crate) fn signed_by_first(&self, message: &[u8], signature: &[u8]) -> bool {
+        let Some((key_algorithm, key)) = self.anchors.first().and_then(|a| split_spki(&a.spki)) else {
+            return false;
+        };
+        let mut fitting = CHAIN_ALGORITHMS.iter().filter(|a| a.public_key_alg_id().as_ref() == key_algorithm);
+        fitting.any(|a| a.verify_signature(key, message, signature).is_ok())
+    }
+
     pub(crate) fn revoked_at(&self, cert: &CertId) -> Option<UnixMillis> {
         self.lists.get(&cert.ca)?.revoked.get(&*cert.serial).copied()
     }

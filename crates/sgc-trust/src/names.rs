@@ -7,7 +7,7 @@ use aws_lc_rs::{digest, hkdf, hmac};
 use sgc_wire::{Blind, Encode, Metadata, Name, NodeId};
 use zeroize::Zeroize;
 
-use crate::FleetSecret;
+use crate::{CaFingerprint, FleetSecret};
 
 /// The secret of one interface: enough to derive its name, and no other name.
 #[derive(Clone, Zeroize)]
@@ -27,6 +27,16 @@ impl TopicSecret {
         Self(out)
     }
 
+    /// Takes the bytes of a secret.
+    pub fn from_bytes(bytes: [u8; 32]) -> Self {
+        Self(bytes)
+    }
+
+    /// The bytes, for handing on this one interface. They belong in no log, and in no packet.
+    pub fn expose(&self) -> &[u8; 32] {
+        &self.0
+    }
+
     /// `HMAC-SHA-256(topic secret, "sgc name")`.
     pub fn blind(&self) -> Blind {
         let key = hmac::Key::new(hmac::HMAC_SHA256, &self.0);
@@ -35,6 +45,15 @@ impl TopicSecret {
         Blind(out)
     }
 }
+
+impl PartialEq for TopicSecret {
+    /// In constant time.
+    fn eq(&self, other: &Self) -> bool {
+        aws_lc_rs::constant_time::verify_slices_are_equal(&self.0, &other.0).is_ok()
+    }
+}
+
+impl Eq for TopicSecret {}
 
 impl std::fmt::Debug for TopicSecret {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -51,6 +70,17 @@ pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
     let mut out = [0; 32];
     out.copy_from_slice(context.finish().as_ref());
     Name(out)
+}
+
+/// The blind under which the authority of a fleet is asked for certificates: known to all who know its CA, also to
+/// routers, which hold no secret.
+pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc renewal v1");
+    context.update(&ca.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Blind(out)
 }
 
 /// The name of an interface, by one who holds the fleet secret.
