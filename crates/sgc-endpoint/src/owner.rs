@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
+use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
@@ -149,9 +150,12 @@ impl Endpoint {
         }
     }
 
-    /// Who asked this authority and is still there: sink and node.
-    pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer)> {
-        self.renewals.iter().map(|(sink, asked)| (*sink, &asked.peer))
+    /// Who asked this authority and is still there: sink, node, and signing request.
+    pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
+        self.renewals.iter().filter_map(|(sink, asked)| match &asked.request {
+            Request::Renew { csr } => Some((*sink, &asked.peer, csr)),
+            Request::Subscribe { .. } | Request::Publish { .. } => None,
+        })
     }
 
     pub(crate) fn end_catalogue(&mut self, name: Name, blind: Blind) {

@@ -4,6 +4,7 @@
 //! happens in tasks and threads of its own.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -12,11 +13,15 @@ use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConf
 use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
-use sgc_trust::{Identity, MessageKey, Suite, TrustAnchors};
-use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use sgc_trust::{CrlError, Identity, MessageKey, Suite, TrustAnchors, VerifiedPeer};
+use sgc_wire::{
+    Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, SinkId, SourceId, UnixMillis,
+};
+use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
+use crate::authority;
+use crate::credentials::{Keeper, renew_at, renewed};
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
 use crate::outflow::OutFlow;
@@ -92,6 +97,20 @@ pub(crate) enum CoreEvent {
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
     },
+    /// The authority's answer to a member is ready.
+    RenewalReady {
+        /// Whom to answer.
+        sink: SinkId,
+        /// What.
+        answer: Result<Credentials, RefuseReason>,
+    },
+    /// The user brings a revocation list; answered with whether it is news.
+    Crl {
+        /// The list, DER.
+        der: bytes::Bytes,
+        /// Where to answer.
+        reply: oneshot::Sender<Result<bool, CrlError>>,
+    },
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
     /// Take nothing in any more; answered with what still leaves.
@@ -128,6 +147,12 @@ pub(crate) struct Core<N: RosNetwork> {
     /// What the messages of this node are signed with, by suite.
     message_keys: BTreeMap<Suite, MessageKey>,
     credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    authority: Option<PathBuf>,
+    keeper: Keeper,
+    /// When to ask for another certificate.
+    renew_due: Option<Instant>,
+    redial: watch::Sender<()>,
     replays: Arc<Semaphore>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
@@ -145,6 +170,12 @@ pub(crate) struct CoreParts<N> {
     pub identity: Arc<Identity>,
     /// What links are made with.
     pub credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    pub authority: Option<PathBuf>,
+    /// Writes what outlives the process.
+    pub(crate) keeper: Keeper,
+    /// Tells the dialling tasks that there is another certificate.
+    pub redial: watch::Sender<()>,
     /// The routing machine.
     pub router: Router,
     /// The endpoint machine.
@@ -189,6 +220,10 @@ impl<N: RosNetwork> Core<N> {
             retire_due: BTreeMap::new(),
             message_keys: BTreeMap::new(),
             credentials: parts.credentials,
+            authority: parts.authority,
+            keeper: parts.keeper,
+            renew_due: None,
+            redial: parts.redial,
             replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
             requests,
             control_drops: Drops::default(),
@@ -209,6 +244,7 @@ impl<N: RosNetwork> Core<N> {
         mut requested: mpsc::Receiver<SinkRequest>,
     ) {
         let mut batch = Vec::with_capacity(BATCH_MAX);
+        self.ask_renewal();
         let mut deadline = self.drain();
         loop {
             let timer = async {
@@ -282,6 +318,12 @@ impl<N: RosNetwork> Core<N> {
                     (_, None) => {}
                 }
             }
+            CoreEvent::RenewalReady { sink, answer } => self.endpoint.answer_renewal(now(), sink, answer),
+            CoreEvent::Crl { der, reply } => {
+                let _ = reply.send(self.router.add_crl(now(), &der));
+                // Whoever brings a list may have changed the fleet's file.
+                self.answer_renewals();
+            }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }
@@ -320,6 +362,9 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
         }
+        if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
+            self.ask_renewal();
+        }
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
         for name in over {
@@ -357,7 +402,10 @@ impl<N: RosNetwork> Core<N> {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
-                return [router, endpoint, routes, history, retire].into_iter().flatten().min();
+                return [router, endpoint, routes, history, retire, self.renew_due]
+                    .into_iter()
+                    .flatten()
+                    .min();
             }
         }
     }
@@ -460,7 +508,13 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Event::OwnGrant { .. } => {}
-            Event::RenewAsked { .. } | Event::Renewed { .. } | Event::RenewRefused { .. } => {}
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 if self.control_drops.count_from("join_refused", peer.short()) {
@@ -612,8 +666,65 @@ impl<N: RosNetwork> Core<N> {
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
     }
 
+    /// Asks the authority for what this node needs, if its identity names one.
+    fn ask_renewal(&mut self) {
+        let now = now();
+        if self.endpoint.renew(now, self.identity.csr().into()) {
+            self.renew_due = Some(renew_at(&self.identity, now));
+        }
+    }
+
+    /// Looks a member up in the fleet's file, where that may block.
+    fn answer_renewal(&self, sink: SinkId, peer: VerifiedPeer, csr: bytes::Bytes) {
+        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let answer = authority::answer(&file, &peer, &csr, now());
+            let _ = events.blocking_send(CoreEvent::RenewalReady { sink, answer });
+        });
+    }
+
+    /// Answers every member once more: the fleet's file may have changed.
+    fn answer_renewals(&self) {
+        let asked: Vec<_> = self.endpoint.renewing().map(|(s, p, csr)| (s, p.clone(), csr.clone())).collect();
+        for (sink, peer, csr) in asked {
+            self.answer_renewal(sink, peer, csr);
+        }
+    }
+
+    fn take_credentials(&mut self, credentials: Credentials) {
+        match renewed(&self.identity, credentials) {
+            Ok(None) => {}
+            Ok(Some(identity)) => {
+                let identity = Arc::new(identity);
+                info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
+                self.keeper.identity(identity.clone());
+                self.set_identity(identity);
+            }
+            Err(why) => {
+                warn!(%why, "credentials from the fleet's authority are not usable");
+                self.control_drops.count("credentials_unusable");
+            }
+        }
+    }
+
+    /// Is this from here on: with another certificate, or other secrets for names made later.
+    fn set_identity(&mut self, identity: Arc<Identity>) {
+        let now = now();
+        self.identity = identity.clone();
+        self.renew_due = Some(renew_at(&identity, now));
+        if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
+            routes.set_secret(newest.secret.clone());
+        }
+        self.credentials.set_identity(identity.clone());
+        self.endpoint.set_identity(now, identity);
+        self.redial.send_replace(());
+    }
+
     /// Believes others from here on, everywhere.
     fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.endpoint.set_anchors(now(), anchors);
     }

@@ -26,9 +26,11 @@ use tracing::{info, warn};
 
 use crate::config::{Config, DiscoveryRange, RosConfig, UseConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
+use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
 use crate::partners::Partners;
 use crate::policy;
+use crate::state::{create_state_dir, state_dir};
 
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
@@ -199,32 +201,37 @@ pub async fn run_on<N: RosNetwork>(
 ) -> Result<(), NodeError> {
     let partners = Partners::default();
     let transport = Arc::new(TransportMetrics::default());
+    let state = usable_state_dir(&config, identity.node_name().as_str());
+    let anchors = with_kept_crls(state.as_deref(), identity.anchors().clone(), now());
     let credentials = CredentialStore::new(identity.clone());
+    credentials.set_anchors(anchors.clone());
+    let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, credentials.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), link_options.clone(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(credentials.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
         transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
-        anchors: Arc::new(identity.anchors().clone()),
+        anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
     });
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
-        authority: false,
+        authority: config.authority.is_some(),
         limits: sgc_endpoint::Limits::default(),
     };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
+    endpoint.set_anchors(now(), Arc::new(anchors));
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
         let shares = config.shares.iter().map(|s| policy::share_rule(s, &identity, &partners)).collect();
         let uses: Vec<_> = config.uses.iter().filter_map(|u| use_rule(u, &identity)).collect();
@@ -234,13 +241,18 @@ pub async fn run_on<N: RosNetwork>(
                 endpoint.follow(now(), &rule.owner_name);
             }
         }
+        let secret = identity.naming_secrets().first().map_or(secret, |newest| &newest.secret);
         Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
     });
 
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
+    let (redial, on_redial) = watch::channel(());
     let (core, requested) = Core::new(CoreParts {
+        authority: config.authority.clone(),
+        keeper: Keeper::spawn(state, config.identity.clone(), alive.clone()),
+        redial,
         alive,
         identity: identity.clone(),
         credentials,
@@ -262,7 +274,6 @@ pub async fn run_on<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
-    let (_redial, on_redial) = watch::channel(());
     for url in &config.routers {
         tasks.push(tokio::spawn(keep_dialled(
             url.clone(),
@@ -330,6 +341,22 @@ pub async fn run_on<N: RosNetwork>(
         let _ = tokio::task::spawn_blocking(move || drop(network)).await;
     }
     Ok(())
+}
+
+/// The state directory, made if need be; `None`, and said, if it cannot be used: then nothing is remembered.
+fn usable_state_dir(config: &Config, node: &str) -> Option<PathBuf> {
+    let dir = state_dir(config, node);
+    let Some(dir) = dir else {
+        warn!("no state directory: set `state` in [node]; revocations are forgotten with each restart");
+        return None;
+    };
+    match create_state_dir(&dir) {
+        Ok(()) => Some(dir),
+        Err(error) => {
+            warn!(%error, "the state directory cannot be used; revocations are forgotten with each restart");
+            None
+        }
+    }
 }
 
 fn system_rng() -> Result<ChaCha20Rng, NodeError> {

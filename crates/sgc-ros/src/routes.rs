@@ -372,6 +372,11 @@ impl<R: RngCore> Routes<R> {
         routes
     }
 
+    /// Names of shares that begin later come from this secret; running ones keep theirs.
+    pub fn set_secret(&mut self, secret: FleetSecret) {
+        self.secret = secret;
+    }
+
     /// The local graph changed.
     pub fn handle_discovery(&mut self, now: Instant, event: DiscoveryEvent) {
         match event {
