@@ -8,11 +8,11 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
-use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig};
+use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
 use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
-use sgc_router::{FibEntry, LinkClose, LinkId, Output as RouterOutput, Router};
-use sgc_transport::{AnyLink, CloseReason, Link};
-use sgc_trust::Identity;
+use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
+use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
+use sgc_trust::{Identity, MessageKey, Suite, TrustAnchors};
 use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tracing::{debug, error, info, warn};
@@ -37,6 +37,8 @@ const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 64 << 20;
 /// Messages of history kept where the publisher keeps all.
 const HISTORY_KEEP_ALL_MAX: usize = 4096;
+/// How long packets of past epochs may be under way.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// What happens to the control task.
 pub(crate) enum CoreEvent {
@@ -121,6 +123,11 @@ pub(crate) struct Core<N: RosNetwork> {
     sinks: HashMap<Name, Arc<LocalSink>>,
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     history_due: BTreeMap<(Name, SourceId), Instant>,
+    /// When the keys of past epochs of a joined name are dropped.
+    retire_due: BTreeMap<Name, Instant>,
+    /// What the messages of this node are signed with, by suite.
+    message_keys: BTreeMap<Suite, MessageKey>,
+    credentials: CredentialStore,
     replays: Arc<Semaphore>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
@@ -136,6 +143,8 @@ pub(crate) struct Core<N: RosNetwork> {
 pub(crate) struct CoreParts<N> {
     /// This node.
     pub identity: Arc<Identity>,
+    /// What links are made with.
+    pub credentials: CredentialStore,
     /// The routing machine.
     pub router: Router,
     /// The endpoint machine.
@@ -177,6 +186,9 @@ impl<N: RosNetwork> Core<N> {
             sinks: HashMap::new(),
             writers: HashMap::new(),
             history_due: BTreeMap::new(),
+            retire_due: BTreeMap::new(),
+            message_keys: BTreeMap::new(),
+            credentials: parts.credentials,
             replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
             requests,
             control_drops: Drops::default(),
@@ -232,13 +244,13 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkUp { link, url, control, reply } => {
                 let id = LinkId(self.next_link);
                 self.next_link += 1;
-                let node = link.peer().node_id;
+                let neighbour = Neighbour::from(link.peer());
                 let remote = link.remote();
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
-                self.router.handle_link_up(id, node);
+                self.router.handle_link_up(now(), id, neighbour);
             }
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(id);
@@ -308,6 +320,14 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
         }
+        let over: Vec<_> =
+            self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
+        for name in over {
+            self.retire_due.remove(&name);
+            if let Some(sink) = self.sinks.get(&name) {
+                sink.retire_epochs();
+            }
+        }
     }
 
     /// Carries out everything the machines want until they want nothing more; returns when to look again.
@@ -336,7 +356,8 @@ impl<N: RosNetwork> Core<N> {
             if !progressed {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
-                return [router, endpoint, routes, history].into_iter().flatten().min();
+                let retire = self.retire_due.values().min().copied();
+                return [router, endpoint, routes, history, retire].into_iter().flatten().min();
             }
         }
     }
@@ -367,12 +388,25 @@ impl<N: RosNetwork> Core<N> {
                         entry.link.close(CloseReason::Replaced);
                     }
                     LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
+                    LinkClose::Revoked => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate is revoked; its link is closed");
+                        entry.link.close(CloseReason::Revoked);
+                    }
+                    LinkClose::Expired => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
+                        entry.link.close(CloseReason::Expired);
+                    }
+                    LinkClose::TooMany | LinkClose::Forgeries => {
+                        warn!(%link, remote = %entry.link.remote(), peer = %entry.link.peer().node_id.short(), "{reason}; its link is closed");
+                        entry.link.close(CloseReason::Denied(reason.to_string()));
+                    }
                     LinkClose::Greeting | LinkClose::Loop => {
                         warn!(%link, remote = %entry.link.remote(), "{reason}");
                         entry.link.close(CloseReason::Protocol(reason.to_string()));
                     }
                 }
             }
+            RouterOutput::Trust(anchors) => self.set_anchors(anchors),
             RouterOutput::Dropped(dropped) => {
                 let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
                 if first && dropped.reason.is_suspicious() {
@@ -410,10 +444,23 @@ impl<N: RosNetwork> Core<N> {
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
                 routes.handle_sink_joined(&name, sink);
             }
-            Event::SinkLeft { name, sink } => {
-                debug!(name = %name.short(), "a subscriber is gone");
+            Event::SinkLeft { name, sink, peer } => {
+                debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
                 routes.handle_sink_left(now.instant, &name, &sink);
             }
+            Event::SinkCut { name, sink, peer, reason } => {
+                info!(peer = %peer.short(), %reason, "took a grant back; a new epoch begins");
+                debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
+                routes.handle_sink_left(now.instant, &name, &sink);
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { .. } => {}
+            Event::RenewAsked { .. } | Event::Renewed { .. } | Event::RenewRefused { .. } => {}
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 if self.control_drops.count_from("join_refused", peer.short()) {
@@ -425,10 +472,11 @@ impl<N: RosNetwork> Core<N> {
                     share.replay(recover, &self.replays);
                 }
             }
-            Event::Granted { name, grant } => {
-                debug!(name = %name.short(), "granted");
+            Event::Granted { name, sink: id, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
                 if let Some(sink) = self.sinks.get(&name) {
-                    sink.grant(grant);
+                    sink.grant(id, grant);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
                 }
                 routes.handle_granted(&name);
                 self.ask_histories(name);
@@ -490,7 +538,7 @@ impl<N: RosNetwork> Core<N> {
             Command::Join { name, owner, transient_local } => {
                 let sink = LocalSink::new(name, transient_local, self.requests.clone());
                 self.sinks.insert(name, Arc::new(sink));
-                self.endpoint.join(now, name, owner);
+                self.endpoint.join(now, name, owner, Wish::Subscribe { describe: false });
             }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
@@ -498,6 +546,7 @@ impl<N: RosNetwork> Core<N> {
                     sink.close();
                 }
                 self.history_due.retain(|(n, _), _| *n != name);
+                self.retire_due.remove(&name);
             }
             Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
             Command::CloseWriter { name, source } => {
@@ -514,10 +563,11 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn map_sources(&mut self, name: Name, qos: &Qos, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
-        let (Some(share), Some(grant)) = (self.shares.get(&name), self.endpoint.share_grant(&name).cloned())
+        let (Some(share), Some(grant)) = (self.shares.get(&name).cloned(), self.endpoint.share_grant(&name))
         else {
             return;
         };
+        let Some(message_key) = self.message_key(grant.suite) else { return };
         let old = share.map();
         let slot = |id, qos: &Qos, keeps_history: bool| {
             let depth = match qos.history {
@@ -533,7 +583,7 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
             };
-            let source = Arc::new(Mutex::new(Source::new(config, &grant)?));
+            let source = Arc::new(Mutex::new(Source::new(config, &grant, message_key.clone())?));
             Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
@@ -546,7 +596,20 @@ impl<N: RosNetwork> Core<N> {
         }
         let kept = old.shared.clone().filter(|s| s.reliable == qos.is_reliable());
         map.shared = kept.or_else(|| slot(self.endpoint.new_source_id(), qos, false));
+        self.endpoint.set_sources(now(), &name, map.slots().map(|s| s.progress.clone()).collect());
         share.set_map(map);
+    }
+
+    /// The key that messages are signed with in this suite: one for the whole node, made when it is needed first.
+    fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
+        let suite = Suite::from_id(suite)?;
+        Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
+    }
+
+    /// Believes others from here on, everywhere.
+    fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
+        self.endpoint.set_anchors(now(), anchors);
     }
 
     fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
@@ -685,6 +748,7 @@ impl<N: RosNetwork> Core<N> {
                 peer: entry.link.peer().node_id.to_string(),
                 remote: entry.link.remote().to_string(),
                 url: entry.url.clone(),
+                kex: stats.key_exchange.label(),
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,

@@ -9,7 +9,8 @@ use rand_core::{OsRng, TryRngCore};
 use sgc_router::LinkId;
 use sgc_transport::{AnyLink, CloseReason, Dialer, FlowError, Link, LinkError, LinkUrl, Listener};
 use sgc_wire::{Control, Decode, Encode};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::timeout;
 use tracing::{debug, info, warn};
 
 use crate::core::CoreEvent;
@@ -20,6 +21,10 @@ use crate::stats::DataDrop;
 const CONTROL_FRAMES_MAX: usize = 8192;
 const BACKOFF_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MAX: Duration = Duration::from_secs(10);
+/// How long a peer may take to greet on a link that replaces another.
+const SUCCESSOR_MAX: Duration = Duration::from_secs(5);
+/// How long it may take to answer a goodbye.
+const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
 /// Sends frames of the control task over a link, in order.
 pub(crate) struct ControlTx {
@@ -34,13 +39,23 @@ impl ControlTx {
 }
 
 /// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
-pub(crate) async fn keep_dialled(url: LinkUrl, dialer: Arc<Dialer>, core: mpsc::Sender<CoreEvent>) {
+///
+/// Each change of `redial` says that the credentials changed: a second link is made with what they are by then, and
+/// the first one taken down only when the peer has been heard on the second. As long as that fails, the first stays.
+pub(crate) async fn keep_dialled(
+    url: LinkUrl,
+    dialer: Arc<Dialer>,
+    core: mpsc::Sender<CoreEvent>,
+    mut redial: watch::Receiver<()>,
+) {
     let mut failures = 0u32;
     loop {
+        // What changes from here on may come too late for this attempt.
+        redial.mark_unchanged();
         match dialer.dial(&url).await {
             Ok(link) => {
                 failures = 0;
-                let end = serve(link, Some(url.to_string()), &core).await;
+                let end = keep_renewed(link, &url, &dialer, &core, &mut redial).await;
                 info!(%url, "link ended: {end}");
             }
             Err(error) => {
@@ -56,9 +71,58 @@ pub(crate) async fn keep_dialled(url: LinkUrl, dialer: Arc<Dialer>, core: mpsc::
         if core.is_closed() {
             return;
         }
-        let wait = (BACKOFF_MIN * 2u32.saturating_pow(failures.saturating_sub(1).min(10))).min(BACKOFF_MAX);
-        let jitter = f64::from(OsRng.try_next_u32().unwrap_or(0) % 1000) / 1000.0;
-        tokio::time::sleep(wait.mul_f64(0.5 + jitter / 2.0)).await;
+        tokio::time::sleep(backoff(failures)).await;
+    }
+}
+
+/// How long to wait after so many failures in a row.
+fn backoff(failures: u32) -> Duration {
+    let wait = (BACKOFF_MIN * 2u32.saturating_pow(failures.saturating_sub(1).min(10))).min(BACKOFF_MAX);
+    let jitter = f64::from(OsRng.try_next_u32().unwrap_or(0) % 1000) / 1000.0;
+    wait.mul_f64(0.5 + jitter / 2.0)
+}
+
+/// Serves a link, and in its place each one that is made on request; returns when the last of them has ended.
+async fn keep_renewed(
+    link: AnyLink,
+    url: &LinkUrl,
+    dialer: &Dialer,
+    core: &mpsc::Sender<CoreEvent>,
+    redial: &mut watch::Receiver<()>,
+) -> LinkError {
+    let mut current = Served::start(link, Some(url.to_string()), core).await;
+    let mut failures = None;
+    loop {
+        let next = async {
+            match failures {
+                None => {
+                    if redial.changed().await.is_err() {
+                        std::future::pending::<()>().await;
+                    }
+                }
+                Some(failures) => tokio::time::sleep(backoff(failures)).await,
+            }
+            redial.mark_unchanged();
+            dialer.dial(url).await
+        };
+        tokio::select! {
+            end = current.end(core) => return end,
+            dialled = next => match dialled {
+                Ok(link) => {
+                    failures = None;
+                    let mut next = Served::start(link, Some(url.to_string()), core).await;
+                    let heard = next.heard.take();
+                    let old = std::mem::replace(&mut current, next);
+                    tokio::spawn(old.retire(heard, core.clone()));
+                }
+                Err(error) => {
+                    if failures.is_none() {
+                        warn!("cannot connect with the new credentials: {error}; the old link stays and it is tried again");
+                    }
+                    failures = Some(failures.unwrap_or(0).saturating_add(1));
+                }
+            }
+        }
     }
 }
 
@@ -78,7 +142,7 @@ pub(crate) async fn keep_accepting(
                 let core = core.clone();
                 tokio::spawn(async move {
                     let remote = link.remote();
-                    let end = serve(link, None, &core).await;
+                    let end = Served::start(link, None, &core).await.end(&core).await;
                     info!(%remote, "link ended: {end}");
                 });
             }
@@ -88,27 +152,60 @@ pub(crate) async fn keep_accepting(
     }
 }
 
-/// Reports a link to the control task and waits for its end.
-async fn serve(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> LinkError {
-    let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
-    let (reply, id) = oneshot::channel();
-    let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
-    let id = match (core.send(up).await, id.await) {
-        (Ok(()), Ok(Some((id, data)))) => {
-            info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
-            spawn_tasks(&link, id, data, outgoing, core);
-            Some(id)
-        }
-        _ => {
-            link.close(CloseReason::Goodbye);
-            None
-        }
-    };
-    let end = link.closed().await;
-    if let Some(id) = id {
-        let _ = core.send(CoreEvent::LinkDown { id }).await;
+/// A link that was reported to the control task.
+struct Served {
+    link: AnyLink,
+    /// Nothing if the node is stopping.
+    id: Option<LinkId>,
+    /// Ready with the first control frame.
+    heard: Option<oneshot::Receiver<()>>,
+}
+
+impl Served {
+    /// Reports it and starts to move what comes in.
+    async fn start(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> Self {
+        let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
+        let (reply, id) = oneshot::channel();
+        let (first, heard) = oneshot::channel();
+        let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
+        let id = match (core.send(up).await, id.await) {
+            (Ok(()), Ok(Some((id, data)))) => {
+                info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
+                spawn_tasks(&link, id, data, outgoing, first, core);
+                Some(id)
+            }
+            _ => {
+                link.close(CloseReason::Goodbye);
+                None
+            }
+        };
+        Self { link, id, heard: Some(heard) }
     }
-    end
+
+    /// Waits for its end and reports that. Dropping the future loses nothing: it is to be called again.
+    async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
+        let end = self.link.closed().await;
+        if let Some(id) = self.id {
+            let _ = core.send(CoreEvent::LinkDown { id }).await;
+        }
+        end
+    }
+
+    /// Takes it down once its successor has been heard. The goodbye makes the peer close it, and so tells that it has
+    /// got everything before.
+    async fn retire(self, successor: Option<oneshot::Receiver<()>>, core: mpsc::Sender<CoreEvent>) {
+        if let Some(heard) = successor {
+            let _ = timeout(SUCCESSOR_MAX, heard).await;
+        }
+        let goodbye = async {
+            let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
+            self.link.closed().await
+        };
+        let _ = timeout(GOODBYE_MAX, goodbye).await;
+        self.link.close(CloseReason::Replaced);
+        self.end(&core).await;
+        info!(remote = %self.link.remote(), "a link with newer credentials took the place of this one");
+    }
 }
 
 fn spawn_tasks(
@@ -116,10 +213,11 @@ fn spawn_tasks(
     id: LinkId,
     data: Arc<DataPlane>,
     outgoing: mpsc::Receiver<Control>,
+    first: oneshot::Sender<()>,
     core: &mpsc::Sender<CoreEvent>,
 ) {
     tokio::spawn(send_control(link.clone(), outgoing));
-    tokio::spawn(receive_control(link.clone(), id, core.clone()));
+    tokio::spawn(receive_control(link.clone(), id, first, core.clone()));
     tokio::spawn(receive_flows(link.clone(), id, data.clone()));
     tokio::spawn(receive_datagrams(link.clone(), id, data));
 }
@@ -133,12 +231,21 @@ async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
     }
 }
 
-async fn receive_control(link: AnyLink, id: LinkId, core: mpsc::Sender<CoreEvent>) {
+async fn receive_control(
+    link: AnyLink,
+    id: LinkId,
+    first: oneshot::Sender<()>,
+    core: mpsc::Sender<CoreEvent>,
+) {
+    let mut first = Some(first);
     while let Ok(bytes) = link.recv_control().await {
         match Control::from_slice(&bytes) {
             Ok(frame) => {
                 if core.send(CoreEvent::Frame { link: id, frame }).await.is_err() {
                     return;
+                }
+                if let Some(first) = first.take() {
+                    let _ = first.send(());
                 }
             }
             Err(error) => {
@@ -185,5 +292,149 @@ async fn receive_datagrams(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::future::Future;
+
+    use rand_core::OsRng;
+    use sgc_transport::{CredentialStore, LinkOptions, RefusalKind, TransportMetrics};
+    use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
+    use sgc_wire::Hello;
+
+    use super::*;
+    use crate::core::now;
+
+    /// What a control task was told, as far as links go.
+    #[derive(Debug, PartialEq)]
+    enum Told {
+        Up(LinkId, CertId),
+        Down(LinkId),
+    }
+
+    /// Greets on each link and closes those whose peers say goodbye, as the machines do.
+    fn control_task() -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<Told>) {
+        let (events, mut inbox) = mpsc::channel(64);
+        let (tell, told) = mpsc::channel(64);
+        tokio::spawn(async move {
+            let mut links = Vec::new();
+            while let Some(event) = inbox.recv().await {
+                match event {
+                    CoreEvent::LinkUp { link, control, reply, .. } => {
+                        let id = LinkId(links.len() as u32 + 1);
+                        tell.send(Told::Up(id, link.peer().cert.clone())).await.unwrap();
+                        assert!(control.send(Control::Hello(Hello {
+                            minor: 0,
+                            incarnation: 1,
+                            transit: true
+                        })));
+                        links.push((link, control));
+                        assert!(reply.send(Some((id, Arc::default()))).is_ok());
+                    }
+                    CoreEvent::LinkDown { id } => tell.send(Told::Down(id)).await.unwrap(),
+                    CoreEvent::Frame { link, frame: Control::Goodbye } => {
+                        links[link.0 as usize - 1].0.close(CloseReason::Goodbye);
+                    }
+                    _ => {}
+                }
+            }
+        });
+        (events, told)
+    }
+
+    async fn soon<T>(future: impl Future<Output = T>) -> T {
+        timeout(Duration::from_secs(30), future).await.expect("it hangs")
+    }
+
+    /// A node that keeps a link to a router, both with control tasks of the test.
+    struct Bench {
+        fleet: Fleet,
+        arm: CredentialStore,
+        router: CredentialStore,
+        redial: watch::Sender<()>,
+        near: mpsc::Receiver<Told>,
+        far: mpsc::Receiver<Told>,
+        doors: Arc<TransportMetrics>,
+        _stop: oneshot::Sender<()>,
+    }
+
+    fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
+        let request = EnrollRequest::new(node.parse().unwrap(), now().unix);
+        Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+            let arm = CredentialStore::new(enroll(&fleet, "arm"));
+            let router = CredentialStore::new(enroll(&fleet, "router"));
+            let addr = "quic://127.0.0.1:0".parse().unwrap();
+            let options = LinkOptions::default();
+            let doors = Arc::<TransportMetrics>::default();
+            let listener = Listener::bind(&addr, router.clone(), options.clone(), doors.clone()).unwrap();
+            let url = listener.local().to_string().parse().unwrap();
+            let ((far_core, far), (near_core, near)) = (control_task(), control_task());
+            let (stop, stopped) = oneshot::channel();
+            tokio::spawn(keep_accepting(listener, far_core, stopped));
+            let (redial, on_redial) = watch::channel(());
+            let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
+            tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));
+            Self { fleet, arm, router, redial, near, far, doors, _stop: stop }
+        }
+
+        fn cert(store: &CredentialStore) -> CertId {
+            store.identity().as_peer().cert.clone()
+        }
+
+        async fn expect(&mut self, near: Told, far: Told) {
+            assert_eq!(soon(self.near.recv()).await.unwrap(), near);
+            assert_eq!(soon(self.far.recv()).await.unwrap(), far);
+        }
+
+        async fn expect_up(&mut self, id: u32) {
+            let (near, far) = (Self::cert(&self.router), Self::cert(&self.arm));
+            self.expect(Told::Up(LinkId(id), near), Told::Up(LinkId(id), far)).await;
+        }
+    }
+
+    #[tokio::test]
+    async fn a_renewed_certificate_is_shown_on_a_second_link_before_the_first_goes() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        for id in 1..4 {
+            bench.arm.set_identity(enroll(&bench.fleet, "arm"));
+            bench.redial.send_replace(());
+            // Up before down, on both sides.
+            bench.expect_up(id + 1).await;
+            bench.expect(Told::Down(LinkId(id)), Told::Down(LinkId(id))).await;
+        }
+    }
+
+    #[tokio::test]
+    async fn the_old_link_stays_while_the_new_certificate_is_refused() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        let refused = enroll(&bench.fleet, "arm");
+        let serial = Arc::clone(&refused.as_peer().cert.serial);
+        let list = bench.fleet.revocation_list_of(&[(serial, now().unix)], 1, now().unix).unwrap();
+        let anchors = bench.router.anchors();
+        bench.router.set_anchors(anchors.with_crl(&list, now().unix).unwrap().unwrap());
+        bench.arm.set_identity(refused);
+        bench.redial.send_replace(());
+        let is_refused = async {
+            while bench.doors.refused(RefusalKind::Revoked) == 0 {
+                tokio::task::yield_now().await;
+            }
+        };
+        soon(is_refused).await;
+        assert!(bench.near.is_empty() && bench.far.is_empty());
+        // It is tried again by itself.
+        bench.router.set_anchors(anchors.as_ref().clone());
+        bench.expect_up(2).await;
+        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
     }
 }

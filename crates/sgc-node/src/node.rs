@@ -14,12 +14,14 @@ use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Router, RouterConfig};
-use sgc_transport::{CloseReason, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics};
+use sgc_transport::{
+    CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
+};
 use sgc_trust::{Identity, IdentityError, Policy};
 use sgc_wire::Metadata;
 use tokio::io::AsyncWriteExt;
 use tokio::net::UnixListener;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
@@ -195,27 +197,31 @@ pub async fn run_on<N: RosNetwork>(
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
     let transport = Arc::new(TransportMetrics::default());
+    let credentials = CredentialStore::new(identity.clone());
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, identity.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), LinkOptions::default(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(identity.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), LinkOptions::default(), transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
-        transit: !config.listen.is_empty(),
+        transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
         anchors: Arc::new(identity.anchors().clone()),
         limits: sgc_router::Limits::default(),
     });
-    let endpoint_config =
-        EndpointConfig { identity: identity.clone(), limits: sgc_endpoint::Limits::default() };
+    let endpoint_config = EndpointConfig {
+        identity: identity.clone(),
+        authority: false,
+        limits: sgc_endpoint::Limits::default(),
+    };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
         let shares = config.shares.iter().map(|s| share_rule(s, &identity)).collect();
@@ -235,6 +241,7 @@ pub async fn run_on<N: RosNetwork>(
     let (core, requested) = Core::new(CoreParts {
         alive,
         identity: identity.clone(),
+        credentials,
         router,
         endpoint,
         routes,
@@ -253,8 +260,14 @@ pub async fn run_on<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
+    let (_redial, on_redial) = watch::channel(());
     for url in &config.routers {
-        tasks.push(tokio::spawn(keep_dialled(url.clone(), dialer.clone(), events.clone())));
+        tasks.push(tokio::spawn(keep_dialled(
+            url.clone(),
+            dialer.clone(),
+            events.clone(),
+            on_redial.clone(),
+        )));
     }
     let mut accepting = Vec::new();
     for listener in listeners {

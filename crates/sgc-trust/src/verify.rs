@@ -244,7 +244,7 @@ pub struct VerifiedPeer {
     /// True if its certificate lets it carry others' names (`sgc:role:router`).
     pub may_route: bool,
     /// All certificates of its path, from the one below the CA to its own.
-    pub(crate) path: Arc<[CertId]>,
+    pub path: Arc<[CertId]>,
     key: Arc<[u8]>,
     algorithm: &'static dyn SignatureVerificationAlgorithm,
 }
