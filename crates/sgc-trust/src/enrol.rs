@@ -65,6 +65,19 @@ impl Fleet {
         self.enroll(&request, rng)
     }
 
+    /// The same for a node that keeps the key with which it signed `csr`.
+    pub fn renew_member(
+        &mut self,
+        csr: &[u8],
+        node: &NodeName,
+        valid: Duration,
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        let request = self.standing_request(node, valid, now)?;
+        self.enroll_csr(csr, &request, rng)
+    }
+
     /// Fresh certificates and the secrets in use for the node of the roster that certificates call `pseudonym`, for
     /// the key that signed `csr`. Who asks has to be that node: the caller checks it.
     pub fn renew_csr(
@@ -77,8 +90,7 @@ impl Fleet {
     ) -> Result<Credentials, FleetError> {
         let known = self.node_by_pseudonym(pseudonym).map(|n| n.name.clone());
         let node = known.ok_or_else(|| FleetError::UnknownNode { node: pseudonym.short() })?;
-        let request = self.standing_request(&node, valid, now)?;
-        let member = self.enroll_csr(csr, &request, rng)?;
+        let member = self.renew_member(csr, &node, valid, now, rng)?;
         let chain = member.chain.iter().map(|c| Bytes::copy_from_slice(c)).collect();
         self.credentials_for(&node, chain)
     }

@@ -139,6 +139,19 @@ impl Identity {
         Ok(new)
     }
 
+    /// The same node and key with everything else anew, as a fleet answered [`Identity::csr`]. CAs that it trusts
+    /// besides stay trusted.
+    pub fn with_membership(&self, member: Membership) -> Result<Self, IdentityError> {
+        let more = member.anchors.certificates().cloned().collect::<Vec<_>>();
+        let anchors = self.anchors().with_anchors(more).map_err(IdentityError::Ca)?;
+        let parts = IdentityParts { member: Membership { anchors, ..member }, ..self.parts.clone() };
+        let new = Self::assemble(parts)?;
+        if new.node_id() != self.node_id() {
+            return Err(IdentityError::NameMismatch { node: new.parts.member.node });
+        }
+        Ok(new)
+    }
+
     /// A request for another certificate of the same node and key, DER (PKCS #10).
     pub fn csr(&self) -> Vec<u8> {
         let own = &self.own;

@@ -16,10 +16,13 @@ use rcgen::{
 };
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{CSR_BYTES_MAX, GroupTag, Pseudonym, UnixMillis};
+use zeroize::Zeroizing;
 
 use crate::fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY};
 use crate::fleet_error::FleetError;
 use crate::key::Key;
+use crate::member::KEY_BLOCK;
+use crate::pem;
 use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, NODE_URI, ROUTER_URI};
 use crate::x509::{CaFields, RequestFields, Validity};
 
@@ -140,6 +143,34 @@ pub(crate) fn signing_request(
         params.subject_alt_names = sans(pseudonym, groups, may_route).ok()?;
     }
     Some(params.serialize_request(key).ok()?.der().to_vec())
+}
+
+/// A key that its node makes for itself, and the request for a certificate that goes to the fleet, or to another CA.
+pub struct KeyRequest {
+    key: Key,
+    csr: Vec<u8>,
+}
+
+impl KeyRequest {
+    /// A new P-256 key. With a pseudonym the request names the node, so that a CA that knows nothing of SGC only has
+    /// to copy its subject alternative names.
+    pub fn generate(pseudonym: Option<&Pseudonym>, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
+        let key = Key::generate(rng);
+        let csr = signing_request(&key, pseudonym, &[], false);
+        let csr = csr.ok_or_else(|| FleetError::Making("its key cannot sign it".into()))?;
+        Ok(Self { key, csr })
+    }
+
+    /// The private key as text, for a file that only its owner may read.
+    pub fn key_text(&self) -> Zeroizing<String> {
+        let comment = "# Private key of an SGC node. KEEP IT SECRET and where it is.\n";
+        pem::write(comment, &[(KEY_BLOCK, self.key.pkcs8())])
+    }
+
+    /// The request (PKCS #10) as text. It is no secret.
+    pub fn csr_text(&self) -> String {
+        String::clone(&pem::write("", &[("CERTIFICATE REQUEST", &self.csr)]))
+    }
 }
 
 /// The key that a request asks a certificate for. Nothing else is read of it: what a certificate says is for the CA

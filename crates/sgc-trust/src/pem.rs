@@ -53,6 +53,13 @@ pub enum PemError {
     },
 }
 
+/// The contents of the blocks of a file that have one of these labels, in their order; others are passed over.
+pub fn pem_contents(text: &str, labels: &[&str]) -> Result<Vec<Zeroizing<Vec<u8>>>, PemError> {
+    let blocks = parse(text, FILE_BYTES_MAX)?;
+    let wanted = blocks.into_iter().filter(|b| labels.contains(&b.label.as_str()));
+    Ok(wanted.map(|b| b.content).collect())
+}
+
 /// One block, decoded.
 pub(crate) struct Block {
     pub(crate) label: String,
