@@ -9,7 +9,10 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig};
-use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
+use sgc_ros::{
+    Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
+    UseRule,
+};
 use sgc_router::{FibEntry, LinkClose, LinkId, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, Link};
 use sgc_trust::Identity;
@@ -17,6 +20,7 @@ use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tracing::{debug, error, info, warn};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
 use crate::outflow::OutFlow;
@@ -90,6 +94,22 @@ pub(crate) enum CoreEvent {
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
     },
+    /// The user wants something else from now on; answered when it is under way.
+    Reload {
+        /// What is shared.
+        shares: Vec<ShareRule>,
+        /// What is brought here.
+        uses: Vec<UseRule>,
+        /// Told when it is done.
+        reply: oneshot::Sender<()>,
+    },
+    /// A user brings a revocation list; answered with what came of it.
+    Crl {
+        /// The list.
+        der: Vec<u8>,
+        /// Told what came of it.
+        reply: oneshot::Sender<Result<String, String>>,
+    },
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
     /// Take nothing in any more; answered with what still leaves.
@@ -130,6 +150,7 @@ pub(crate) struct Core<N: RosNetwork> {
     superseded: BTreeSet<String>,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
+    audit: Audit,
 }
 
 /// What a [`Core`] is made of.
@@ -150,6 +171,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) alive: mpsc::Sender<()>,
     /// Transport counters.
     pub transport: Arc<sgc_transport::TransportMetrics>,
+    /// Where is kept who was granted what.
+    pub audit: Audit,
 }
 
 /// The present, by both clocks.
@@ -186,6 +209,7 @@ impl<N: RosNetwork> Core<N> {
             superseded: BTreeSet::new(),
             transport: parts.transport,
             alive: parts.alive,
+            audit: parts.audit,
         };
         (core, requested)
     }
@@ -234,6 +258,8 @@ impl<N: RosNetwork> Core<N> {
                 self.next_link += 1;
                 let node = link.peer().node_id;
                 let remote = link.remote();
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&node).remote(remote);
+                self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
@@ -243,6 +269,8 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
+                    let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()));
                     entry.flows.values().for_each(|f| f.close());
                 }
             }
@@ -269,6 +297,17 @@ impl<N: RosNetwork> Core<N> {
                     (_, Some(writer)) => writer.close(),
                     (_, None) => {}
                 }
+            }
+            CoreEvent::Reload { shares, uses, reply } => {
+                if let Some(routes) = &mut self.routes {
+                    routes.reconfigure(Instant::now(), shares, uses);
+                }
+                self.drain();
+                let _ = reply.send(());
+            }
+            CoreEvent::Crl { der, reply } => {
+                debug!(bytes = der.len(), "a revocation list");
+                let _ = reply.send(Err("revocation lists are not taken by this version".to_owned()));
             }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
@@ -403,6 +442,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn endpoint_event(&mut self, now: Now, event: Event) {
+        self.audit_event(&event);
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer } => {
@@ -455,6 +495,25 @@ impl<N: RosNetwork> Core<N> {
                 warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
                 routes.handle_owner_refused(owner, by);
             }
+        }
+    }
+
+    /// Keeps what concerns who gets what of this node.
+    fn audit_event(&self, event: &Event) {
+        let about = |event, name| {
+            let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));
+            AuditRecord::new(event).topic(topic).name(name)
+        };
+        match event {
+            Event::SinkJoined { name, peer, .. } => {
+                let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
+                self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
+            }
+            Event::SinkLeft { name, .. } => self.audit.write(about(AuditEvent::Left, name)),
+            Event::SinkRefused { name, peer, reason } => {
+                self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
+            }
+            _ => {}
         }
     }
 

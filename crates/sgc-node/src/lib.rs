@@ -5,6 +5,8 @@
 //! beside it, on the tasks and threads that receive.
 #![forbid(unsafe_code)]
 
+pub mod admin;
+pub mod audit;
 pub mod config;
 mod core;
 mod dataplane;
@@ -14,6 +16,8 @@ mod outflow;
 pub mod partners;
 pub mod policy;
 mod queue;
+mod reload;
+mod rules;
 mod sinks;
 mod sources;
 mod state;
@@ -23,5 +27,7 @@ mod status;
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };
+pub use reload::{ConfigSource, ReloadReport};
+pub use rules::{RulesError, read_token};
 pub use state::{StateError, create_state_dir, state_dir};
 pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
