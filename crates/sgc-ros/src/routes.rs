@@ -498,10 +498,11 @@ impl<R: RngCore> Routes<R> {
 
     /// A sink of one of our shares is gone.
     pub fn handle_sink_left(&mut self, now: Instant, name: &Name, sink: &SinkId) {
-        if let Some(share) = self.shares.get_mut(name) {
-            if share.sinks.remove(sink) && share.sinks.is_empty() {
-                share.sinkless_until = Some(now + SINKLESS_HOLD);
-            }
+        if let Some(share) = self.shares.get_mut(name)
+            && share.sinks.remove(sink)
+            && share.sinks.is_empty()
+        {
+            share.sinkless_until = Some(now + SINKLESS_HOLD);
         }
     }
 
