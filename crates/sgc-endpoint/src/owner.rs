@@ -1,7 +1,7 @@
 //! As the owner of names: shares, whom they are granted to, epochs, the catalogue, and for an authority the
 //! credentials of members.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -17,6 +17,10 @@ use crate::SourceProgress;
 use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
+
+/// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
+/// epochs whose packets are still under way.
+const EPOCHS_AHEAD_MAX: u32 = 3;
 
 impl Endpoint {
     /// Shares an interface under the name that its metadata gives with the newest secret.
@@ -41,6 +45,7 @@ impl Endpoint {
             rotate_at: now.instant + self.config.limits.rotate_every,
             own: Vec::new(),
             sinks: BTreeMap::new(),
+            left: BTreeMap::new(),
         };
         self.shares.shares.insert(name, share);
         self.withdrawn.remove(&blind);
@@ -171,24 +176,28 @@ impl Endpoint {
     /// Cuts everyone who has lost the right to what was granted, and begins new epochs for those who stay.
     pub(crate) fn enforce(&mut self) {
         let mut cut = Vec::new();
+        let mut names = BTreeSet::new();
         for (name, share) in &self.shares.shares {
+            let denied = |peer: &VerifiedPeer, role| {
+                let policy = &share.spec.policy;
+                self.standing(peer).or_else(|| policy.permits(peer, role).err().map(refusal))
+            };
             for (sink, granted) in &share.sinks {
-                let denied = self.standing(&granted.peer).or_else(|| {
-                    let role = granted.request.role();
-                    share.spec.policy.permits(&granted.peer, role).err().map(refusal)
-                });
+                let denied = denied(&granted.peer, granted.request.role());
                 cut.extend(denied.map(|reason| (*name, *sink, reason)));
             }
+            // That it left, or was cut off by a router that heard of it first, does not make it forget the key.
+            if share.left.values().any(|(peer, role)| denied(peer, *role).is_some()) {
+                names.insert(*name);
+            }
         }
-        let mut names = Vec::new();
         for (name, sink, reason) in cut {
             let Some(share) = self.shares.shares.get_mut(&name) else { continue };
             let Some(granted) = share.sinks.remove(&sink) else { continue };
             self.refuse(name, sink, granted.serial + 1, reason);
             self.event(Event::SinkCut { name, sink, peer: granted.peer.node_id, reason });
-            names.push(name);
+            names.insert(name);
         }
-        names.dedup();
         for name in names {
             self.begin_epoch(name);
         }
@@ -225,11 +234,22 @@ impl Endpoint {
         let limits = &self.config.limits;
         let (wait, every) = (limits.rotate_wait, limits.rotate_every);
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
-        // An epoch that some were granted and that never began is skipped: one of them may be who was cut.
+        // An epoch that some were granted and that never began is skipped: one of them may be who was cut. The time
+        // runs on from the first of them, or many in a row would put the new key off for ever; and sinks hold few keys,
+        // so beyond that number the next one waits for its turn.
+        let ahead = share.newest().number - share.epoch.number;
+        let deadline = match &mut share.rotation {
+            Some(rotation) if ahead >= EPOCHS_AHEAD_MAX => {
+                rotation.again = true;
+                return;
+            }
+            Some(rotation) => rotation.deadline,
+            None => self.now.instant + wait,
+        };
         let epoch = Epoch::new(share.newest().number.saturating_add(1), &mut self.rng);
         share.rotate_at = self.now.instant + every;
-        let deadline = self.now.instant + wait;
-        share.rotation = Some(Rotation { epoch, waiting: BTreeMap::new(), deadline });
+        share.left.clear();
+        share.rotation = Some(Rotation { epoch, waiting: BTreeMap::new(), deadline, again: false });
         self.regrant(name);
         if let Some(Share { rotation: Some(rotation), sinks, .. }) = self.shares.shares.get_mut(&name) {
             rotation.waiting = sinks.iter().map(|(sink, s)| (*sink, s.serial)).collect();
@@ -246,6 +266,9 @@ impl Endpoint {
         share.epoch = rotation.epoch;
         let grant = share.grant(&share.epoch, None);
         self.event(Event::Rekeyed { name, grant });
+        if rotation.again {
+            self.begin_epoch(name);
+        }
     }
 
     pub(crate) fn rotation_deadline(&self) -> Option<Instant> {
@@ -527,9 +550,14 @@ impl Endpoint {
             if let Some(rotation) = &mut share.rotation {
                 rotation.waiting.remove(&sink);
             }
-            self.event(Event::SinkLeft { name, sink, peer: granted.peer.node_id });
+            let (peer, role) = (granted.peer.node_id, granted.request.role());
+            share.left.insert(peer, (granted.peer, role));
+            let too_many = share.left.len() > self.config.limits.sinks_per_name_max;
+            self.event(Event::SinkLeft { name, sink, peer });
             self.finish_epoch(name);
-            if matches!(granted.request, Request::Publish { .. }) {
+            if too_many {
+                self.begin_epoch(name);
+            } else if role == Role::Publish {
                 self.regrant(name);
             }
         }

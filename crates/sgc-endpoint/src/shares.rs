@@ -92,6 +92,8 @@ pub(crate) struct Rotation {
     pub(crate) waiting: BTreeMap<SinkId, u64>,
     /// When the epoch begins even if some have not.
     pub(crate) deadline: Instant,
+    /// True if another is to follow at once.
+    pub(crate) again: bool,
 }
 
 /// A share.
@@ -106,6 +108,8 @@ pub(crate) struct Share {
     /// This node's own sources.
     pub(crate) own: Vec<Arc<SourceProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
+    /// Who left and still has the newest key. If one of them loses its right, that key has to go.
+    pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
 }
 
 impl Share {
