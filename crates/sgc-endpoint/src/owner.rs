@@ -8,8 +8,8 @@ use std::time::Instant;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
-    Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
-    SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
+    Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos, Recover, RefuseReason, Request,
+    Role, SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
 };
 
 use crate::SourceProgress;
@@ -447,6 +447,7 @@ impl Endpoint {
         // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
         let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
+        share.left.remove(&peer);
         let content = GrantContent::Topic(share.grant(&share.epoch, share.sinks.get(&sink)));
         if !self.grant(name, sink, serial, &reply_key, &content) {
             if let Some(share) = self.shares.shares.get_mut(&name) {
@@ -478,7 +479,7 @@ impl Endpoint {
                 return Err(RefuseReason::NotVerified);
             }
             // Two sources under one id would use one nonce twice.
-            Request::Publish { offer } if share.has_source(&offer.source, sink) => {
+            Request::Publish { offer } if share.has_source(offer, &asked.peer.node_id) => {
                 return Err(RefuseReason::NotPermitted);
             }
             Request::Publish { .. } | Request::Subscribe { .. } => {}
@@ -501,7 +502,7 @@ impl Endpoint {
             Some(RefuseReason::RoleNotOffered)
         } else if !own_fleet {
             Some(RefuseReason::NotPermitted)
-        } else if self.shares.followers.len() >= self.config.limits.sinks_per_name_max {
+        } else if self.follower_places(&name, &sink, &asked.peer.node_id) == 0 {
             Some(RefuseReason::Limit)
         } else {
             None
@@ -514,6 +515,18 @@ impl Endpoint {
                 self.tell_follower(name, sink);
             }
         }
+    }
+
+    /// How many more catalogues may be sent to a node that asks as `sink`; one that asks again has its place.
+    fn follower_places(&self, name: &Name, sink: &SinkId, peer: &NodeId) -> usize {
+        let followers = &self.shares.followers;
+        if let Some(known) = followers.get(&(*name, *sink)) {
+            return usize::from(known.peer.node_id == *peer);
+        }
+        let limits = &self.config.limits;
+        let of_peer = followers.values().filter(|f| f.peer.node_id == *peer).count();
+        let left = limits.sinks_per_peer_max.saturating_sub(of_peer);
+        left.min(limits.sinks_per_name_max.saturating_sub(followers.len()))
     }
 
     fn handle_renew(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
