@@ -10,7 +10,7 @@ use sgc_router::{LinkId, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
-    SinkId,
+    SinkId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -358,6 +358,16 @@ impl World {
         let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
             running.endpoint.join(now, name, id, Wish::Subscribe { describe: false });
+        }
+        self.settle(node);
+    }
+
+    /// Asks to publish on another's topic without looking into its catalogue, until the node stops.
+    pub fn publish_blindly(&mut self, node: NodeKey, owner: NodeKey, topic: &str, offer: SourceOffer) {
+        self.note(format!("publish blindly {node:?} {owner:?}:{topic}"));
+        let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.join(now, name, id, Wish::Publish(offer));
         }
         self.settle(node);
     }
