@@ -135,6 +135,8 @@ impl Trio {
             shares: vec![],
             uses: vec![],
             admin_socket: Some(self.dir.path().join(format!("{}.sock", self.starts.get()))),
+            state: Some(self.dir.path().join(format!("{}.state", self.starts.get()))),
+            ..Config::default()
         }
     }
 
@@ -153,6 +155,7 @@ impl Trio {
                 topic: (*topic).into(),
                 type_name: None,
                 to: vec![Recipient::Node(to.parse().unwrap())],
+                publish: vec![],
                 priority: Class::Default,
                 suite: Suite::Group,
                 metadata: ShareMetadata::default(),

@@ -46,6 +46,11 @@ impl TrustAnchors {
         self.lists.values().map(|list| &list.der)
     }
 
+    /// The same, each with its CA.
+    pub fn crls_by_ca(&self) -> impl Iterator<Item = (&CaFingerprint, &Bytes)> {
+        self.lists.iter().map(|(ca, list)| (ca, &list.der))
+    }
+
     /// True if this very certificate is revoked. A certificate below an intermediate CA is over also when the
     /// intermediate's is: see [`TrustAnchors::is_peer_revoked`].
     pub fn is_revoked(&self, cert: &CertId) -> bool {

@@ -27,6 +27,7 @@ mod seal;
 mod secret;
 mod signed;
 mod suite;
+mod token;
 mod verify;
 mod x509;
 mod xwing;
@@ -53,6 +54,7 @@ pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, verify_advert, verify_answer, verify_join,
 };
 pub use suite::{ParseSuiteError, Suite};
+pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};
 pub use verify::{
     ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, SignatureError, TrustAnchors,
     VerifiedPeer, node_id,

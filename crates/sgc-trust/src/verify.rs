@@ -144,6 +144,11 @@ impl TrustAnchors {
         self.anchors.iter().map(|a| &a.der)
     }
 
+    /// The CAs, by their public keys, in the order of [`TrustAnchors::certificates`].
+    pub fn fingerprints(&self) -> impl Iterator<Item = CaFingerprint> {
+        self.anchors.iter().map(|a| a.fingerprint)
+    }
+
     /// The public key (SubjectPublicKeyInfo, DER) of a CA that is trusted here.
     pub fn ca_spki(&self, ca: &CaFingerprint) -> Option<&[u8]> {
         self.anchors.iter().find(|a| a.fingerprint == *ca).map(|a| &*a.spki)
