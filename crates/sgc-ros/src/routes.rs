@@ -631,6 +631,12 @@ impl<R: RngCore> Routes<R> {
         shares.chain(uses).flatten().min()
     }
 
+    /// The ROS topic behind a name that is shared or used here.
+    pub fn topic_of(&self, name: &Name) -> Option<&str> {
+        let share = self.shares.get(name).map(|s| self.share_rules[s.rule].metadata.ros_name.as_str());
+        share.or_else(|| Some(self.use_rules[self.uses.get(name)?.rule].topic.as_str()))
+    }
+
     /// Where every rule stands.
     pub fn status(&self) -> Vec<RouteStatus> {
         let mut all = Vec::new();

@@ -4,7 +4,7 @@
 //! What is in them is the business of `sgc-trust`.
 
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -99,6 +99,36 @@ pub(crate) fn read_secret(path: &Path, what: &'static str) -> Result<Zeroizing<S
         return Err(failed(io::Error::other("it is far too large")));
     }
     fs::read_to_string(path).map(Zeroizing::new).map_err(failed)
+}
+
+/// Reads a file of at most `max` bytes.
+pub(crate) fn read_limited(path: &Path, max: u64) -> Result<Vec<u8>, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    let mut content = Vec::new();
+    fs::File::open(path).and_then(|file| file.take(max + 1).read_to_end(&mut content)).map_err(failed)?;
+    if content.len() as u64 > max {
+        return Err(failed(io::Error::other(format!("it has more than {max} bytes"))));
+    }
+    Ok(content)
+}
+
+/// The configuration that is meant: as named, or the only one of this directory.
+pub(crate) fn config_here(named: Option<&Path>) -> Result<PathBuf, CliError> {
+    let dir = Path::new(".");
+    let found = match named {
+        Some(path) => return Ok(path.to_owned()),
+        None => {
+            with_extension(dir, "toml").map_err(|source| CliError::Read { path: dir.to_owned(), source })?
+        }
+    };
+    let name = |path: &PathBuf| path.strip_prefix(dir).unwrap_or(path).to_owned();
+    match &found[..] {
+        [] => Err(CliError::NoConfigHere),
+        [only] => Ok(name(only)),
+        several => Err(CliError::SeveralConfigs {
+            files: several.iter().map(|p| name(p).display().to_string()).collect(),
+        }),
+    }
 }
 
 /// The files of a directory with this extension, in order.
