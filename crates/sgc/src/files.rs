@@ -143,3 +143,29 @@ pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<Path
     found.sort();
     Ok(found)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        write_secret(&path, "1", Existing::Replace).unwrap();
+        let first = lock(&path).unwrap();
+        let waiting = std::thread::spawn({
+            let path = path.clone();
+            move || lock(&path).unwrap().metadata().unwrap().ino()
+        });
+        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
+        let inode = format!(":{} ", first.metadata().unwrap().ino());
+        let waits = |line: &str| line.contains("->") && line.contains(&inode);
+        while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {
+            std::thread::yield_now();
+        }
+        write_secret(&path, "2", Existing::Replace).unwrap();
+        drop(first);
+        assert_eq!(waiting.join().unwrap(), fs::metadata(&path).unwrap().ino());
+    }
+}
