@@ -12,22 +12,25 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
-use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
+use sgc_ros::{Direction, RosError, RosNetwork, Routes, UseRule};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
 };
-use sgc_trust::{Identity, IdentityError, Policy};
-use sgc_wire::Metadata;
+use sgc_trust::{Identity, IdentityError};
 use tokio::io::AsyncWriteExt;
 use tokio::net::UnixListener;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::config::{Config, DiscoveryRange, Recipient, RosConfig, ShareConfig, UseConfig};
+use crate::config::{Config, DiscoveryRange, RosConfig, UseConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
+use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
+use crate::partners::Partners;
+use crate::policy;
+use crate::state::{create_state_dir, state_dir};
 
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
@@ -196,35 +199,44 @@ pub async fn run_on<N: RosNetwork>(
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
+    let partners = Partners::default();
     let transport = Arc::new(TransportMetrics::default());
+    let state = usable_state_dir(&config, identity.node_name().as_str());
+    let anchors = with_kept_crls(state.as_deref(), identity.anchors().clone(), now());
     let credentials = CredentialStore::new(identity.clone());
+    credentials.set_anchors(anchors.clone());
+    let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, credentials.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), link_options.clone(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(credentials.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
         transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
-        anchors: Arc::new(identity.anchors().clone()),
+        anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
     });
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
-        authority: false,
-        limits: sgc_endpoint::Limits::default(),
+        authority: config.authority.is_some(),
+        limits: sgc_endpoint::Limits {
+            rotate_every: config.rotation.every,
+            ..sgc_endpoint::Limits::default()
+        },
     };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
+    endpoint.set_anchors(now(), Arc::new(anchors));
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
-        let shares = config.shares.iter().map(|s| share_rule(s, &identity)).collect();
+        let shares = config.shares.iter().map(|s| policy::share_rule(s, &identity, &partners)).collect();
         let uses: Vec<_> = config.uses.iter().filter_map(|u| use_rule(u, &identity)).collect();
         let mut followed = std::collections::BTreeSet::new();
         for rule in &uses {
@@ -232,13 +244,19 @@ pub async fn run_on<N: RosNetwork>(
                 endpoint.follow(now(), &rule.owner_name);
             }
         }
+        let secret = identity.naming_secrets().first().map_or(secret, |newest| &newest.secret);
         Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
     });
 
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
+    let (redial, on_redial) = watch::channel(());
     let (core, requested) = Core::new(CoreParts {
+        authority: config.authority.clone(),
+        epoch_messages_max: config.rotation.messages,
+        keeper: Keeper::spawn(state, config.identity.clone(), alive.clone()),
+        redial,
         alive,
         identity: identity.clone(),
         credentials,
@@ -261,7 +279,12 @@ pub async fn run_on<N: RosNetwork>(
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
     for url in &config.routers {
-        tasks.push(tokio::spawn(keep_dialled(url.clone(), dialer.clone(), events.clone())));
+        tasks.push(tokio::spawn(keep_dialled(
+            url.clone(),
+            dialer.clone(),
+            events.clone(),
+            on_redial.clone(),
+        )));
     }
     let mut accepting = Vec::new();
     for listener in listeners {
@@ -324,6 +347,22 @@ pub async fn run_on<N: RosNetwork>(
     Ok(())
 }
 
+/// The state directory, made if need be; `None`, and said, if it cannot be used: then nothing is remembered.
+fn usable_state_dir(config: &Config, node: &str) -> Option<PathBuf> {
+    let dir = state_dir(config, node);
+    let Some(dir) = dir else {
+        warn!("no state directory: set `state` in [node]; revocations are forgotten with each restart");
+        return None;
+    };
+    match create_state_dir(&dir) {
+        Ok(()) => Some(dir),
+        Err(error) => {
+            warn!(%error, "the state directory cannot be used; revocations are forgotten with each restart");
+            None
+        }
+    }
+}
+
 fn system_rng() -> Result<ChaCha20Rng, NodeError> {
     let mut seed = [0; 32];
     OsRng.try_fill_bytes(&mut seed).map_err(|e| NodeError::Randomness(e.to_string()))?;
@@ -345,44 +384,14 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
     }
 }
 
-fn share_rule(share: &ShareConfig, identity: &Identity) -> ShareRule {
-    let mut policy = Policy::default();
-    for recipient in &share.to {
-        match recipient {
-            Recipient::Everyone => {
-                policy.subscribe.fleets.insert(identity.as_peer().ca);
-            }
-            Recipient::Node(node) => policy.subscribe.nodes.extend(identity.node_id_of(node.as_str())),
-            Recipient::Group(group) => {
-                let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
-                policy.subscribe.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
-            }
-        }
-    }
-    let extra = share.metadata.clone();
-    let type_name = share.type_name.clone().unwrap_or_default();
-    ShareRule {
-        metadata: Metadata {
-            node: extra.node,
-            author: extra.author,
-            maintainer: extra.maintainer,
-            interface: extra.interface,
-            description: extra.description,
-            unique: extra.unique,
-            ..Metadata::topic(identity.node_name().as_str(), &share.topic, &type_name)
-        },
-        policy,
-        suite: share.suite,
-        class: share.priority,
-    }
-}
-
 fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
     Some(UseRule {
+        direction: Direction::Bring,
         owner: identity.node_id_of(rule.from.as_str())?,
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),
         type_name: rule.type_name.clone(),
+        token: None,
     })
 }
 

@@ -23,10 +23,6 @@ use crate::stats::DataDrop;
 /// Histories that may be sent at once; a sink that comes too early asks again.
 pub(crate) const REPLAYS_MAX: usize = 16;
 
-/// Messages of one source under one key, after which a new epoch begins: far below what its ciphers bear, and little
-/// enough for a key that got out.
-const EPOCH_MESSAGES_MAX: u64 = 1 << 24;
-
 /// Samples that may wait for their writer to be discovered.
 const EARLY_SAMPLES_MAX: usize = 256;
 
@@ -70,6 +66,11 @@ impl SourceMap {
         self.slots().find(|slot| slot.id == *id).cloned()
     }
 
+    /// Their ids.
+    pub(crate) fn ids(&self) -> Vec<SourceId> {
+        self.slots().map(|slot| slot.id).collect()
+    }
+
     /// All.
     pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
         self.own.values().chain(&self.shared)
@@ -97,6 +98,8 @@ pub(crate) struct LocalShare {
     /// How many those are, to be seen without the lock, which a publisher holds while it is pushed back.
     waiting: AtomicUsize,
     closed: AtomicBool,
+    /// Messages of one source under one key, after which a new epoch begins.
+    epoch_messages_max: u64,
     /// True while the epoch that is over by its number of messages has no successor yet.
     rotating: AtomicBool,
     published: AtomicU64,
@@ -109,7 +112,12 @@ impl LocalShare {
     }
 
     /// A share without sources.
-    pub(crate) fn new(name: Name, data: Arc<DataPlane>, alive: mpsc::Sender<()>) -> Self {
+    pub(crate) fn new(
+        name: Name,
+        data: Arc<DataPlane>,
+        alive: mpsc::Sender<()>,
+        epoch_messages_max: u64,
+    ) -> Self {
         Self {
             name,
             data,
@@ -119,6 +127,7 @@ impl LocalShare {
             inbox: Mutex::default(),
             waiting: AtomicUsize::new(0),
             closed: AtomicBool::new(false),
+            epoch_messages_max,
             rotating: AtomicBool::new(false),
             published: AtomicU64::new(0),
         }
@@ -261,7 +270,7 @@ impl LocalShare {
 
     /// True, once per epoch, when a source has published so many messages that a new one shall begin.
     pub(crate) fn is_epoch_over(&self) -> bool {
-        let over = |slot: &SourceSlot| slot.progress.published_in_epoch() >= EPOCH_MESSAGES_MAX;
+        let over = |slot: &SourceSlot| slot.progress.published_in_epoch() >= self.epoch_messages_max;
         self.map.load().slots().any(over) && !self.rotating.swap(true, Relaxed)
     }
 

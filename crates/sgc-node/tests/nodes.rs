@@ -37,7 +37,7 @@ fn unix_now() -> UnixMillis {
 fn identity(name: &str, router: bool) -> Arc<Identity> {
     let mut request = EnrollRequest::new(name.parse::<NodeName>().unwrap(), unix_now());
     request.router = router;
-    Arc::new(fleet().enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+    Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
 }
 
 /// A node in a runtime of its own.
@@ -135,6 +135,8 @@ impl Trio {
             shares: vec![],
             uses: vec![],
             admin_socket: Some(self.dir.path().join(format!("{}.sock", self.starts.get()))),
+            state: Some(self.dir.path().join(format!("{}.state", self.starts.get()))),
+            ..Config::default()
         }
     }
 
@@ -157,6 +159,7 @@ impl Trio {
                 topic: (*topic).into(),
                 type_name: None,
                 to: vec![Recipient::Node(to.parse().unwrap())],
+                publish: vec![],
                 priority: Class::Default,
                 suite,
                 metadata: ShareMetadata::default(),

@@ -31,7 +31,7 @@ fn fleet(seed: u64) -> Fleet {
 }
 
 fn enroll(fleet: &Fleet, node: &str, seed: u64) -> Identity {
-    fleet.enroll(&EnrollRequest::new(node.parse().unwrap(), NOW), &mut rng(seed)).unwrap()
+    fleet.issue(&EnrollRequest::new(node.parse().unwrap(), NOW), &mut rng(seed)).unwrap()
 }
 
 /// A list that revokes these.
