@@ -1,7 +1,7 @@
 //! As the owner of names: shares, whom they are granted to, epochs, the catalogue, and for an authority the
 //! credentials of members.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -9,13 +9,17 @@ use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
-    Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
-    SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
+    Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos, Recover, RefuseReason, Request,
+    Role, SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
 };
 
 use crate::SourceProgress;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
+
+/// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
+/// epochs whose packets are still under way.
+const EPOCHS_AHEAD_MAX: u32 = 3;
 
 impl Endpoint {
     /// Shares an interface under the name that its metadata gives with the newest secret.
@@ -40,6 +44,7 @@ impl Endpoint {
             rotate_at: now.instant + self.config.limits.rotate_every,
             own: Vec::new(),
             sinks: BTreeMap::new(),
+            left: BTreeMap::new(),
         };
         self.shares.shares.insert(name, share);
         self.withdrawn.remove(&blind);
@@ -173,24 +178,28 @@ impl Endpoint {
     /// Cuts everyone who has lost the right to what was granted, and begins new epochs for those who stay.
     pub(crate) fn enforce(&mut self) {
         let mut cut = Vec::new();
+        let mut names = BTreeSet::new();
         for (name, share) in &self.shares.shares {
+            let denied = |peer: &VerifiedPeer, role| {
+                let policy = &share.spec.policy;
+                self.standing(peer).or_else(|| policy.permits(peer, role).err().map(refusal))
+            };
             for (sink, granted) in &share.sinks {
-                let denied = self.standing(&granted.peer).or_else(|| {
-                    let role = granted.request.role();
-                    share.spec.policy.permits(&granted.peer, role).err().map(refusal)
-                });
+                let denied = denied(&granted.peer, granted.request.role());
                 cut.extend(denied.map(|reason| (*name, *sink, reason)));
             }
+            // That it left, or was cut off by a router that heard of it first, does not make it forget the key.
+            if share.left.values().any(|(peer, role)| denied(peer, *role).is_some()) {
+                names.insert(*name);
+            }
         }
-        let mut names = Vec::new();
         for (name, sink, reason) in cut {
             let Some(share) = self.shares.shares.get_mut(&name) else { continue };
             let Some(granted) = share.sinks.remove(&sink) else { continue };
             self.refuse(name, sink, granted.serial + 1, reason);
             self.event(Event::SinkCut { name, sink, peer: granted.peer.node_id, reason });
-            names.push(name);
+            names.insert(name);
         }
-        names.dedup();
         for name in names {
             self.begin_epoch(name);
         }
@@ -227,11 +236,22 @@ impl Endpoint {
         let limits = &self.config.limits;
         let (wait, every) = (limits.rotate_wait, limits.rotate_every);
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
-        // An epoch that some were granted and that never began is skipped: one of them may be who was cut.
+        // An epoch that some were granted and that never began is skipped: one of them may be who was cut. The time
+        // runs on from the first of them, or many in a row would put the new key off for ever; and sinks hold few keys,
+        // so beyond that number the next one waits for its turn.
+        let ahead = share.newest().number - share.epoch.number;
+        let deadline = match &mut share.rotation {
+            Some(rotation) if ahead >= EPOCHS_AHEAD_MAX => {
+                rotation.again = true;
+                return;
+            }
+            Some(rotation) => rotation.deadline,
+            None => self.now.instant + wait,
+        };
         let epoch = Epoch::new(share.newest().number.saturating_add(1), &mut self.rng);
         share.rotate_at = self.now.instant + every;
-        let deadline = self.now.instant + wait;
-        share.rotation = Some(Rotation { epoch, waiting: BTreeMap::new(), deadline });
+        share.left.clear();
+        share.rotation = Some(Rotation { epoch, waiting: BTreeMap::new(), deadline, again: false });
         self.regrant(name);
         if let Some(Share { rotation: Some(rotation), sinks, .. }) = self.shares.shares.get_mut(&name) {
             rotation.waiting = sinks.iter().map(|(sink, s)| (*sink, s.serial)).collect();
@@ -248,6 +268,9 @@ impl Endpoint {
         share.epoch = rotation.epoch;
         let grant = share.grant(&share.epoch, None);
         self.event(Event::Rekeyed { name, grant });
+        if rotation.again {
+            self.begin_epoch(name);
+        }
     }
 
     pub(crate) fn rotation_deadline(&self) -> Option<Instant> {
@@ -428,6 +451,7 @@ impl Endpoint {
         // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
         let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
+        share.left.remove(&peer);
         let content = GrantContent::Topic(share.grant(&share.epoch, share.sinks.get(&sink)));
         if !self.grant(name, sink, serial, &reply_key, &content) {
             if let Some(share) = self.shares.shares.get_mut(&name) {
@@ -473,7 +497,7 @@ impl Endpoint {
                 return Err(RefuseReason::NotVerified);
             }
             // Two sources under one id would use one nonce twice.
-            Request::Publish { offer } if share.has_source(&offer.source, sink) => {
+            Request::Publish { offer } if share.has_source(offer, &asked.peer.node_id) => {
                 return Err(RefuseReason::NotPermitted);
             }
             Request::Publish { .. } | Request::Subscribe { .. } => {}
@@ -496,7 +520,7 @@ impl Endpoint {
             Some(RefuseReason::RoleNotOffered)
         } else if !own_fleet {
             Some(RefuseReason::NotPermitted)
-        } else if self.shares.followers.len() >= self.config.limits.sinks_per_name_max {
+        } else if self.follower_places(&name, &sink, &asked.peer.node_id) == 0 {
             Some(RefuseReason::Limit)
         } else {
             None
@@ -509,6 +533,18 @@ impl Endpoint {
                 self.tell_follower(name, sink);
             }
         }
+    }
+
+    /// How many more catalogues may be sent to a node that asks as `sink`; one that asks again has its place.
+    fn follower_places(&self, name: &Name, sink: &SinkId, peer: &NodeId) -> usize {
+        let followers = &self.shares.followers;
+        if let Some(known) = followers.get(&(*name, *sink)) {
+            return usize::from(known.peer.node_id == *peer);
+        }
+        let limits = &self.config.limits;
+        let of_peer = followers.values().filter(|f| f.peer.node_id == *peer).count();
+        let left = limits.sinks_per_peer_max.saturating_sub(of_peer);
+        left.min(limits.sinks_per_name_max.saturating_sub(followers.len()))
     }
 
     fn handle_renew(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
@@ -545,9 +581,14 @@ impl Endpoint {
             if let Some(rotation) = &mut share.rotation {
                 rotation.waiting.remove(&sink);
             }
-            self.event(Event::SinkLeft { name, sink, peer: granted.peer.node_id });
+            let (peer, role) = (granted.peer.node_id, granted.request.role());
+            share.left.insert(peer, (granted.peer, role));
+            let too_many = share.left.len() > self.config.limits.sinks_per_name_max;
+            self.event(Event::SinkLeft { name, sink, peer });
             self.finish_epoch(name);
-            if matches!(granted.request, Request::Publish { .. }) {
+            if too_many {
+                self.begin_epoch(name);
+            } else if role == Role::Publish {
                 self.regrant(name);
             }
         }

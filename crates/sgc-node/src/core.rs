@@ -13,7 +13,10 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
-use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
+use sgc_ros::{
+    Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
+    UseRule,
+};
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
 use sgc_trust::{CrlError, Identity, MessageKey, Suite};
@@ -23,6 +26,7 @@ use sgc_wire::{
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::publish::Publishing;
 use crate::credentials::Keeper;
 use crate::dataplane::{DataPlane, Forward, Out};
@@ -107,6 +111,15 @@ pub(crate) enum CoreEvent {
         /// What.
         answer: Result<Credentials, RefuseReason>,
     },
+    /// The user wants something else from now on; answered when it is under way.
+    Reload {
+        /// What is shared.
+        shares: Vec<ShareRule>,
+        /// What is brought here.
+        uses: Vec<UseRule>,
+        /// Told when it is done.
+        reply: oneshot::Sender<()>,
+    },
     /// The user brings a revocation list; answered with whether it is news.
     Crl {
         /// The list, DER.
@@ -168,6 +181,7 @@ pub(crate) struct Core<N: RosNetwork> {
     superseded: BTreeSet<String>,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
+    audit: Audit,
 }
 
 /// What a [`Core`] is made of.
@@ -198,6 +212,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) alive: mpsc::Sender<()>,
     /// Transport counters.
     pub transport: Arc<sgc_transport::TransportMetrics>,
+    /// Where is kept who was granted what.
+    pub audit: Audit,
 }
 
 /// The present, by both clocks.
@@ -243,6 +259,7 @@ impl<N: RosNetwork> Core<N> {
             superseded: BTreeSet::new(),
             transport: parts.transport,
             alive: parts.alive,
+            audit: parts.audit,
         };
         (core, requested)
     }
@@ -292,6 +309,8 @@ impl<N: RosNetwork> Core<N> {
                 self.next_link += 1;
                 let neighbour = Neighbour::from(link.peer());
                 let remote = link.remote();
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&neighbour.node).remote(remote);
+                self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
@@ -301,6 +320,8 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
+                    let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()));
                     entry.flows.values().for_each(|f| f.close());
                 }
             }
@@ -328,11 +349,19 @@ impl<N: RosNetwork> Core<N> {
                     (_, None) => {}
                 }
             }
-            CoreEvent::RenewalReady { sink, answer } => self.endpoint.answer_renewal(now(), sink, answer),
+            CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
             CoreEvent::Crl { der, reply } => {
                 let _ = reply.send(self.router.add_crl(now(), &der));
                 // Whoever brings a list may have changed the fleet's file.
                 self.answer_renewals();
+            }
+            CoreEvent::Reload { shares, uses, reply } => {
+                if let Some(routes) = &mut self.routes {
+                    routes.reconfigure(Instant::now(), shares, uses);
+                }
+                self.answer_renewals();
+                self.drain();
+                let _ = reply.send(());
             }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
@@ -499,6 +528,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn endpoint_event(&mut self, now: Now, event: Event) {
+        self.audit_event(&event);
         match event {
             Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
             Event::Renewed { credentials } => self.take_credentials(credentials),
@@ -591,6 +621,33 @@ impl<N: RosNetwork> Core<N> {
             | Event::OwnGrant { .. }
             | Event::Recover(_)
             | Event::Granted { .. } => {}
+        }
+    }
+
+    /// Keeps what concerns who gets what of this node.
+    fn audit_event(&self, event: &Event) {
+        let about = |event, name| {
+            let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));
+            AuditRecord::new(event).topic(topic).name(name)
+        };
+        match event {
+            Event::SinkJoined { name, peer, .. } => {
+                let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
+                self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
+            }
+            Event::SinkLeft { name, peer, .. } => self.audit.write(about(AuditEvent::Left, name).peer(peer)),
+            Event::SinkCut { name, peer, reason, .. } => {
+                let revoked = *reason == RefuseReason::Revoked;
+                let event = if revoked { AuditEvent::Revoked } else { AuditEvent::Cut };
+                self.audit.write(about(event, name).peer(peer).reason(reason));
+            }
+            Event::Rekeyed { name, grant } => {
+                self.audit.write(about(AuditEvent::Epoch, name).epoch(grant.epoch));
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
+            }
+            _ => {}
         }
     }
 

@@ -5,6 +5,8 @@
 //! beside it, on the tasks and threads that receive.
 #![forbid(unsafe_code)]
 
+pub mod admin;
+pub mod audit;
 mod authority;
 pub mod config;
 mod core;
@@ -17,6 +19,8 @@ mod outflow;
 pub mod partners;
 pub mod policy;
 mod queue;
+mod reload;
+mod rules;
 mod sinks;
 mod sources;
 mod state;
@@ -27,5 +31,7 @@ pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };
+pub use reload::{ConfigSource, ReloadReport};
+pub use rules::{RulesError, read_token};
 pub use state::{StateError, create_state_dir, state_dir};
 pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};

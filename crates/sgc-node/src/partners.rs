@@ -36,10 +36,15 @@ pub fn read_ca_file(path: &Path) -> Result<Vec<CertificateDer<'static>>, CaFileE
     certificates(&text)
 }
 
+/// The certificates of a PEM text, whatever they are for.
+pub fn chain(pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, CaFileError> {
+    let certificates = CertificateDer::pem_slice_iter(pem).collect::<Result<Vec<_>, _>>();
+    certificates.map_err(|error| CaFileError::Pem(error.to_string()))
+}
+
 /// The CA certificates of a PEM text.
 pub fn certificates(pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, CaFileError> {
-    let certificates = CertificateDer::pem_slice_iter(pem).collect::<Result<Vec<_>, _>>();
-    let certificates = certificates.map_err(|error| CaFileError::Pem(error.to_string()))?;
+    let certificates = chain(pem)?;
     TrustAnchors::new(certificates.iter().cloned()).map_err(CaFileError::Certificates)?;
     Ok(certificates)
 }

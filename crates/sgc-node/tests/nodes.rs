@@ -59,7 +59,7 @@ impl Node {
         let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
         runtime.spawn(async move {
-            let options = RunOptions { ready: Some(ready) };
+            let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };

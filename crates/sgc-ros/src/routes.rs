@@ -498,10 +498,11 @@ impl<R: RngCore> Routes<R> {
 
     /// A sink of one of our shares is gone.
     pub fn handle_sink_left(&mut self, now: Instant, name: &Name, sink: &SinkId) {
-        if let Some(share) = self.shares.get_mut(name) {
-            if share.sinks.remove(sink) && share.sinks.is_empty() {
-                share.sinkless_until = Some(now + SINKLESS_HOLD);
-            }
+        if let Some(share) = self.shares.get_mut(name)
+            && share.sinks.remove(sink)
+            && share.sinks.is_empty()
+        {
+            share.sinkless_until = Some(now + SINKLESS_HOLD);
         }
     }
 
@@ -629,6 +630,12 @@ impl<R: RngCore> Routes<R> {
         let shares = self.shares.values().flat_map(|s| [s.writerless_until, s.sinkless_until]);
         let uses = self.uses.values().map(|u| u.unreachable_until);
         shares.chain(uses).flatten().min()
+    }
+
+    /// The ROS topic behind a name that is shared or used here.
+    pub fn topic_of(&self, name: &Name) -> Option<&str> {
+        let share = self.shares.get(name).map(|s| self.share_rules[s.rule].metadata.ros_name.as_str());
+        share.or_else(|| Some(self.use_rules[self.uses.get(name)?.rule].topic.as_str()))
     }
 
     /// Where every rule stands.

@@ -2,13 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
 
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_wire::UnixMillis;
 
 use crate::clock::GENESIS;
+
+/// When the fleets were made: so long before the world that clocks may be wrong by days.
+const BIRTH: UnixMillis = UnixMillis(GENESIS.0 - 30 * 86_400_000);
 
 /// A member of a fleet.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -23,6 +28,12 @@ pub struct Member {
     pub router: bool,
     /// True for a member that carries others' names.
     pub may_route: bool,
+    /// How long after the world began its certificate was made; `None` for a month before.
+    pub from: Option<Duration>,
+    /// How long its certificate holds from then on; `None` for as long as any test lasts.
+    pub valid: Option<Duration>,
+    /// Which certificate of the node this is; 0 for the first.
+    pub renewal: u32,
 }
 
 impl Member {
@@ -34,6 +45,9 @@ impl Member {
             groups: Vec::new(),
             router: false,
             may_route: false,
+            from: None,
+            valid: None,
+            renewal: 0,
         }
     }
 }
@@ -48,7 +62,7 @@ impl Cast {
     fn fleet(&mut self, name: &str) -> &mut Fleet {
         self.fleets.entry(name.to_owned()).or_insert_with(|| {
             let legal = name.parse().expect("tests name fleets legally");
-            Fleet::create(legal, GENESIS, &mut rng(name)).expect("the provider makes a CA")
+            Fleet::create(legal, BIRTH, &mut rng(name)).expect("the provider makes a CA")
         })
     }
 }
@@ -64,13 +78,24 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     if let Some(identity) = cast.identities.get(member) {
         return identity.clone();
     }
+    let usual = EnrollRequest::new(
+        member.name.parse().expect("tests name nodes legally"),
+        match (member.from, member.valid) {
+            (None, None) => BIRTH,
+            (from, _) => UnixMillis(GENESIS.0 + from.unwrap_or_default().as_millis() as u64),
+        },
+    );
     let request = EnrollRequest {
         groups: member.groups.iter().map(|g| g.parse().expect("tests name groups legally")).collect(),
         router: member.router,
         may_route: member.may_route,
-        ..EnrollRequest::new(member.name.parse().expect("tests name nodes legally"), GENESIS)
+        valid: member.valid.unwrap_or(usual.valid),
+        ..usual
     };
-    let seed = format!("{}/{}", member.fleet, member.name);
+    let seed = match member.renewal {
+        0 => format!("{}/{}", member.fleet, member.name),
+        n => format!("{}/{}/{n}", member.fleet, member.name),
+    };
     let fleet = cast.fleet(&member.fleet);
     let identity = Arc::new(fleet.issue(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
     cast.identities.insert(member.clone(), identity.clone());

@@ -43,4 +43,4 @@ pub use node::{NodeKey, Sharing};
 pub use record::{DataDrop, Logged, MessageId, Published, Received, What};
 pub use rng::Dice;
 pub use ros::{FakeDomain, FakeReader, FakeRos, FakeWriter};
-pub use world::{Captured, World, WorldConfig};
+pub use world::{Captured, CapturedPacket, World, WorldConfig};

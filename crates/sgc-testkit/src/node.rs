@@ -18,7 +18,7 @@ use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
-    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
+    Name, NodeId, Now, Packet, Qos, Reliability, SinkId, SourceId, SourceOffer, TopicGrant,
 };
 
 use crate::record::{DataDrop, MessageId, What};
@@ -106,6 +106,8 @@ pub(crate) struct Node {
     pub(crate) endpoint_limits: sgc_endpoint::Limits,
     pub(crate) shares: BTreeMap<String, Sharing>,
     pub(crate) uses: BTreeSet<(NodeKey, String)>,
+    /// Topics of others that it publishes on.
+    pub(crate) publishing: BTreeSet<(NodeKey, String)>,
     pub(crate) running: Option<Running>,
     /// Starts so far.
     pub(crate) runs: u64,
@@ -149,6 +151,7 @@ pub(crate) struct Directory {
 
 /// A running node.
 pub(crate) struct Running {
+    key: NodeKey,
     pub(crate) run: u64,
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
@@ -163,6 +166,9 @@ pub(crate) struct Running {
     pub(crate) sinks: BTreeMap<Name, LocalSink>,
     pub(crate) catalogues: BTreeMap<NodeKey, Catalogue>,
     uses: BTreeSet<(NodeKey, String)>,
+    publishing: BTreeSet<(NodeKey, String)>,
+    /// What this node publishes on others' topics.
+    pub(crate) publishers: BTreeMap<Name, Publisher>,
     /// Owners that are followed.
     owners: BTreeMap<NodeKey, NodeId>,
     uses_begun: u64,
@@ -174,6 +180,16 @@ pub(crate) struct Running {
 pub(crate) struct LocalSource {
     pub(crate) topic: String,
     pub(crate) source: Source,
+}
+
+/// A source of this node on another's topic.
+pub(crate) struct Publisher {
+    owner: NodeKey,
+    config: SourceConfig,
+    message_key: MessageKey,
+    /// The key that `source` seals with.
+    grant: Option<TopicGrant>,
+    pub(crate) source: Option<Source>,
 }
 
 pub(crate) struct LocalSink {
@@ -210,6 +226,7 @@ impl Node {
         let mut endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
         endpoint.set_anchors(now, anchors.clone());
         let mut running = Running {
+            key: self.key,
             run: self.runs,
             router,
             endpoint,
@@ -222,6 +239,8 @@ impl Node {
             sinks: BTreeMap::new(),
             catalogues: BTreeMap::new(),
             uses: BTreeSet::new(),
+            publishing: BTreeSet::new(),
+            publishers: BTreeMap::new(),
             owners: BTreeMap::new(),
             uses_begun: 0,
             wake: None,
@@ -234,6 +253,9 @@ impl Node {
         for (owner, topic) in &self.uses {
             running.use_topic(now, *owner, topic, directory);
         }
+        for (owner, topic) in &self.publishing {
+            running.publish_on(now, *owner, topic, directory);
+        }
         self.running = Some(running);
     }
 }
@@ -245,6 +267,11 @@ impl Running {
         self.links.insert(link, (wire, side));
         self.router.handle_link_up(now, link, peer);
         link
+    }
+
+    pub(crate) fn renew(&mut self, now: Now, identity: Arc<Identity>) {
+        self.identity = identity.clone();
+        self.endpoint.set_identity(now, identity);
     }
 
     pub(crate) fn handle(&mut self, now: Now, arrival: Arrival) {
@@ -329,12 +356,23 @@ impl Running {
         let name = self.sources.iter().find(|(_, s)| s.topic == topic).map(|(n, _)| *n);
         if let Some(name) = name {
             self.sources.remove(&name);
+            self.sinks.remove(&name);
             self.endpoint.unshare(now, &name);
         }
     }
 
     pub(crate) fn use_topic(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
         self.uses.insert((owner, topic.to_owned()));
+        self.follow(now, owner, directory);
+    }
+
+    /// Publishes on another's topic whenever its catalogue permits it.
+    pub(crate) fn publish_on(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+        self.publishing.insert((owner, topic.to_owned()));
+        self.follow(now, owner, directory);
+    }
+
+    fn follow(&mut self, now: Now, owner: NodeKey, directory: &Directory) {
         // The owner may be of a fleet that this node cannot see; then there is nothing to follow.
         let owner_name = &directory.names[owner.0];
         if self.endpoint.follow(now, owner_name) {
@@ -346,7 +384,7 @@ impl Running {
     pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str) {
         self.uses.remove(&(owner, topic.to_owned()));
         self.reconcile(now, owner);
-        if self.uses.iter().all(|(o, _)| *o != owner) {
+        if self.uses.iter().chain(&self.publishing).all(|(o, _)| *o != owner) {
             if let Some(id) = self.owners.remove(&owner) {
                 self.endpoint.unfollow(now, &id);
             }
@@ -356,22 +394,33 @@ impl Running {
 
     pub(crate) fn publish(&mut self, now: Now, topic: &str, id: MessageId, bytes: usize) -> Option<SourceId> {
         let (_, local) = self.sources.iter_mut().find(|(_, s)| s.topic == topic)?;
-        let mut payload = id.0.to_be_bytes().to_vec();
-        payload.resize(bytes.max(8), 0x5a);
-        let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
+        let packets = sealed(&mut local.source, id, bytes);
         let source = local.source.id();
-        let mut packets = Vec::new();
-        local
-            .source
-            .publish(&head, payload.into(), false, |p| packets.push(p))
-            .expect("tests publish what fits");
+        self.send_packets(now, packets);
+        Some(source)
+    }
+
+    /// Publishes on another's topic; `None` while that is not granted.
+    pub(crate) fn publish_as(
+        &mut self,
+        now: Now,
+        name: &Name,
+        id: MessageId,
+        bytes: usize,
+    ) -> Option<SourceId> {
+        let source = self.publishers.get_mut(name)?.source.as_mut()?;
+        let (packets, source) = (sealed(source, id, bytes), source.id());
+        self.send_packets(now, packets);
+        Some(source)
+    }
+
+    fn send_packets(&mut self, now: Now, packets: Vec<Packet>) {
         for packet in packets {
             // As in the driver: what nobody asked for is not sent.
             if self.fib.contains_key(&packet.header.name) {
                 self.forward(now, LinkId::LOCAL, packet);
             }
         }
-        Some(source)
     }
 
     /// Everything that both machines and the data path want done, until they want nothing more.
@@ -446,6 +495,14 @@ impl Running {
 
     fn handle_event(&mut self, now: Now, event: Event) {
         match event {
+            Event::Granted { name, grant, .. } if self.publishers.contains_key(&name) => {
+                let mut packets = Vec::new();
+                if let Some(publisher) = self.publishers.get_mut(&name) {
+                    publisher.take_grant(grant, |p| packets.push(p));
+                }
+                self.send_packets(now, packets);
+            }
+            Event::OwnGrant { name, grant } => self.handle_own_grant(now, name, grant),
             Event::Granted { name, sink: id, grant } => {
                 let Some(local) = self.sinks.get_mut(&name) else { return };
                 let mut released = Vec::new();
@@ -497,11 +554,12 @@ impl Running {
     fn reconcile(&mut self, now: Now, owner: NodeKey) {
         let Some(owner_id) = self.owners.get(&owner).copied() else { return };
         let mut wanted = BTreeMap::new();
-        for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries) {
+        for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries).filter(|e| e.subscribe) {
             if self.uses.contains(&(owner, entry.metadata.ros_name.clone())) {
                 wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
             }
         }
+        self.reconcile_publishers(now, owner, owner_id);
         let gone: Vec<_> = self
             .sinks
             .iter()
@@ -537,6 +595,69 @@ impl Running {
             };
             self.sinks.insert(name, local);
             self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
+        }
+    }
+
+    /// Joins what is to be published on, and leaves what no longer is.
+    fn reconcile_publishers(&mut self, now: Now, owner: NodeKey, owner_id: NodeId) {
+        let mut wanted = BTreeMap::new();
+        for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries).filter(|e| e.publish) {
+            if self.publishing.contains(&(owner, entry.metadata.ros_name.clone())) {
+                wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
+            }
+        }
+        let gone = |(name, p): (&Name, &Publisher)| {
+            (p.owner == owner && !wanted.contains_key(name)).then_some(*name)
+        };
+        for name in self.publishers.iter().filter_map(gone).collect::<Vec<_>>() {
+            self.publishers.remove(&name);
+            self.endpoint.leave(now, &name);
+        }
+        for (name, entry) in wanted {
+            if self.publishers.contains_key(&name) {
+                continue;
+            }
+            let suite = Suite::from_id(entry.suite).expect("a suite of this build");
+            let config = SourceConfig {
+                name,
+                id: self.endpoint.new_source_id(),
+                class: entry.class,
+                reliable: entry.qos.reliability == Reliability::Reliable,
+                history_depth: 0,
+                history_bytes_max: 0,
+            };
+            let message_key = MessageKey::generate(suite);
+            let offer = SourceOffer { source: config.id, key: message_key.public().clone() };
+            self.publishers.insert(name, Publisher { owner, config, message_key, grant: None, source: None });
+            self.endpoint.join(now, name, owner_id, Wish::Publish(offer));
+        }
+    }
+
+    /// Feeds this node's own sink of a topic that others publish on.
+    fn handle_own_grant(&mut self, now: Now, name: Name, grant: TopicGrant) {
+        let Some(share) = self.sources.get(&name) else {
+            // The share is being made; what it was told is told again with its source.
+            return;
+        };
+        let mut released = Vec::new();
+        let own = SinkId([0; 16]);
+        let local = self.sinks.entry(name).or_insert_with(|| LocalSink {
+            owner: self.key,
+            topic: share.topic.clone(),
+            use_number: 0,
+            transient_local: false,
+            sources: Vec::new(),
+            sink: None,
+            retry_at: None,
+            retire_at: None,
+        });
+        match &mut local.sink {
+            Some(sink) => sink.regrant(own, grant, |delivery| released.push(delivery)),
+            None => local.sink = Some(Sink::new(name, own, grant, false, SinkLimits::default())),
+        }
+        local.retire_at = Some(now.instant + EPOCH_GRACE);
+        for delivery in released {
+            self.delivered(now, name, delivery);
         }
     }
 
@@ -619,6 +740,29 @@ impl Running {
     fn drop_packet(&mut self, name: Name, ingress: LinkId, why: DataDrop) {
         self.effects.push(Effect::Log(What::DataDrop { name, ingress, why }));
     }
+}
+
+impl Publisher {
+    fn take_grant(&mut self, grant: TopicGrant, emit: impl FnMut(Packet)) {
+        let of_same_run = |known: &TopicGrant| known.epoch < grant.epoch || known.key == grant.key;
+        match &mut self.source {
+            Some(source) if self.grant.as_ref().is_some_and(of_same_run) => {
+                let _ = source.rekey(&grant, emit);
+            }
+            // The first grant, or one of an owner that started anew, under whose keys nothing was sealed yet.
+            source => *source = Source::new(self.config.clone(), &grant, self.message_key.clone()),
+        }
+        self.grant = Some(grant);
+    }
+}
+
+fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Packet> {
+    let mut payload = id.0.to_be_bytes().to_vec();
+    payload.resize(bytes.max(8), 0x5a);
+    let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
+    let mut packets = Vec::new();
+    source.publish(&head, payload.into(), false, |p| packets.push(p)).expect("tests publish what fits");
+    packets
 }
 
 /// Who may join, as a node's policy says it.

@@ -19,8 +19,10 @@ pub struct Published {
     pub id: MessageId,
     /// When, since the world began.
     pub at: Duration,
-    /// By whom.
+    /// Whose topic.
     pub owner: NodeKey,
+    /// By whom; another node than the owner where that may publish.
+    pub by: NodeKey,
     /// In which run of that node.
     pub run: u64,
     /// Under which topic.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_wire::{Now, UnixMillis};
 
+use crate::cast::identity;
 use crate::node::{Node, NodeKey, Sharing, policy};
 use crate::world::World;
 
@@ -22,12 +23,33 @@ impl World {
         self.settle(node);
     }
 
+    /// The newest epoch in which a topic is published by its owner.
+    pub fn epoch(&self, owner: NodeKey, topic: &str) -> Option<u32> {
+        let running = self.nodes[owner.0].running.as_ref()?;
+        Some(running.sources.get(&self.name(owner, topic))?.source.epoch())
+    }
+
     /// Begins a new epoch of a topic.
     pub fn rotate(&mut self, node: NodeKey, topic: &str) {
         self.note(format!("rotate {node:?} {topic}"));
         let (now, name) = (self.now_at(node), self.name(node, topic));
         if let Some(running) = &mut self.nodes[node.0].running {
             running.endpoint.rotate(now, &name);
+        }
+        self.settle(node);
+    }
+
+    /// Gives a node a fresh certificate; its links stay as they were made.
+    pub fn renew(&mut self, node: NodeKey) {
+        self.note(format!("renew {node:?}"));
+        let now = self.now_at(node);
+        let member = &mut self.members[node.0];
+        (member.renewal, member.from, member.valid) = (member.renewal + 1, Some(self.clock.elapsed()), None);
+        let renewed = identity(member);
+        let Node { identity, running, .. } = &mut self.nodes[node.0];
+        *identity = renewed.clone();
+        if let Some(running) = running {
+            running.renew(now, renewed);
         }
         self.settle(node);
     }

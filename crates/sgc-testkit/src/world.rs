@@ -10,7 +10,7 @@ use sgc_router::{LinkId, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
-    SinkId,
+    SinkId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -71,6 +71,19 @@ pub struct Captured {
     pub frame: Control,
 }
 
+/// A packet that crossed a link while [`World::capture`] was on.
+#[derive(Clone, Debug)]
+pub struct CapturedPacket {
+    /// Who sent it.
+    pub from: NodeKey,
+    /// To whom.
+    pub to: NodeKey,
+    /// When, since the world began.
+    pub at: Duration,
+    /// What.
+    pub packet: Packet,
+}
+
 enum Pending {
     Frame { wire: usize, to: usize, bytes: Vec<u8> },
     Packet { wire: usize, to: usize, packet: Packet },
@@ -104,6 +117,7 @@ pub struct World {
     received: Vec<Received>,
     published: Vec<Published>,
     captured: Option<Vec<Captured>>,
+    captured_packets: Vec<CapturedPacket>,
     trace: Vec<String>,
     tracing: Tracing,
     steps: usize,
@@ -132,6 +146,7 @@ impl World {
             received: Vec::new(),
             published: Vec::new(),
             captured: None,
+            captured_packets: Vec::new(),
             trace: Vec::new(),
             tracing: match std::env::var("SGC_TRACE").as_deref() {
                 Err(_) => Tracing::Transitions,
@@ -171,6 +186,7 @@ impl World {
             endpoint_limits: self.config.endpoint_limits.clone(),
             shares: BTreeMap::new(),
             uses: BTreeSet::new(),
+            publishing: BTreeSet::new(),
             running: None,
             runs: 0,
             frozen: None,
@@ -346,6 +362,16 @@ impl World {
         self.settle(node);
     }
 
+    /// Asks to publish on another's topic without looking into its catalogue, until the node stops.
+    pub fn publish_blindly(&mut self, node: NodeKey, owner: NodeKey, topic: &str, offer: SourceOffer) {
+        self.note(format!("publish blindly {node:?} {owner:?}:{topic}"));
+        let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.join(now, name, id, Wish::Publish(offer));
+        }
+        self.settle(node);
+    }
+
     /// Publishes a small message on a shared topic; its number.
     pub fn publish(&mut self, node: NodeKey, topic: &str) -> MessageId {
         self.publish_bytes(node, topic, 8)
@@ -360,9 +386,33 @@ impl World {
         let running = running.as_mut().expect("only a running node publishes");
         let source = running.publish(now, topic, id, bytes).expect("only what is shared is published");
         let (run, at, topic) = (running.run, self.clock.elapsed(), topic.to_owned());
-        self.published.push(Published { id, at, owner: node, run, topic, source });
+        self.published.push(Published { id, at, owner: node, by: node, run, topic, source });
         self.settle(node);
         id
+    }
+
+    /// Publishes on another's topic whenever the owner's catalogue permits it, now and after every restart.
+    pub fn publish_on(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
+        self.note(format!("publish on {node:?} {owner:?}:{topic}"));
+        let now = self.now_at(node);
+        let Node { publishing, running, .. } = &mut self.nodes[node.0];
+        publishing.insert((owner, topic.to_owned()));
+        if let Some(running) = running {
+            running.publish_on(now, owner, topic, &self.directory);
+        }
+        self.settle(node);
+    }
+
+    /// Publishes a small message on another's topic; `None` while that is not granted.
+    pub fn publish_as(&mut self, node: NodeKey, owner: NodeKey, topic: &str) -> Option<MessageId> {
+        let (now, id) = (self.now_at(node), MessageId(self.published.len() as u64));
+        let name = self.name(owner, topic);
+        let running = self.nodes[node.0].running.as_mut()?;
+        let source = running.publish_as(now, &name, id, 8)?;
+        let (run, at, topic) = (running.run, self.clock.elapsed(), topic.to_owned());
+        self.published.push(Published { id, at, owner, by: node, run, topic, source });
+        self.settle(node);
+        Some(id)
     }
 
     // ---- Evil.
@@ -398,7 +448,7 @@ impl World {
         self.cables[cable].tampers[side] = None;
     }
 
-    /// Keeps all frames from here on.
+    /// Keeps all frames and packets from here on.
     pub fn capture(&mut self) {
         self.captured.get_or_insert_default();
     }
@@ -406,6 +456,11 @@ impl World {
     /// The frames kept.
     pub fn captured(&self) -> &[Captured] {
         self.captured.as_deref().unwrap_or_default()
+    }
+
+    /// The packets kept, in the order in which they were sent; those that the network loses among them.
+    pub fn captured_packets(&self) -> &[CapturedPacket] {
+        &self.captured_packets
     }
 
     // ---- Time.
@@ -498,6 +553,11 @@ impl World {
     /// How often a node was started.
     pub fn runs(&self, node: NodeKey) -> u64 {
         self.nodes[node.0].runs
+    }
+
+    /// What a node was enrolled as.
+    pub fn member(&self, node: NodeKey) -> &Member {
+        &self.members[node.0]
     }
 
     /// Who a node is.
@@ -795,6 +855,11 @@ impl World {
     }
 
     fn carry_packet(&mut self, wire: usize, side: usize, packet: Packet) {
+        if self.captured.is_some() {
+            let ends = &self.wires[wire].ends;
+            let (from, to, at) = (ends[side].node, ends[1 - side].node, self.clock.elapsed());
+            self.captured_packets.push(CapturedPacket { from, to, at, packet: packet.clone() });
+        }
         if !packet.header.reliable && self.dice.chance(self.config.loss_percent) {
             let (name, ingress) = (packet.header.name, self.wires[wire].ends[side].link);
             let node = self.wires[wire].ends[side].node;

@@ -269,6 +269,11 @@ fn credentials_renew_an_identity_and_nothing_else() {
     let cloud = fleet.enroll(&EnrollRequest { router: true, ..request("cloud") }, &mut rng(7)).unwrap();
     let own = fleet.renew_csr(&cloud.csr(), &cloud.pseudonym(), short, at(1), &mut rng(8)).unwrap();
     assert!(own.secrets.is_empty() && cloud.with_credentials(&own).is_ok());
+    fleet.enroll(&EnrollRequest { router: true, ..request("other") }, &mut rng(7)).unwrap();
+    let pseudonym = fleet.secret().pseudonym("other");
+    let other = fleet.renew_csr(&cloud.csr(), &pseudonym, short, at(1), &mut rng(8)).unwrap();
+    let error = cloud.with_credentials(&other).unwrap_err();
+    assert_eq!(error, IdentityError::NameMismatch { node: name("cloud") });
     let given = Credentials { secrets: credentials.secrets.clone(), ..own };
     assert_eq!(cloud.with_credentials(&given).unwrap_err(), IdentityError::Generations);
 }

@@ -4,7 +4,7 @@
 //! What is in them is the business of `sgc-trust`.
 
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
@@ -101,6 +101,36 @@ pub(crate) fn read_secret(path: &Path, what: &'static str) -> Result<Zeroizing<S
     fs::read_to_string(path).map(Zeroizing::new).map_err(failed)
 }
 
+/// Reads a file of at most `max` bytes.
+pub(crate) fn read_limited(path: &Path, max: u64) -> Result<Vec<u8>, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    let mut content = Vec::new();
+    fs::File::open(path).and_then(|file| file.take(max + 1).read_to_end(&mut content)).map_err(failed)?;
+    if content.len() as u64 > max {
+        return Err(failed(io::Error::other(format!("it has more than {max} bytes"))));
+    }
+    Ok(content)
+}
+
+/// The configuration that is meant: as named, or the only one of this directory.
+pub(crate) fn config_here(named: Option<&Path>) -> Result<PathBuf, CliError> {
+    let dir = Path::new(".");
+    let found = match named {
+        Some(path) => return Ok(path.to_owned()),
+        None => {
+            with_extension(dir, "toml").map_err(|source| CliError::Read { path: dir.to_owned(), source })?
+        }
+    };
+    let name = |path: &PathBuf| path.strip_prefix(dir).unwrap_or(path).to_owned();
+    match &found[..] {
+        [] => Err(CliError::NoConfigHere),
+        [only] => Ok(name(only)),
+        several => Err(CliError::SeveralConfigs {
+            files: several.iter().map(|p| name(p).display().to_string()).collect(),
+        }),
+    }
+}
+
 /// The files of a directory with this extension, in order.
 pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
@@ -112,4 +142,30 @@ pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<Path
     }
     found.sort();
     Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        write_secret(&path, "1", Existing::Replace).unwrap();
+        let first = lock(&path).unwrap();
+        let waiting = std::thread::spawn({
+            let path = path.clone();
+            move || lock(&path).unwrap().metadata().unwrap().ino()
+        });
+        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
+        let inode = format!(":{} ", first.metadata().unwrap().ino());
+        let waits = |line: &str| line.contains("->") && line.contains(&inode);
+        while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {
+            std::thread::yield_now();
+        }
+        write_secret(&path, "2", Existing::Replace).unwrap();
+        drop(first);
+        assert_eq!(waiting.join().unwrap(), fs::metadata(&path).unwrap().ino());
+    }
 }

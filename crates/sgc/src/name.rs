@@ -108,7 +108,7 @@ impl NameArgs {
 }
 
 /// A basic string of TOML: what is not printable ASCII or could end it is escaped.
-fn toml_string(text: &str) -> String {
+pub(crate) fn toml_string(text: &str) -> String {
     let mut out = String::from("\"");
     for c in text.chars() {
         match c {

@@ -305,8 +305,8 @@ fn every_mistake_is_told_with_its_line() {
         place.bad(2, &["check", "-c", "node.toml"]),
         "node.toml:3: [node] has no key `router`; did you mean `routers`?\n\
          node.toml:5: `topic` is \"camera/image\"; a topic name starts with '/': \"/camera/image\"\n\
-         node.toml:6: `to` names \"Desk\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
-         to 64 of a-z, 0-9, '-', '_' and '.'\n\
+         node.toml:6: `to` names \"Desk\"; name nodes (\"desk\"), groups (\"group:operators\"), partners \
+         (\"partner:acme\") or \"*\", names of 1 to 64 of a-z, 0-9, '-', '_' and '.'\n\
          node.toml:7: [[use]] has no `from`; add one, such as from = \"arm-1\"\n\
          sgc: node.toml: 4 mistakes\n"
     );

@@ -30,7 +30,7 @@ use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
-pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX};
+pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration};
 pub use resolve::{
     LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES,
     TRUST_MAX, USES_MAX, suite_default,
@@ -243,6 +243,11 @@ impl Config {
         let (draft, errors) = args::read(args);
         resolve::resolve(&draft, errors, Path::new(""), env, None).map_err(ConfigErrors::new)
     }
+}
+
+/// Checks a message type that stands outside of a configuration, and gives it as `pkg/msg/Name`.
+pub fn message_type(value: &str) -> Result<String, Mistake> {
+    names::message_type("--type", value)
 }
 
 /// Reads and resolves a file, and checks that the identity file is there, readable, and its owner's alone.

@@ -171,19 +171,21 @@ pub(super) fn duration(
     value: &str,
     (min, max): (Duration, Duration),
 ) -> Result<Duration, Mistake> {
-    let mistake = || Mistake::Duration { key, value: value.to_owned(), min, max };
-    let at = value.find(|c: char| !c.is_ascii_digit()).ok_or_else(mistake)?;
-    let (number, unit) = value.split_at(at);
-    let number: u64 = number.parse().map_err(|_| mistake())?;
+    let duration = parse_duration(value).filter(|d| (min..=max).contains(d));
+    duration.ok_or_else(|| Mistake::Duration { key, value: value.to_owned(), min, max })
+}
+
+/// A length of time as the configuration has it: `90s`, `15min`, `1h`, `30d`.
+pub fn parse_duration(text: &str) -> Option<Duration> {
+    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
     let unit = match unit.trim_start() {
         "s" => 1,
         "m" | "min" => 60,
         "h" => 3600,
         "d" => 86_400,
-        _ => return Err(mistake()),
+        _ => return None,
     };
-    let duration = number.checked_mul(unit).map(Duration::from_secs);
-    duration.filter(|d| (min..=max).contains(d)).ok_or_else(mistake)
+    number.parse::<u64>().ok()?.checked_mul(unit).map(Duration::from_secs)
 }
 
 /// A length of time in the largest unit that divides it.

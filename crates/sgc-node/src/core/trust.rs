@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use sgc_ros::RosNetwork;
 use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
-use sgc_wire::{Credentials, SinkId};
+use sgc_wire::{Credentials, RefuseReason, SinkId};
 use tracing::{info, warn};
 
 use super::{Core, CoreEvent, now};
+use crate::audit::{AuditEvent, AuditRecord};
 use crate::authority;
 use crate::credentials::{renew_at, renewed};
 
@@ -32,6 +33,20 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
+    /// Gives a member what the fleet's file says.
+    pub(super) fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
+        let peer = self.endpoint.renewing().find(|(id, ..)| *id == sink).map(|(_, peer, _)| peer.node_id);
+        if let Some(peer) = peer {
+            let record = |event| AuditRecord::new(event).peer(&peer);
+            match &answer {
+                Ok(credentials) if credentials.chain.is_empty() => {}
+                Ok(_) => self.audit.write(record(AuditEvent::Renewed)),
+                Err(reason) => self.audit.write(record(AuditEvent::Refused).reason(reason)),
+            }
+        }
+        self.endpoint.answer_renewal(now(), sink, answer);
+    }
+
     /// Answers every member once more: the fleet's file may have changed.
     pub(super) fn answer_renewals(&self) {
         let asked: Vec<_> = self.endpoint.renewing().map(|(s, p, csr)| (s, p.clone(), csr.clone())).collect();
@@ -46,6 +61,8 @@ impl<N: RosNetwork> Core<N> {
             Ok(Some(identity)) => {
                 let identity = Arc::new(identity);
                 info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
+                let until = format!("this node's own, until {}", identity.not_after());
+                self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
                 self.keeper.identity(identity.clone());
                 self.set_identity(identity);
             }
@@ -71,6 +88,8 @@ impl<N: RosNetwork> Core<N> {
 
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        let lists = anchors.crls().count();
+        self.audit.write(AuditRecord::new(AuditEvent::Crl).reason(format!("{lists} lists are in force")));
         self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.endpoint.set_anchors(now(), anchors);
