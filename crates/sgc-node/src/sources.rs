@@ -305,3 +305,90 @@ impl LocalShare {
 fn lock(source: &Mutex<Source>) -> std::sync::MutexGuard<'_, Source> {
     source.lock().unwrap_or_else(PoisonError::into_inner)
 }
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use sgc_endpoint::SourceConfig;
+    use sgc_trust::{MessageKey, Suite};
+    use sgc_wire::{Class, SecretBytes};
+
+    use super::*;
+
+    const KNOWN: Guid = Guid([1; 16]);
+    const STRANGER: Guid = Guid([2; 16]);
+
+    fn sample(writer: Guid, more: bool) -> Sample {
+        let payload = Bytes::from_static(b"\0\x01\0\0data");
+        Sample { kind: SampleKind::Write, writer: Some(writer), source_timestamp_ns: 0, payload, more }
+    }
+
+    fn grant(epoch: u32) -> TopicGrant {
+        let key = SecretBytes::new([epoch as u8; 32]);
+        TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
+    }
+
+    /// A share with a source for one writer; samples of others wait until their writer is known.
+    fn share() -> (Arc<LocalShare>, SourceSlot) {
+        let (alive, _) = mpsc::channel(1);
+        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2));
+        let config = SourceConfig {
+            name: Name([1; 32]),
+            id: SourceId([1; 16]),
+            class: Class::Default,
+            reliable: true,
+            history_depth: 10,
+            history_bytes_max: 1000,
+        };
+        let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
+        let slot = SourceSlot::new(source, true, true);
+        share.set_map(SourceMap {
+            shared: None,
+            per_writer: true,
+            own: HashMap::from([(KNOWN, slot.clone())]),
+        });
+        (share, slot)
+    }
+
+    fn unflushed(slot: &SourceSlot) -> usize {
+        let mut n = 0;
+        lock(&slot.source).flush(|_| n += 1);
+        n
+    }
+
+    #[test]
+    fn nothing_stays_unsigned_when_the_last_sample_of_a_batch_goes_elsewhere() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.publish(sample(KNOWN, true));
+        share.publish(sample(KNOWN, true));
+        share.publish(sample(STRANGER, false));
+        assert_eq!((share.published(), unflushed(&slot)), (2, 0));
+        // The same once the stranger is known and what waited for it is published.
+        share.publish(sample(KNOWN, true));
+        assert_eq!(unflushed(&slot), 1, "it does wait while more is to come");
+        share.publish(sample(KNOWN, true));
+        share.closed.store(true, Relaxed);
+        share.publish(sample(KNOWN, false));
+        assert_eq!(unflushed(&slot), 0);
+    }
+
+    #[test]
+    fn an_epoch_is_over_once_however_often_that_is_asked() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.publish(sample(KNOWN, false));
+        assert!(!share.is_epoch_over());
+        share.publish(sample(KNOWN, false));
+        assert_eq!(slot.progress.published_in_epoch(), 2);
+        assert!(share.is_epoch_over());
+        assert!(!share.is_epoch_over());
+        share.rekey(grant(2));
+        while lock(&slot.source).epoch() == 1 {
+            std::thread::yield_now();
+        }
+        assert_eq!(slot.progress.published_in_epoch(), 0);
+    }
+}
