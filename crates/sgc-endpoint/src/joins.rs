@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use rand_core::RngCore;
 use sgc_trust::{ReplyKey, VerifiedPeer};
-use sgc_wire::{NodeId, RefuseReason, RejectReason, SinkId};
+use sgc_wire::{NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer};
 
 /// Shortest wait before asking again.
 const RETRY_MIN: Duration = Duration::from_millis(200);
@@ -46,6 +47,33 @@ pub enum LostReason {
     Refused(RefuseReason),
 }
 
+/// What a join is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Wish {
+    /// To receive what is published under a name; `describe` if its owner's catalogue cannot be seen.
+    Subscribe {
+        /// True if the grant is to say what the name stands for.
+        describe: bool,
+    },
+    /// To publish under a name.
+    Publish(SourceOffer),
+    /// The catalogue of an owner.
+    Follow,
+    /// A fresh certificate for this signing request (PKCS #10, DER).
+    Renew(Bytes),
+}
+
+impl Wish {
+    pub(crate) fn request(&self) -> Request {
+        match self {
+            Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
+            Self::Follow => Request::Subscribe { describe: false },
+            Self::Publish(offer) => Request::Publish { offer: offer.clone() },
+            Self::Renew(csr) => Request::Renew { csr: csr.clone() },
+        }
+    }
+}
+
 /// Where a join stands, for status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JoinStatus {
@@ -77,6 +105,7 @@ pub(crate) enum JoinState {
 pub(crate) struct Join {
     /// Whose it must be.
     pub(crate) owner: NodeId,
+    pub(crate) wish: Wish,
     /// The owner as its last advertisement proved it; `None` while there is none.
     pub(crate) reachable: Option<VerifiedPeer>,
     pub(crate) state: JoinState,
@@ -84,8 +113,8 @@ pub(crate) struct Join {
 }
 
 impl Join {
-    pub(crate) fn new(owner: NodeId) -> Self {
-        Self { owner, reachable: None, state: JoinState::ExpectAdvert, attempts: 0 }
+    pub(crate) fn new(owner: NodeId, wish: Wish) -> Self {
+        Self { owner, wish, reachable: None, state: JoinState::ExpectAdvert, attempts: 0 }
     }
 
     pub(crate) fn status(&self) -> JoinStatus {
@@ -116,10 +145,15 @@ impl Join {
     }
 
     /// Asks now: a fresh sink id and reply key.
-    pub(crate) fn ask(&mut self, now: Instant, rng: &mut impl RngCore) -> (SinkId, bytes::Bytes) {
+    pub(crate) fn ask(
+        &mut self,
+        now: Instant,
+        reply_key: ReplyKey,
+        rng: &mut impl RngCore,
+    ) -> (SinkId, Bytes) {
         let mut id = [0; 16];
         rng.fill_bytes(&mut id);
-        let (sink, reply_key) = (SinkId(id), ReplyKey::generate());
+        let sink = SinkId(id);
         let public = reply_key.public().clone();
         self.attempts = self.attempts.saturating_add(1);
         self.state = JoinState::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };

@@ -10,13 +10,18 @@
 #![forbid(unsafe_code)]
 
 mod endpoint;
+mod joiner;
 mod joins;
+mod owner;
+mod parking;
+mod partial;
 mod shares;
 mod sink;
 mod source;
 
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
-pub use joins::{JoinStatus, LostReason, RefusedBy};
+pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
+pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
-pub use sink::{Delivery, Message, Sink, SinkDrop, SinkLimits};
-pub use source::{FRAGMENT_BYTES, PublishError, Source, SourceConfig};
+pub use sink::{Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits};
+pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};

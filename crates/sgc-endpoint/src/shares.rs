@@ -1,13 +1,18 @@
 //! What this node owns: its shares, who was granted them, and what each asker sees in the catalogue.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
 
 use bytes::Bytes;
+use rand_core::RngCore;
 use sgc_trust::{Policy, Suite, VerifiedPeer};
 use sgc_wire::{
-    Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Metadata, Name, NodeId, Qos, Role, SinkId,
-    TopicGrant,
+    Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, GRANT_SOURCES_MAX, Metadata, Name, NodeId, Qos,
+    Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
+
+use crate::SourceProgress;
 
 /// What to share.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -56,11 +61,37 @@ pub enum ShareError {
 #[derive(Clone, Debug)]
 pub(crate) struct GrantedSink {
     pub(crate) peer: VerifiedPeer,
+    pub(crate) request: Request,
     pub(crate) reply_key: Bytes,
     /// Serial of the last answer.
     pub(crate) serial: u64,
-    /// Hash-free memory of what it was told last; only used for catalogues.
+    /// What it was told last, so that it is not told again; only used for catalogues.
     pub(crate) told: Option<Catalogue>,
+}
+
+/// The key of one epoch.
+#[derive(Clone, Debug)]
+pub(crate) struct Epoch {
+    pub(crate) number: u32,
+    pub(crate) key: SecretBytes,
+}
+
+impl Epoch {
+    pub(crate) fn new(number: u32, rng: &mut impl RngCore) -> Self {
+        let mut key = zeroize::Zeroizing::new([0; 32]);
+        rng.fill_bytes(&mut *key);
+        Self { number, key: SecretBytes::new(*key) }
+    }
+}
+
+/// An epoch that its sinks were granted and that is not in use yet.
+#[derive(Debug)]
+pub(crate) struct Rotation {
+    pub(crate) epoch: Epoch,
+    /// Who has not said yet that it has the key, and with which answer it got it.
+    pub(crate) waiting: BTreeMap<SinkId, u64>,
+    /// When the epoch begins even if some have not.
+    pub(crate) deadline: Instant,
 }
 
 /// A share.
@@ -68,18 +99,57 @@ pub(crate) struct GrantedSink {
 pub(crate) struct Share {
     pub(crate) spec: ShareSpec,
     pub(crate) blind: Blind,
-    pub(crate) grant: TopicGrant,
+    pub(crate) epoch: Epoch,
+    pub(crate) rotation: Option<Rotation>,
+    /// When the epoch has lasted long enough.
+    pub(crate) rotate_at: Instant,
+    /// This node's own sources.
+    pub(crate) own: Vec<Arc<SourceProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
 }
 
 impl Share {
-    fn entry(&self) -> CatalogueEntry {
+    /// What is granted of an epoch to one who asked with `request`.
+    pub(crate) fn grant(&self, epoch: &Epoch, peer: Option<&GrantedSink>) -> TopicGrant {
+        let own = self.own.iter().map(|s| s.announce());
+        let others = self.sinks.values().filter_map(|s| match &s.request {
+            Request::Publish { offer } => {
+                Some(SourceAnnounce { source: offer.source, key: offer.key.clone(), oldest: 0, next: 0 })
+            }
+            Request::Subscribe { .. } | Request::Renew { .. } => None,
+        });
+        let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
+        TopicGrant {
+            epoch: epoch.number,
+            suite: self.spec.suite.id(),
+            key: epoch.key.clone(),
+            sources: own.chain(others).take(GRANT_SOURCES_MAX).collect(),
+            entry: describe.map(|p| Box::new(self.entry(&p.peer))),
+        }
+    }
+
+    /// The epoch that sinks were told last.
+    pub(crate) fn newest(&self) -> &Epoch {
+        self.rotation.as_ref().map_or(&self.epoch, |r| &r.epoch)
+    }
+
+    /// True if `source` publishes here already, other than by the request of `sink`.
+    pub(crate) fn has_source(&self, source: &SourceId, sink: &SinkId) -> bool {
+        let offered =
+            |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);
+        self.own.iter().any(|s| s.announce().source == *source)
+            || self.sinks.iter().any(|(id, s)| id != sink && offered(s))
+    }
+
+    /// The share as `peer` may see it.
+    pub(crate) fn entry(&self, peer: &VerifiedPeer) -> CatalogueEntry {
+        let policy = &self.spec.policy;
         CatalogueEntry {
             metadata: self.spec.metadata.clone(),
             blind: self.blind,
-            subscribe: true,
-            publish: false,
-            suite: self.grant.suite,
+            subscribe: policy.permits(peer, Role::Subscribe).is_ok(),
+            publish: policy.permits(peer, Role::Publish).is_ok(),
+            suite: self.spec.suite.id(),
             keyless: self.spec.keyless,
             type_hash: self.spec.type_hash.clone(),
             qos: self.spec.qos.clone(),
@@ -93,20 +163,16 @@ impl Share {
 #[derive(Debug, Default)]
 pub(crate) struct Shares {
     pub(crate) shares: BTreeMap<Name, Share>,
-    pub(crate) followers: BTreeMap<SinkId, GrantedSink>,
+    /// By the name of the catalogue, of which there is one for each secret that names are derived from.
+    pub(crate) followers: BTreeMap<(Name, SinkId), GrantedSink>,
     pub(crate) version: u64,
 }
 
 impl Shares {
     /// What `peer` may see.
     pub(crate) fn catalogue_for(&self, peer: &VerifiedPeer) -> Catalogue {
-        let entries = self
-            .shares
-            .values()
-            .filter(|s| s.spec.policy.permits(peer, Role::Subscribe).is_ok())
-            .map(Share::entry)
-            .collect();
-        Catalogue { version: self.version, entries }
+        let entries = self.shares.values().map(|s| s.entry(peer)).filter(|e| e.subscribe || e.publish);
+        Catalogue { version: self.version, entries: entries.collect() }
     }
 
     /// The nodes granted one name, each sink once.

@@ -1,19 +1,29 @@
-//! One subscriber of one name: opens packets, puts messages together, and delivers each once.
+//! One subscriber of one name: opens and verifies packets, puts messages together, and delivers each once.
 //!
-//! Nothing is allocated on the word of a header: the packet that claims a size must open first.
+//! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed, first. A
+//! packet that is refused leaves no state.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 
 use bytes::Bytes;
-use sgc_trust::{Freshness, OpenError, ReplayWindow, SourceKey, opened_bytes};
+use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite, opened_bytes};
 use sgc_wire::{
-    Decode, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader, SourceId, TopicGrant,
+    Decode, GRANT_SOURCES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader,
+    SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
+
+use crate::parking::{Parked, Parking};
+use crate::partial::Partials;
+use crate::source::without_lists;
+
+/// Epochs whose keys are held at once. One that is over is held until [`Sink::retire_epochs`]; beyond this number the
+/// oldest goes.
+pub const EPOCHS_MAX: usize = 8;
 
 /// Bounds of one sink.
 #[derive(Clone, Debug)]
 pub struct SinkLimits {
-    /// Sources remembered; beyond it the one idle for longest is forgotten.
+    /// Sources believed; those announced beyond it are not.
     pub sources_max: usize,
     /// Messages of one source that may be incomplete at once.
     pub partials_per_source_max: usize,
@@ -23,7 +33,11 @@ pub struct SinkLimits {
 
 impl Default for SinkLimits {
     fn default() -> Self {
-        Self { sources_max: 256, partials_per_source_max: 4, partial_bytes_max: 128 * 1024 * 1024 }
+        Self {
+            sources_max: GRANT_SOURCES_MAX,
+            partials_per_source_max: 4,
+            partial_bytes_max: 128 * 1024 * 1024,
+        }
     }
 }
 
@@ -36,6 +50,8 @@ pub struct Message {
     pub seq: u64,
     /// What it is and when it was published.
     pub head: MessageHead,
+    /// True if its publisher waits for who cannot take it; otherwise newer ones replace it.
+    pub reliable: bool,
     /// The payload, as it was published.
     pub payload: Bytes,
 }
@@ -51,6 +67,8 @@ pub enum Delivery {
     NeedsHistory(SourceId),
     /// The source's history is complete.
     Synced(SourceId),
+    /// It waits for the grant that tells of its epoch or source; see [`Sink::regrant`].
+    Parked,
 }
 
 /// Why a packet was dropped.
@@ -59,6 +77,21 @@ pub enum SinkDrop {
     /// It could not be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
+    /// It is for another sink, or for this one as it asked before.
+    #[error("addressed to another sink")]
+    NotForUs,
+    /// Several grants were to tell of its source, and none did.
+    #[error("of a source that the owner does not announce")]
+    UnknownSource,
+    /// Several grants were to tell of its epoch, and none did.
+    #[error("of an epoch that was never granted")]
+    UnknownEpoch,
+    /// It waits for a grant, and an older one that did has been dropped for it.
+    #[error("too many packets wait for a grant")]
+    ParkingFull,
+    /// The message was published before the source was announced to this sink, and not asked for.
+    #[error("message older than the announcement of its source")]
+    BelowFloor,
     /// The message was delivered before, or is too old to tell.
     #[error("message delivered before")]
     Replayed,
@@ -87,6 +120,13 @@ impl SinkDrop {
             Self::Open(OpenError::Epoch { .. }) => "sink_epoch",
             Self::Open(OpenError::Length) => "sink_length",
             Self::Open(OpenError::Forged) => "sink_forged",
+            Self::Open(OpenError::Trailer) => "sink_trailer",
+            Self::Open(OpenError::Signature) => "sink_signature",
+            Self::NotForUs => "sink_not_for_us",
+            Self::UnknownSource => "sink_unknown_source",
+            Self::UnknownEpoch => "sink_unknown_epoch",
+            Self::ParkingFull => "sink_parking_full",
+            Self::BelowFloor => "sink_below_floor",
             Self::Replayed => "sink_replayed",
             Self::DuplicateFragment => "sink_duplicate_fragment",
             Self::Inconsistent => "sink_inconsistent",
@@ -97,78 +137,165 @@ impl SinkDrop {
     }
 }
 
-struct Partial {
-    seq: u64,
-    header: PacketHeader,
-    head: Option<MessageHead>,
-    message: Vec<u8>,
-    have: Vec<u64>,
-    missing: u32,
+/// What the next grant may explain.
+enum Unexplained {
+    Epoch,
+    Source,
 }
 
+/// A source that was announced.
 struct SourceState {
-    key: SourceKey,
+    /// What its signatures verify with, as announced; parsed when the first packet opens.
+    announced_key: Bytes,
+    verifier: Option<BatchVerifier>,
+    /// By epoch: for packets to all.
+    keys: Vec<SourceKey>,
+    /// For packets to this sink, of the epoch seen last.
+    addressed: Option<SourceKey>,
     window: ReplayWindow,
-    partials: VecDeque<Partial>,
-    /// False while a transient-local source's history has been asked for and is not here yet.
+    /// Packets to all below it are replays of what was published before this sink was told of the source.
+    next: u64,
+    /// History below it was given up by the source before this sink was told of it.
+    oldest: u64,
+    partials: Partials,
+    /// False while a transient-local source's history is not here yet.
     synced: bool,
-    used: u64,
+    /// True once it was asked for.
+    asked: bool,
+    /// The last epoch in which it is believed, if the newest grant no longer announces it.
+    last_epoch: Option<u32>,
 }
 
 /// A subscriber.
 pub struct Sink {
     name: Name,
-    grant: TopicGrant,
+    id: SinkId,
     transient_local: bool,
     limits: SinkLimits,
+    /// Ascending; never empty.
+    epochs: Vec<TopicGrant>,
     sources: BTreeMap<SourceId, SourceState>,
-    clock: u64,
+    parking: Parking,
     incomplete: u64,
     scratch: Vec<u8>,
 }
 
 impl Sink {
-    /// A sink with the granted key. A transient-local one takes each source's history before anything else.
-    pub fn new(name: Name, grant: TopicGrant, transient_local: bool, limits: SinkLimits) -> Self {
-        Self {
+    /// A sink that was granted as `id`. A transient-local one takes each source's history before anything else.
+    pub fn new(name: Name, id: SinkId, grant: TopicGrant, transient_local: bool, limits: SinkLimits) -> Self {
+        let mut sink = Self {
             name,
-            grant,
+            id,
             transient_local,
             limits,
+            epochs: vec![without_lists(&grant)],
             sources: BTreeMap::new(),
-            clock: 0,
+            parking: Parking::default(),
             incomplete: 0,
             scratch: Vec::new(),
-        }
+        };
+        sink.announce(grant.sources, None);
+        sink
     }
 
-    /// Takes a new grant. With the same key (the way to the owner changed) what was delivered is remembered and
-    /// histories are asked for again; with another one (the owner started anew) all sources are new.
-    pub fn regrant(&mut self, grant: TopicGrant) {
-        if grant == self.grant {
-            for source in self.sources.values_mut() {
-                source.synced = !self.transient_local;
-                source.partials.clear();
-            }
-        } else {
+    /// Takes a further grant, and hands over what the packets come to that waited for it.
+    ///
+    /// - A later epoch is added to those that are known. What was delivered is remembered; packets of the epochs before
+    ///   open until [`Self::retire_epochs`].
+    /// - Another key for an epoch that was known, or an earlier epoch, is that of an owner that started anew: nothing
+    ///   of before counts.
+    /// - Under another id (the way to the owner changed, and this sink asked again), histories must be asked for again.
+    /// - A source that is no longer announced is believed in the epochs until then, and in none that begins later.
+    pub fn regrant(
+        &mut self,
+        id: SinkId,
+        grant: TopicGrant,
+        mut deliver: impl FnMut(Result<Delivery, SinkDrop>),
+    ) {
+        let newest = self.newest_epoch();
+        let anew = match self.epochs.iter().find(|known| known.epoch == grant.epoch) {
+            Some(known) => (&known.key, known.suite) != (&grant.key, grant.suite),
+            None => grant.epoch < newest,
+        };
+        if anew {
+            self.epochs.clear();
             self.sources.clear();
-            self.grant = grant;
+        }
+        if self.epochs.last().is_none_or(|known| known.epoch < grant.epoch) {
+            self.epochs.push(without_lists(&grant));
+            if self.epochs.len() > EPOCHS_MAX {
+                self.epochs.remove(0);
+                self.drop_old_keys();
+            }
+        }
+        if id != self.id {
+            self.id = id;
+            for source in self.sources.values_mut() {
+                source.addressed = None;
+                source.unsync(self.transient_local);
+            }
+        }
+        self.announce(grant.sources, Some(newest));
+        for mut parked in self.parking.take() {
+            let result = match self.handle(&parked.packet) {
+                Ok(Ok(delivery)) => Ok(delivery),
+                Ok(Err(unexplained)) if parked.looked_in_vain() => Err(match unexplained {
+                    Unexplained::Epoch => SinkDrop::UnknownEpoch,
+                    Unexplained::Source => SinkDrop::UnknownSource,
+                }),
+                Ok(Err(_)) => {
+                    // It was here before, so there is room.
+                    self.parking.push(parked);
+                    continue;
+                }
+                Err(dropped) => Err(dropped),
+            };
+            deliver(result);
         }
     }
 
-    /// The sources whose history has not arrived yet.
+    /// Drops all epochs but the newest, and the sources that are not announced in it: their packets are refused.
+    pub fn retire_epochs(&mut self) {
+        let newest = self.newest_epoch();
+        self.epochs.retain(|known| known.epoch == newest);
+        self.drop_old_keys();
+        self.sources.retain(|_, source| source.last_epoch.is_none_or(|last| last >= newest));
+    }
+
+    /// The announced sources whose history has not arrived yet.
     pub fn unsynced(&self) -> impl Iterator<Item = SourceId> + '_ {
-        self.sources.iter().filter(|(_, s)| !s.synced).map(|(id, _)| *id)
+        self.sources.iter().filter(|(_, s)| !s.synced && s.last_epoch.is_none()).map(|(id, _)| *id)
     }
 
-    /// Makes a source known before its first packet; true if its history must be asked for.
+    /// True if a source's history must be asked for, which the caller then does.
     pub fn expect(&mut self, source: SourceId) -> bool {
-        self.transient_local && self.source(source).is_ok_and(|s| !s.synced)
+        match self.sources.get_mut(&source) {
+            Some(state) if !state.synced => {
+                state.asked = true;
+                true
+            }
+            _ => false,
+        }
     }
 
-    /// Forgets a source that is gone.
+    /// Begins anew with a source whose messages went nowhere meanwhile: its history will be asked for, and delivered
+    /// again. Other messages that were published until now stay past.
     pub fn forget(&mut self, source: &SourceId) {
-        self.sources.remove(source);
+        if let Some(state) = self.sources.get_mut(source) {
+            state.next = state.next.max(state.window.newest().saturating_add(1));
+            state.window = ReplayWindow::default();
+            state.unsync(self.transient_local);
+        }
+    }
+
+    /// Takes a packet.
+    pub fn handle_packet(&mut self, packet: &Packet) -> Result<Delivery, SinkDrop> {
+        debug_assert_eq!(packet.header.name, self.name);
+        match self.handle(packet)? {
+            Ok(delivery) => Ok(delivery),
+            Err(_) if self.parking.push(Parked::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
+            Err(_) => Ok(Delivery::Parked),
+        }
     }
 
     /// Messages given up because a newer one was complete first, or for want of room.
@@ -176,346 +303,292 @@ impl Sink {
         self.incomplete
     }
 
-    /// Takes a packet.
-    pub fn handle_packet(&mut self, packet: &Packet) -> Result<Delivery, SinkDrop> {
-        let header = &packet.header;
-        debug_assert_eq!(header.name, self.name);
-        // Only what opens may make a source known, or any packet could push out a good one.
-        let known = self.sources.contains_key(&header.source);
-        let fresh_key;
-        let key = match self.sources.get(&header.source) {
-            Some(state) => {
-                if header.seq != 0 && state.window.check(header.seq) != Freshness::Fresh {
-                    return Err(SinkDrop::Replayed);
-                }
-                &state.key
-            }
-            None => {
-                fresh_key = SourceKey::derive(&self.grant, &self.name, &header.source)
-                    .ok_or(OpenError::Suite { found: self.grant.suite })?;
-                &fresh_key
-            }
-        };
-        let mut opened = std::mem::take(&mut self.scratch);
-        opened.clear();
-        opened.resize(opened_bytes(header), 0);
-        let result = match &packet.payload.0[..] {
-            [one] => key.open(header, one, &mut opened),
-            _ => {
-                let mut joined = Vec::with_capacity(packet.payload.len());
-                packet.payload.copy_into(&mut joined);
-                key.open(header, &joined, &mut opened)
-            }
-        };
-        if let Err(error) = result {
-            self.scratch = opened;
-            return Err(error.into());
+    /// Packets that wait for a grant.
+    pub fn parked(&self) -> usize {
+        self.parking.len()
+    }
+
+    /// The epochs whose packets open, oldest first.
+    pub fn epochs(&self) -> impl Iterator<Item = u32> + '_ {
+        self.epochs.iter().map(|known| known.epoch)
+    }
+
+    /// Signatures that were checked.
+    pub fn signatures_checked(&self) -> u64 {
+        let verifiers = self.sources.values().filter_map(|s| s.verifier.as_ref());
+        verifiers.map(BatchVerifier::signatures_checked).sum()
+    }
+
+    fn newest_epoch(&self) -> u32 {
+        self.epochs.last().map_or(0, |known| known.epoch)
+    }
+
+    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the first.
+    fn announce(&mut self, announced: Vec<SourceAnnounce>, before: Option<u32>) {
+        for source in self.sources.values_mut() {
+            source.last_epoch = source.last_epoch.or(before);
         }
-        let delivery = if !known && self.transient_local && header.to.is_none() {
-            self.source(header.source).map(|_| Delivery::NeedsHistory(header.source))
-        } else {
-            self.accept(header, &mut opened)
+        for announce in announced {
+            match self.sources.get_mut(&announce.source) {
+                Some(known) => known.announce_again(announce.key),
+                None => {
+                    self.make_room();
+                    if self.sources.len() < self.limits.sources_max {
+                        let state = SourceState::new(&announce, self.transient_local);
+                        self.sources.insert(announce.source, state);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Drops a source that is no longer announced, if there are too many.
+    fn make_room(&mut self) {
+        if self.sources.len() >= self.limits.sources_max
+            && let Some(gone) = self.sources.iter().find(|(_, s)| s.last_epoch.is_some()).map(|(id, _)| *id)
+        {
+            self.sources.remove(&gone);
+        }
+    }
+
+    fn drop_old_keys(&mut self) {
+        let oldest = self.epochs.first().map_or(0, |known| known.epoch);
+        for source in self.sources.values_mut() {
+            source.keys.retain(|key| key.epoch() >= oldest);
+            source.addressed = source.addressed.take().filter(|key| key.epoch() >= oldest);
+        }
+    }
+
+    /// What a packet comes to, if a grant explained it. In this order: what costs nothing (addressee, epoch, suite,
+    /// replay); the seal, which only holders of the topic's key pass; the signature.
+    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, Unexplained>, SinkDrop> {
+        let header = &packet.header;
+        if header.to.is_some_and(|to| to != self.id) {
+            return Err(SinkDrop::NotForUs);
+        }
+        let Some(grant) = self.epochs.iter().find(|known| known.epoch == header.epoch) else {
+            if header.epoch > self.newest_epoch() {
+                return Ok(Err(Unexplained::Epoch));
+            }
+            return Err(OpenError::Epoch { found: header.epoch }.into());
         };
-        self.scratch = opened;
-        delivery
+        let suite = Suite::from_id(grant.suite).filter(|suite| suite.id() == header.suite);
+        let suite = suite.ok_or(OpenError::Suite { found: header.suite })?;
+        let joined;
+        let payload = match &packet.payload.0[..] {
+            [one] => &one[..],
+            _ => {
+                let mut out = Vec::with_capacity(packet.payload.len());
+                packet.payload.copy_into(&mut out);
+                joined = out;
+                &joined
+            }
+        };
+        let known = self.sources.get_mut(&header.source);
+        let Some(source) = known.filter(|s| s.last_epoch.is_none_or(|last| header.epoch <= last)) else {
+            // Who does not hold the topic's key takes no room.
+            let mut text = vec![0; opened_bytes(header)];
+            derive(grant, &self.name, header)?.open(header, payload, &mut text)?;
+            return Ok(Err(Unexplained::Source));
+        };
+        source.check_freshness(header)?;
+        source.derive_key(grant, &self.name, header)?;
+        let SourceState { keys, addressed, partials, verifier, announced_key, .. } = source;
+        let key = if header.to.is_some() {
+            addressed.as_ref()
+        } else {
+            keys.iter().find(|key| key.epoch() == header.epoch)
+        };
+        let key = key.ok_or(OpenError::Epoch { found: header.epoch })?;
+        let text_bytes = opened_bytes(header);
+        let mut opened = if header.fragments() == 1 {
+            Opened::Whole(vec![0; text_bytes])
+        } else if partials.place(header).is_some() {
+            Opened::InPlace
+        } else {
+            let mut scratch = std::mem::take(&mut self.scratch);
+            scratch.clear();
+            scratch.resize(text_bytes, 0);
+            Opened::Aside(scratch)
+        };
+        let out = match &mut opened {
+            Opened::Whole(text) | Opened::Aside(text) => &mut text[..],
+            Opened::InPlace => partials.place(header).unwrap_or_default(),
+        };
+        let mut result = key.open(header, payload, out);
+        if result.is_ok() && suite.is_signed() {
+            result = verify(verifier, announced_key, suite, header, payload);
+        }
+        let delivery = match result {
+            Ok(()) => self.accept(header, &mut opened),
+            Err(error) => Err(error.into()),
+        };
+        if let Opened::Aside(scratch) = opened {
+            self.scratch = scratch;
+        }
+        delivery.map(Ok)
     }
 
     /// Takes what a packet opened to: fragment, and behind the first one the head.
-    fn accept(&mut self, header: &PacketHeader, opened: &mut Vec<u8>) -> Result<Delivery, SinkDrop> {
-        let head = match header.index {
-            0 => {
-                let at = opened.len() - MESSAGE_HEAD_BYTES;
-                let head = MessageHead::from_slice(&opened[at..]).map_err(|_| SinkDrop::Head)?;
-                opened.truncate(at);
+    fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
+        let head = match opened {
+            Opened::Whole(text) | Opened::Aside(text) if header.index == 0 => {
+                let at = text.len() - MESSAGE_HEAD_BYTES;
+                let head = MessageHead::from_slice(&text[at..]).map_err(|_| SinkDrop::Head)?;
+                text.truncate(at);
+                // Number 0 is the mark that a history was sent, and nothing else.
+                if (head.kind == MessageKind::Synced) != (header.seq == 0) {
+                    return Err(SinkDrop::Head);
+                }
                 Some(head)
             }
             _ => None,
         };
-        let begins = header.fragments() > 1
-            && self
-                .sources
-                .get(&header.source)
-                .is_none_or(|s| s.partials.iter().all(|p| p.seq != header.seq));
-        let room =
-            if begins { self.limits.partial_bytes_max.saturating_sub(self.partial_bytes()) } else { 0 };
-        let partials_max = self.limits.partials_per_source_max;
-        let mut given_up = 0;
-        let source = self.source(header.source)?;
-        if let Some(MessageHead { kind: MessageKind::Synced, .. }) = head {
+        let known = self.sources.get(&header.source);
+        let begins = header.fragments() > 1 && known.is_some_and(|s| !s.partials.has_begun(header.seq));
+        let room = if begins {
+            let used: usize = self.sources.values().map(|s| s.partials.bytes()).sum();
+            self.limits.partial_bytes_max.saturating_sub(used)
+        } else {
+            0
+        };
+        let Some(source) = self.sources.get_mut(&header.source) else { return Err(SinkDrop::UnknownSource) };
+        if header.seq == 0 {
+            if head.is_none() || header.total > 0 {
+                return Err(SinkDrop::Head);
+            }
             source.synced = true;
             return Ok(Delivery::Synced(header.source));
         }
         if !source.synced && header.to.is_none() {
-            return Err(SinkDrop::AwaitingHistory);
+            if std::mem::replace(&mut source.asked, true) {
+                return Err(SinkDrop::AwaitingHistory);
+            }
+            return Ok(Delivery::NeedsHistory(header.source));
         }
-        let complete = if let (1, Some(head)) = (header.fragments(), head) {
-            Some((head, Bytes::copy_from_slice(opened)))
-        } else {
-            let at = match source.partials.iter().position(|p| p.seq == header.seq) {
-                Some(at) => at,
-                None => {
-                    if header.total as usize > room {
-                        return Err(SinkDrop::PartialsFull);
-                    }
-                    if source.partials.len() >= partials_max {
-                        source.partials.pop_front();
-                        given_up += 1;
-                    }
-                    source.partials.push_back(Partial::new(header));
-                    source.partials.len() - 1
+        let complete = match (opened, head) {
+            (Opened::Whole(text), Some(head)) => Some((head, Bytes::from(std::mem::take(text)))),
+            (opened, head) => {
+                if begins && header.total as usize > room {
+                    return Err(SinkDrop::PartialsFull);
                 }
-            };
-            let partial = &mut source.partials[at];
-            partial.put(header, head, opened)?;
-            match (partial.missing, partial.head) {
-                (0, Some(head)) => source.partials.remove(at).map(|p| (head, Bytes::from(p.message))),
-                _ => None,
+                let fragment = match opened {
+                    Opened::Whole(text) | Opened::Aside(text) => Some(&text[..]),
+                    Opened::InPlace => None,
+                };
+                let max = self.limits.partials_per_source_max;
+                let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
+                self.incomplete += given_up;
+                complete
             }
         };
-        let delivery = complete.map(|(head, message)| {
-            source.window.accept(header.seq);
-            if header.reliable {
-                // A reliable flow is in order: what is older and incomplete will never be complete.
-                let before = source.partials.len();
-                source.partials.retain(|p| p.seq > header.seq);
-                given_up += (before - source.partials.len()) as u64;
-            }
-            Delivery::Message(Message { source: header.source, seq: header.seq, head, payload: message })
-        });
-        self.incomplete += given_up;
-        Ok(delivery.unwrap_or(Delivery::Incomplete))
-    }
-
-    fn partial_bytes(&self) -> usize {
-        self.sources.values().flat_map(|s| &s.partials).map(|p| p.message.len()).sum()
-    }
-
-    /// The state of a source, made if need be; the one idle for longest makes room.
-    fn source(&mut self, id: SourceId) -> Result<&mut SourceState, SinkDrop> {
-        self.clock += 1;
-        if !self.sources.contains_key(&id) {
-            let key = SourceKey::derive(&self.grant, &self.name, &id)
-                .ok_or(OpenError::Suite { found: self.grant.suite })?;
-            if self.sources.len() >= self.limits.sources_max
-                && let Some(idle) = self.sources.iter().min_by_key(|(_, s)| s.used).map(|(id, _)| *id)
-            {
-                self.sources.remove(&idle);
-            }
-            let state = SourceState {
-                key,
-                window: ReplayWindow::default(),
-                partials: VecDeque::new(),
-                synced: !self.transient_local,
-                used: self.clock,
-            };
-            self.sources.insert(id, state);
+        let Some((head, payload)) = complete else { return Ok(Delivery::Incomplete) };
+        source.window.accept(header.seq);
+        if header.reliable {
+            // A reliable flow is in order: what is older and incomplete will never be complete.
+            self.incomplete += source.partials.give_up(header.seq);
         }
-        let state = self.sources.get_mut(&id).expect("inserted above if it was missing");
-        state.used = self.clock;
-        Ok(state)
+        let PacketHeader { source, seq, reliable, .. } = *header;
+        Ok(Delivery::Message(Message { source, seq, head, reliable, payload }))
     }
 }
 
-impl Partial {
-    fn new(header: &PacketHeader) -> Self {
-        let fragments = header.fragments();
+/// Where a packet was opened to.
+enum Opened {
+    /// Memory of its own, which becomes the message.
+    Whole(Vec<u8>),
+    /// Its place in the message.
+    InPlace,
+    /// Memory that is used again; the fragment is copied to its place.
+    Aside(Vec<u8>),
+}
+
+impl SourceState {
+    fn new(announce: &SourceAnnounce, transient_local: bool) -> Self {
         Self {
-            seq: header.seq,
-            header: header.clone(),
-            head: None,
-            message: vec![0; header.total as usize],
-            have: vec![0; fragments.div_ceil(64) as usize],
-            missing: fragments,
+            announced_key: announce.key.clone(),
+            verifier: None,
+            keys: Vec::new(),
+            addressed: None,
+            window: ReplayWindow::default(),
+            next: announce.next,
+            oldest: announce.oldest,
+            partials: Partials::default(),
+            synced: !transient_local,
+            asked: false,
+            last_epoch: None,
         }
     }
 
-    fn put(
+    /// The floors stay those of the first announcement: what is under way since then was not delivered yet, and what
+    /// was is in the window.
+    fn announce_again(&mut self, key: Bytes) {
+        self.last_epoch = None;
+        if self.announced_key != key {
+            self.announced_key = key;
+            self.verifier = None;
+        }
+    }
+
+    fn unsync(&mut self, transient_local: bool) {
+        self.synced = !transient_local;
+        self.asked = false;
+        self.partials.clear();
+    }
+
+    fn check_freshness(&self, header: &PacketHeader) -> Result<(), SinkDrop> {
+        let floor = match (header.to, header.seq) {
+            (Some(_), 0) => return Ok(()),
+            (Some(_), _) => self.oldest,
+            (None, _) => self.next.max(1),
+        };
+        if header.seq < floor {
+            return Err(SinkDrop::BelowFloor);
+        }
+        match self.window.check(header.seq) {
+            Freshness::Fresh => Ok(()),
+            Freshness::Duplicate | Freshness::TooOld => Err(SinkDrop::Replayed),
+        }
+    }
+
+    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for what is addressed.
+    fn derive_key(
         &mut self,
+        grant: &TopicGrant,
+        name: &Name,
         header: &PacketHeader,
-        head: Option<MessageHead>,
-        fragment: &[u8],
-    ) -> Result<(), SinkDrop> {
-        if (header.total, header.grid) != (self.header.total, self.header.grid) {
-            return Err(SinkDrop::Inconsistent);
+    ) -> Result<(), OpenError> {
+        if header.to.is_some() {
+            if self.addressed.as_ref().is_none_or(|key| key.epoch() != header.epoch) {
+                self.addressed = Some(derive(grant, name, header)?);
+            }
+        } else if self.keys.iter().all(|key| key.epoch() != header.epoch) {
+            self.keys.push(derive(grant, name, header)?);
         }
-        let (word, bit) = (usize::from(header.index / 64), 1u64 << (header.index % 64));
-        if self.have[word] & bit != 0 {
-            return Err(SinkDrop::DuplicateFragment);
-        }
-        self.have[word] |= bit;
-        self.missing -= 1;
-        let start = usize::from(header.index) * usize::from(header.grid);
-        self.message[start..start + fragment.len()].copy_from_slice(fragment);
-        self.head = self.head.or(head);
         Ok(())
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use sgc_trust::Suite;
-    use sgc_wire::{Class, SecretBytes, SinkId};
+/// The key that a packet was sealed with, if it is what it says.
+fn derive(grant: &TopicGrant, name: &Name, header: &PacketHeader) -> Result<SourceKey, OpenError> {
+    let key = match &header.to {
+        Some(sink) => SourceKey::derive_addressed(grant, name, &header.source, sink),
+        None => SourceKey::derive(grant, name, &header.source),
+    };
+    key.ok_or(OpenError::Suite { found: grant.suite })
+}
 
-    use super::*;
-    use crate::{FRAGMENT_BYTES, PublishError, Source, SourceConfig};
-
-    const NAME: Name = Name([1; 32]);
-    const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
-
-    fn grant(key: u8) -> TopicGrant {
-        TopicGrant {
-            epoch: 1,
-            suite: Suite::Group.id(),
-            key: SecretBytes::new([key; 32]),
-            sources: Vec::new(),
-            entry: None,
-        }
+/// Verifies a packet that opened.
+fn verify(
+    verifier: &mut Option<BatchVerifier>,
+    announced_key: &Bytes,
+    suite: Suite,
+    header: &PacketHeader,
+    payload: &[u8],
+) -> Result<(), OpenError> {
+    if verifier.is_none() {
+        *verifier = BatchVerifier::new(suite, announced_key);
     }
-
-    fn source(history_depth: usize) -> Source {
-        source_with_room(history_depth, 1 << 20)
-    }
-
-    fn source_with_room(history_depth: usize, history_bytes_max: usize) -> Source {
-        let config = SourceConfig {
-            name: NAME,
-            id: SourceId([5; 16]),
-            class: Class::Default,
-            reliable: true,
-            history_depth,
-            history_bytes_max,
-        };
-        Source::new(config, &grant(1)).unwrap()
-    }
-
-    fn sink(transient_local: bool) -> Sink {
-        Sink::new(NAME, grant(1), transient_local, SinkLimits::default())
-    }
-
-    fn published(source: &mut Source, payload: &[u8]) -> Vec<Packet> {
-        let mut packets = Vec::new();
-        source.publish(&HEAD, payload, |p| packets.push(p)).unwrap();
-        packets
-    }
-
-    fn replayed(source: &Source) -> Vec<Packet> {
-        let mut packets = Vec::new();
-        source.replay(SinkId([9; 16]), 1, u64::MAX, |p| packets.push(p));
-        packets
-    }
-
-    fn delivered(sink: &mut Sink, packets: &[Packet]) -> Vec<Vec<u8>> {
-        packets
-            .iter()
-            .filter_map(|p| match sink.handle_packet(p) {
-                Ok(Delivery::Message(m)) => Some(m.payload.to_vec()),
-                _ => None,
-            })
-            .collect()
-    }
-
-    fn bytes(n: usize) -> Vec<u8> {
-        (0..n).map(|i| (i * 7 % 251) as u8).collect()
-    }
-
-    #[test]
-    fn messages_of_every_size_arrive_whole_in_any_order_of_fragments() {
-        let grid = usize::from(FRAGMENT_BYTES);
-        for n in [0, 1, grid - 1, grid, grid + 1, 3 * grid, 1_000_003] {
-            let (mut source, mut sink) = (source(0), sink(false));
-            let mut packets = published(&mut source, &bytes(n));
-            assert_eq!(packets.len(), n.div_ceil(grid).max(1));
-            packets.reverse();
-            assert_eq!(delivered(&mut sink, &packets), vec![bytes(n)], "{n} bytes");
-        }
-    }
-
-    #[test]
-    fn a_message_is_delivered_once_however_often_it_comes() {
-        let (mut source, mut sink) = (source(0), sink(false));
-        let packets = published(&mut source, &bytes(40_000));
-        assert_eq!(delivered(&mut sink, &packets).len(), 1);
-        assert_eq!(delivered(&mut sink, &packets).len(), 0);
-        assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::Replayed));
-        sink.regrant(grant(1));
-        assert_eq!(delivered(&mut sink, &packets).len(), 0, "after a change of route");
-    }
-
-    #[test]
-    fn a_forged_packet_leaves_no_trace() {
-        let (mut source, mut sink) = (source(0), sink(false));
-        let good = published(&mut source, &bytes(60));
-        for n in 0..1000u16 {
-            let mut bad = good[0].clone();
-            bad.header.source = SourceId([(n % 256) as u8; 16]);
-            bad.header.total = 60;
-            bad.payload = Bytes::from(vec![0; 60 + MESSAGE_HEAD_BYTES + 16]).into();
-            assert_eq!(sink.handle_packet(&bad), Err(SinkDrop::Open(OpenError::Forged)));
-        }
-        assert!(sink.sources.is_empty());
-        assert_eq!(delivered(&mut sink, &good).len(), 1);
-    }
-
-    #[test]
-    fn incomplete_messages_are_bounded_and_counted() {
-        let (mut source, mut sink) = (source(0), sink(false));
-        for _ in 0..10 {
-            let packets = published(&mut source, &bytes(40_000));
-            sink.handle_packet(&packets[0]).unwrap();
-        }
-        assert_eq!(sink.partial_bytes(), 4 * 40_000);
-        let last = published(&mut source, &bytes(5));
-        assert_eq!(delivered(&mut sink, &last).len(), 1);
-        assert_eq!((sink.partial_bytes(), sink.incomplete()), (0, 10));
-        sink.limits.partial_bytes_max = 100;
-        let packets = published(&mut source, &bytes(40_000));
-        assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::PartialsFull));
-    }
-
-    #[test]
-    fn a_late_joiner_gets_the_history_first_and_each_message_once() {
-        let (mut source, mut sink) = (source(3), sink(true));
-        for n in 1..=5 {
-            published(&mut source, &bytes(n));
-        }
-        let live = published(&mut source, &bytes(6));
-        assert_eq!(sink.handle_packet(&live[0]), Ok(Delivery::NeedsHistory(source.id())));
-        assert_eq!(sink.handle_packet(&live[0]), Err(SinkDrop::AwaitingHistory));
-        let history = replayed(&source);
-        assert_eq!(delivered(&mut sink, &history), vec![bytes(4), bytes(5), bytes(6)]);
-        assert_eq!(sink.unsynced().count(), 0);
-        assert_eq!(delivered(&mut sink, &live).len(), 0);
-        let next = published(&mut source, &bytes(7));
-        assert_eq!(delivered(&mut sink, &next), vec![bytes(7)]);
-        // The way changed: history again, nothing twice.
-        sink.regrant(grant(1));
-        assert!(sink.expect(source.id()));
-        assert_eq!(delivered(&mut sink, &replayed(&source)).len(), 0);
-        assert_eq!(sink.unsynced().count(), 0);
-    }
-
-    #[test]
-    fn history_is_bounded_in_bytes_but_keeps_the_newest() {
-        let mut source = source_with_room(100, 1000);
-        for _ in 0..50 {
-            published(&mut source, &bytes(400));
-        }
-        assert_eq!(replayed(&source).len(), 1 + 1);
-        published(&mut source, &bytes(5000));
-        assert_eq!(replayed(&source).len(), 1 + 1);
-    }
-
-    #[test]
-    fn the_mark_of_synchrony_is_always_the_same_bytes() {
-        let source = source(1);
-        let (a, b) = (replayed(&source), replayed(&source));
-        assert_eq!(a[0].payload.0, b[0].payload.0);
-    }
-
-    #[test]
-    fn oversized_messages_are_refused_at_the_source() {
-        let payload = vec![0; sgc_wire::MESSAGE_BYTES_MAX as usize + 1];
-        let error = source(0).publish(&HEAD, &payload, |_| panic!("nothing is emitted")).unwrap_err();
-        assert_eq!(error, PublishError::TooLarge { bytes: payload.len() });
-    }
+    // A source that was announced with a key of no use has signed nothing.
+    verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
 }

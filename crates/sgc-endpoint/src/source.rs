@@ -1,16 +1,26 @@
-//! One publisher under one name: numbers messages, cuts and seals them, and keeps what late joiners may ask for.
+//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners may ask for.
+//!
+//! A payload is read once, from where it is into the packets that leave; fragments of a large message leave before its
+//! end is read. Who may hear it, and when its epoch ends, is decided by the endpoint.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 
 use bytes::Bytes;
-use sgc_trust::{SourceKey, TAG_BYTES};
+use sgc_trust::{Batch, MessageKey, SourceKey, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet,
-    PacketHeader, SinkId, SourceId, TopicGrant,
+    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, SinkId,
+    SourceAnnounce, SourceId, TopicGrant,
 };
 
 /// Bytes of message in one packet.
 pub const FRAGMENT_BYTES: u16 = 16 * 1024;
+/// Most messages of one source. At a million a second it lasts nine years; a new source id begins anew.
+pub const SOURCE_MESSAGES_MAX: u64 = 1 << 48;
+
+/// What a kept message counts beyond its payload, bytes.
+const KEPT_OVERHEAD_BYTES: usize = 64;
 
 /// What a source is made of.
 #[derive(Clone, Debug)]
@@ -38,22 +48,182 @@ pub enum PublishError {
         /// Its length.
         bytes: usize,
     },
+    /// The source has numbered all messages that it can; it takes one of another id to go on.
+    #[error("a source carries at most {SOURCE_MESSAGES_MAX} messages")]
+    Exhausted,
+}
+
+/// How far a source is, to be read without its lock.
+#[derive(Debug)]
+pub struct SourceProgress {
+    source: SourceId,
+    key: Bytes,
+    next: AtomicU64,
+    oldest: AtomicU64,
+    /// Messages published before the present epoch.
+    epoch_start: AtomicU64,
+}
+
+impl SourceProgress {
+    /// The source with its present floors, for the owner to vouch for.
+    pub fn announce(&self) -> SourceAnnounce {
+        // Both only grow, `next` first: read the other way round, the oldest is never beyond the next.
+        let oldest = self.oldest.load(Acquire);
+        let next = self.next.load(Acquire);
+        SourceAnnounce { source: self.source, key: self.key.clone(), oldest, next }
+    }
+
+    /// Id of the source.
+    pub fn id(&self) -> SourceId {
+        self.source
+    }
+
+    /// What its messages verify with; empty if the suite has no signatures.
+    pub fn key(&self) -> &Bytes {
+        &self.key
+    }
+
+    /// Messages published.
+    pub fn published(&self) -> u64 {
+        self.next.load(Acquire).saturating_sub(1)
+    }
+
+    /// Messages published since the present epoch began; many ask for a new one.
+    pub fn published_in_epoch(&self) -> u64 {
+        let start = self.epoch_start.load(Acquire);
+        self.published().saturating_sub(start)
+    }
+}
+
+/// A message as it was published.
+struct Kept {
+    seq: u64,
+    head: MessageHead,
+    payload: Bytes,
+}
+
+impl Kept {
+    fn bytes(&self) -> usize {
+        self.payload.len() + KEPT_OVERHEAD_BYTES
+    }
 }
 
 /// A publisher.
 pub struct Source {
     config: SourceConfig,
+    suite: Suite,
+    /// The present epoch, for deriving keys; without the lists that came with it.
+    grant: TopicGrant,
     key: SourceKey,
+    message_key: MessageKey,
     seq: u64,
-    history: VecDeque<Vec<Packet>>,
+    batch: Batch,
+    /// The packets of `batch`, sealed and not signed.
+    unsigned: Vec<(PacketHeader, Vec<u8>)>,
+    history: VecDeque<Kept>,
     history_bytes: usize,
+    progress: Arc<SourceProgress>,
 }
 
 impl Source {
-    /// A source that starts at message 1; `None` if the grant's suite is not in this build.
-    pub fn new(config: SourceConfig, grant: &TopicGrant) -> Option<Self> {
+    /// A source that starts at message 1; `None` if the grant's suite is not in this build, or the key is not one to
+    /// sign with in it. Sources may share a key.
+    ///
+    /// Never make two sources under one id with one topic key: their nonces would repeat.
+    pub fn new(config: SourceConfig, grant: &TopicGrant, message_key: MessageKey) -> Option<Self> {
         let key = SourceKey::derive(grant, &config.name, &config.id)?;
-        Some(Self { config, key, seq: 0, history: VecDeque::new(), history_bytes: 0 })
+        let suite = key.suite();
+        if !message_key.fits(suite) {
+            return None;
+        }
+        let progress = SourceProgress {
+            source: config.id,
+            key: message_key.public().clone(),
+            next: AtomicU64::new(1),
+            oldest: AtomicU64::new(1),
+            epoch_start: AtomicU64::new(0),
+        };
+        Some(Self {
+            config,
+            suite,
+            grant: without_lists(grant),
+            key,
+            message_key,
+            seq: 0,
+            batch: Batch::default(),
+            unsigned: Vec::new(),
+            history: VecDeque::new(),
+            history_bytes: 0,
+            progress: Arc::new(progress),
+        })
+    }
+
+    /// Seals what follows in a new epoch; what waits for a signature leaves first. False, and nothing happens, unless
+    /// the epoch is later than the present one and of the same suite.
+    #[must_use]
+    pub fn rekey(&mut self, grant: &TopicGrant, emit: impl FnMut(Packet)) -> bool {
+        if grant.epoch <= self.grant.epoch || grant.suite != self.grant.suite {
+            return false;
+        }
+        let Some(key) = SourceKey::derive(grant, &self.config.name, &self.config.id) else { return false };
+        self.flush(emit);
+        self.key = key;
+        self.grant = without_lists(grant);
+        self.progress.epoch_start.store(self.seq, Release);
+        true
+    }
+
+    /// Seals one message and hands its packets to `emit` in order.
+    ///
+    /// With `more` the caller says that it publishes again at once, or calls [`Self::flush`]: packets may then wait for
+    /// those that follow, and share a signature with them. Without it nothing waits.
+    pub fn publish(
+        &mut self,
+        head: &MessageHead,
+        payload: Bytes,
+        more: bool,
+        mut emit: impl FnMut(Packet),
+    ) -> Result<(), PublishError> {
+        let result = self.seal_message(head, payload, &mut emit);
+        if !more {
+            self.flush(emit);
+        }
+        result
+    }
+
+    /// Signs and hands over what waits for a signature.
+    pub fn flush(&mut self, mut emit: impl FnMut(Packet)) {
+        if self.batch.is_empty() {
+            return;
+        }
+        let signed = self.batch.sign(&self.message_key);
+        for (index, (header, mut payload)) in self.unsigned.drain(..).enumerate() {
+            signed.put_trailer(index, &mut payload);
+            emit(Packet { header, payload: Bytes::from(payload).into() });
+        }
+    }
+
+    /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the mark that
+    /// they were sent. What was published before leaves before.
+    pub fn replay(&mut self, sink: SinkId, from: u64, to: u64, mut emit: impl FnMut(Packet)) {
+        self.flush(&mut emit);
+        let Some(key) = SourceKey::derive_addressed(&self.grant, &self.config.name, &self.config.id, &sink)
+        else {
+            return;
+        };
+        // Clones of references, so that the history can be read while packets are put aside for signing.
+        let asked: Vec<_> = self
+            .history
+            .iter()
+            .filter(|m| (from..=to).contains(&m.seq))
+            .map(|m| (m.seq, m.head, m.payload.clone()))
+            .collect();
+        for (seq, head, payload) in asked {
+            self.seal_fragments(Some(&key), seq, &head, &payload, &mut emit);
+        }
+        let head = MessageHead { kind: MessageKind::Synced, source_timestamp_ns: 0 };
+        self.seal_fragments(Some(&key), 0, &head, &[], &mut emit);
+        self.flush(emit);
     }
 
     /// Its id.
@@ -66,86 +236,106 @@ impl Source {
         self.seq
     }
 
-    /// Seals one message and hands its packets to `emit` in order.
-    pub fn publish(
+    /// The epoch that it seals in.
+    pub fn epoch(&self) -> u32 {
+        self.grant.epoch
+    }
+
+    /// Messages published since the present epoch began; many ask for a new one.
+    pub fn published_in_epoch(&self) -> u64 {
+        self.progress.published_in_epoch()
+    }
+
+    /// The source with its present floors, for the owner to vouch for.
+    pub fn announce(&self) -> SourceAnnounce {
+        self.progress.announce()
+    }
+
+    /// The same, to be read while another thread publishes.
+    pub fn progress(&self) -> Arc<SourceProgress> {
+        self.progress.clone()
+    }
+
+    fn seal_message(
         &mut self,
         head: &MessageHead,
-        payload: &[u8],
-        mut emit: impl FnMut(Packet),
+        payload: Bytes,
+        emit: &mut impl FnMut(Packet),
     ) -> Result<(), PublishError> {
-        let total = u32::try_from(payload.len())
-            .ok()
-            .filter(|n| *n <= MESSAGE_BYTES_MAX)
-            .ok_or(PublishError::TooLarge { bytes: payload.len() })?;
+        if payload.len() > MESSAGE_BYTES_MAX as usize {
+            return Err(PublishError::TooLarge { bytes: payload.len() });
+        }
+        if self.seq >= SOURCE_MESSAGES_MAX {
+            return Err(PublishError::Exhausted);
+        }
         self.seq += 1;
-        let mut kept = Vec::new();
-        let keep = self.config.history_depth > 0;
-        for index in 0..total.div_ceil(FRAGMENT_BYTES.into()).max(1) as u16 {
-            let packet = self.seal(self.seq, total, index, head, payload);
-            if keep {
-                kept.push(packet.clone());
-            }
-            emit(packet);
+        self.seal_fragments(None, self.seq, head, &payload, emit);
+        if self.config.history_depth > 0 {
+            self.keep(Kept { seq: self.seq, head: *head, payload });
         }
-        if keep {
-            self.keep(kept);
-        }
+        // What is announced as past can be asked for by now, so the order matters.
+        self.progress.next.store(self.seq + 1, Release);
+        let oldest = self.history.front().map_or(self.seq + 1, |m| m.seq);
+        self.progress.oldest.store(oldest, Release);
         Ok(())
     }
 
-    /// Hands the kept messages `from..=to` to `emit`, addressed to one sink, and then the mark that they were
-    /// sent.
-    pub fn replay(&self, sink: SinkId, from: u64, to: u64, mut emit: impl FnMut(Packet)) {
-        let addressed = |packet: &Packet| {
-            let mut packet = packet.clone();
-            packet.header.to = Some(sink);
-            packet
-        };
-        for message in &self.history {
-            if message.first().is_some_and(|p| (from..=to).contains(&p.header.seq)) {
-                message.iter().for_each(|p| emit(addressed(p)));
+    /// Seals a message under the key for all, or the one for a sink.
+    fn seal_fragments(
+        &mut self,
+        addressed: Option<&SourceKey>,
+        seq: u64,
+        head: &MessageHead,
+        payload: &[u8],
+        emit: &mut impl FnMut(Packet),
+    ) {
+        let fragments = payload.len().div_ceil(FRAGMENT_BYTES.into()).max(1);
+        for index in 0..fragments {
+            let key = addressed.unwrap_or(&self.key);
+            let header = PacketHeader {
+                reliable: self.config.reliable,
+                class: self.config.class,
+                hops: HOP_LIMIT,
+                suite: self.suite.id(),
+                epoch: key.epoch(),
+                name: self.config.name,
+                source: self.config.id,
+                seq,
+                total: payload.len() as u32,
+                index: index as u16,
+                grid: FRAGMENT_BYTES,
+                to: key.to(),
+            };
+            let start = index * usize::from(FRAGMENT_BYTES);
+            let sealed = key.seal(&header, head, &payload[start..start + header.fragment_bytes()]);
+            if !self.suite.is_signed() {
+                emit(Packet { header, payload: Bytes::from(sealed).into() });
+                continue;
+            }
+            self.batch.push(&header, &sealed);
+            self.unsigned.push((header, sealed));
+            if self.batch.is_full() {
+                self.flush(&mut *emit);
             }
         }
-        let head = MessageHead { kind: MessageKind::Synced, source_timestamp_ns: 0 };
-        emit(addressed(&self.seal(0, 0, 0, &head, &[])));
     }
 
-    fn seal(&self, seq: u64, total: u32, index: u16, head: &MessageHead, payload: &[u8]) -> Packet {
-        let header = PacketHeader {
-            reliable: self.config.reliable,
-            class: self.config.class,
-            hops: HOP_LIMIT,
-            suite: self.key.suite().id(),
-            epoch: self.key.epoch(),
-            name: self.config.name,
-            source: self.config.id,
-            seq,
-            total,
-            index,
-            grid: FRAGMENT_BYTES,
-            to: None,
-        };
-        let start = usize::from(index) * usize::from(FRAGMENT_BYTES);
-        let fragment = &payload[start..start + header.fragment_bytes()];
-        let mut sealed = Vec::with_capacity(fragment.len() + MESSAGE_HEAD_BYTES + TAG_BYTES);
-        self.key.seal(&header, head, fragment, &mut sealed);
-        Packet { header, payload: Bytes::from(sealed).into() }
-    }
-
-    fn keep(&mut self, message: Vec<Packet>) {
-        self.history_bytes += message_bytes(&message);
+    fn keep(&mut self, message: Kept) {
+        self.history_bytes += message.bytes();
         self.history.push_back(message);
         let over = |s: &Self| {
             s.history.len() > s.config.history_depth || s.history_bytes > s.config.history_bytes_max
         };
         while over(self) && self.history.len() > 1 {
             if let Some(old) = self.history.pop_front() {
-                self.history_bytes -= message_bytes(&old);
+                self.history_bytes -= old.bytes();
             }
         }
     }
 }
 
-fn message_bytes(message: &[Packet]) -> usize {
-    message.iter().map(Packet::encoded_bytes).sum()
+/// What keys are derived from.
+pub(crate) fn without_lists(grant: &TopicGrant) -> TopicGrant {
+    let TopicGrant { epoch, suite, key, .. } = grant;
+    TopicGrant { epoch: *epoch, suite: *suite, key: key.clone(), sources: Vec::new(), entry: None }
 }

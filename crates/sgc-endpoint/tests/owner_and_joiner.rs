@@ -6,6 +6,7 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
     Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason, Output, ShareError, ShareSpec,
+    Wish,
 };
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
@@ -28,7 +29,7 @@ struct Bench {
 impl Bench {
     fn new(name: &str, limits: Limits) -> Self {
         let (clock, identity) = (Clock::default(), identity(&Member::new(name)));
-        let config = EndpointConfig { identity: identity.clone(), limits };
+        let config = EndpointConfig { identity: identity.clone(), authority: false, limits };
         let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(1), clock.now());
         let (sent, events, dropped) = (Vec::new(), Vec::new(), Vec::new());
         let mut bench = Self { endpoint, clock, identity, sent, events, dropped, timeout: None };
@@ -113,7 +114,7 @@ fn owner() -> Bench {
 }
 
 fn join(bench: &Bench, who: &Identity, name: Name, sink: u8) -> (Control, ReplyKey) {
-    let reply_key = ReplyKey::generate();
+    let reply_key = ReplyKey::generate(sgc_trust::Kem::default());
     let body = JoinBody {
         name,
         sink: SinkId([sink; 16]),
@@ -247,7 +248,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let metadata = Metadata::topic("arm-1", "/a", "p/msg/T");
     let blind = sgc_trust::TopicSecret::derive(secret, &metadata).blind();
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, arm.node_id());
+    bench.endpoint.join(bench.clock.now(), name, arm.node_id(), Wish::Subscribe { describe: false });
     bench.drain();
     assert!(matches!(&bench.sent[..], [Control::Interest { names }] if *names == [name]), "{:?}", bench.sent);
     let body = AdvertBody {
@@ -330,7 +331,7 @@ fn a_name_of_another_owner_than_expected_is_not_asked_for() {
     let (arm, other) = (identity(&Member::new("arm-1")), identity(&Member::new("mallory")));
     let blind = sgc_wire::Blind([5; 32]);
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, other.node_id());
+    bench.endpoint.join(bench.clock.now(), name, other.node_id(), Wish::Subscribe { describe: false });
     bench.drain();
     let body = AdvertBody {
         chain: arm.chain_bytes(),

@@ -214,9 +214,9 @@ async fn carry_out(
         }
         AdminRequest::Crl(der) => {
             let (reply, done) = oneshot::channel();
-            events.send(CoreEvent::Crl { der, reply }).await.map_err(|_| stopping())?;
-            let said = done.await.map_err(|_| stopping())??;
-            serde_json::to_string(&said).map_err(|error| error.to_string())
+            events.send(CoreEvent::Crl { der: der.into(), reply }).await.map_err(|_| stopping())?;
+            let is_news = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
+            Ok(serde_json::json!({ "news": is_news }).to_string())
         }
     }
 }

@@ -3,24 +3,33 @@
 //! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
 //! happens in tasks and threads of its own.
 
+mod publish;
+mod trust;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Arc, Mutex};
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
-use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig};
+use rustls_pki_types::CertificateDer;
+use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
 use sgc_ros::{
     Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
     UseRule,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, Output as RouterOutput, Router};
-use sgc_transport::{AnyLink, CloseReason, Link};
-use sgc_trust::Identity;
-use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
+use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
+use sgc_trust::{AnchorError, CrlError, Identity, MessageKey, Suite};
+use sgc_wire::{
+    Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, Role, SinkId, SourceId, UnixMillis,
+};
+use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
+use crate::core::publish::Publishing;
+use crate::credentials::Keeper;
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
 use crate::outflow::OutFlow;
@@ -41,6 +50,8 @@ const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 64 << 20;
 /// Messages of history kept where the publisher keeps all.
 const HISTORY_KEEP_ALL_MAX: usize = 4096;
+/// How long packets of past epochs may be under way.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// What happens to the control task.
 pub(crate) enum CoreEvent {
@@ -100,15 +111,24 @@ pub(crate) enum CoreEvent {
         shares: Vec<ShareRule>,
         /// What is brought here.
         uses: Vec<UseRule>,
+        /// CAs to be trusted from now on besides those that are.
+        certificates: Vec<CertificateDer<'static>>,
         /// Told when it is done.
-        reply: oneshot::Sender<()>,
+        reply: oneshot::Sender<Result<(), AnchorError>>,
     },
-    /// A user brings a revocation list; answered with what came of it.
+    /// The authority's answer to a member is ready.
+    RenewalReady {
+        /// Whom to answer.
+        sink: SinkId,
+        /// What.
+        answer: Result<Credentials, RefuseReason>,
+    },
+    /// The user brings a revocation list; answered with whether it is news.
     Crl {
-        /// The list.
-        der: Vec<u8>,
-        /// Told what came of it.
-        reply: oneshot::Sender<Result<String, String>>,
+        /// The list, DER.
+        der: bytes::Bytes,
+        /// Where to answer.
+        reply: oneshot::Sender<Result<bool, CrlError>>,
     },
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
@@ -141,6 +161,20 @@ pub(crate) struct Core<N: RosNetwork> {
     sinks: HashMap<Name, Arc<LocalSink>>,
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     history_due: BTreeMap<(Name, SourceId), Instant>,
+    /// When the keys of past epochs of a joined name are dropped.
+    retire_due: BTreeMap<Name, Instant>,
+    /// What the messages of this node are signed with, by suite.
+    message_keys: BTreeMap<Suite, MessageKey>,
+    publishing: BTreeMap<Name, Publishing>,
+    /// Messages of one source under one key.
+    epoch_messages_max: u64,
+    credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    authority: Option<PathBuf>,
+    keeper: Keeper,
+    /// When to ask for another certificate.
+    renew_due: Option<Instant>,
+    redial: watch::Sender<()>,
     replays: Arc<Semaphore>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
@@ -157,6 +191,16 @@ pub(crate) struct Core<N: RosNetwork> {
 pub(crate) struct CoreParts<N> {
     /// This node.
     pub identity: Arc<Identity>,
+    /// What links are made with.
+    pub credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    pub authority: Option<PathBuf>,
+    /// Messages of one source under one key.
+    pub epoch_messages_max: u64,
+    /// Writes what outlives the process.
+    pub(crate) keeper: Keeper,
+    /// Tells the dialling tasks that there is another certificate.
+    pub redial: watch::Sender<()>,
     /// The routing machine.
     pub router: Router,
     /// The endpoint machine.
@@ -200,6 +244,15 @@ impl<N: RosNetwork> Core<N> {
             sinks: HashMap::new(),
             writers: HashMap::new(),
             history_due: BTreeMap::new(),
+            retire_due: BTreeMap::new(),
+            message_keys: BTreeMap::new(),
+            publishing: BTreeMap::new(),
+            epoch_messages_max: parts.epoch_messages_max,
+            credentials: parts.credentials,
+            authority: parts.authority,
+            keeper: parts.keeper,
+            renew_due: None,
+            redial: parts.redial,
             replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
             requests,
             control_drops: Drops::default(),
@@ -221,6 +274,7 @@ impl<N: RosNetwork> Core<N> {
         mut requested: mpsc::Receiver<SinkRequest>,
     ) {
         let mut batch = Vec::with_capacity(BATCH_MAX);
+        self.ask_renewal();
         let mut deadline = self.drain();
         loop {
             let timer = async {
@@ -256,15 +310,15 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkUp { link, url, control, reply } => {
                 let id = LinkId(self.next_link);
                 self.next_link += 1;
-                let node = link.peer().node_id;
+                let neighbour = Neighbour::from(link.peer());
                 let remote = link.remote();
-                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&node).remote(remote);
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
-                self.router.handle_link_up(id, node);
+                self.router.handle_link_up(now(), id, neighbour);
             }
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(id);
@@ -298,16 +352,21 @@ impl<N: RosNetwork> Core<N> {
                     (_, None) => {}
                 }
             }
-            CoreEvent::Reload { shares, uses, reply } => {
-                if let Some(routes) = &mut self.routes {
-                    routes.reconfigure(Instant::now(), shares, uses);
-                }
-                self.drain();
-                let _ = reply.send(());
+            CoreEvent::Reload { shares, uses, certificates, reply } => {
+                let _ = reply.send(self.reconfigure(shares, uses, certificates));
             }
+            CoreEvent::RenewalReady { sink, answer } => self.endpoint.answer_renewal(now(), sink, answer),
             CoreEvent::Crl { der, reply } => {
-                debug!(bytes = der.len(), "a revocation list");
-                let _ = reply.send(Err("revocation lists are not taken by this version".to_owned()));
+                let taken = self.router.add_crl(now(), &der);
+                let record = AuditRecord::new(AuditEvent::Crl).by("a user");
+                self.audit.write(match &taken {
+                    Ok(true) => record,
+                    Ok(false) => record.reason("known already"),
+                    Err(why) => record.reason(format!("refused: {why}")),
+                });
+                let _ = reply.send(taken);
+                // Whoever brings a list may have changed the fleet's file.
+                self.answer_renewals();
             }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
@@ -347,6 +406,22 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
         }
+        if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
+            self.ask_renewal();
+        }
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
+        self.rekey_due(now);
+        let over: Vec<_> =
+            self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
+        for name in over {
+            self.retire_due.remove(&name);
+            if let Some(sink) = self.sinks.get(&name) {
+                sink.retire_epochs();
+            }
+        }
     }
 
     /// Carries out everything the machines want until they want nothing more; returns when to look again.
@@ -375,7 +450,10 @@ impl<N: RosNetwork> Core<N> {
             if !progressed {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
-                return [router, endpoint, routes, history].into_iter().flatten().min();
+                let retire = self.retire_due.values().min().copied();
+                let rekey = self.rekey_deadline();
+                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due];
+                return all.into_iter().flatten().min();
             }
         }
     }
@@ -406,11 +484,30 @@ impl<N: RosNetwork> Core<N> {
                         entry.link.close(CloseReason::Replaced);
                     }
                     LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
+                    LinkClose::Revoked => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate is revoked; its link is closed");
+                        entry.link.close(CloseReason::Revoked);
+                    }
+                    LinkClose::Expired => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
+                        entry.link.close(CloseReason::Expired);
+                    }
+                    LinkClose::TooMany | LinkClose::Forgeries => {
+                        warn!(%link, remote = %entry.link.remote(), peer = %entry.link.peer().node_id.short(), "{reason}; its link is closed");
+                        entry.link.close(CloseReason::Denied(reason.to_string()));
+                    }
                     LinkClose::Greeting | LinkClose::Loop => {
                         warn!(%link, remote = %entry.link.remote(), "{reason}");
                         entry.link.close(CloseReason::Protocol(reason.to_string()));
                     }
                 }
+            }
+            RouterOutput::Trust(anchors) => {
+                let lists = anchors.crls().count();
+                let record =
+                    AuditRecord::new(AuditEvent::Crl).reason(format!("in force, {lists} lists in all"));
+                self.audit.write(record);
+                self.set_anchors(anchors);
             }
             RouterOutput::Dropped(dropped) => {
                 let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
@@ -443,15 +540,62 @@ impl<N: RosNetwork> Core<N> {
 
     fn endpoint_event(&mut self, now: Now, event: Event) {
         self.audit_event(&event);
+        match event {
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name) {
+                    share.replay(recover, &self.replays);
+                }
+            }
+            Event::Granted { name, sink, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
+                if self.publishing_granted(now, name, &grant) {
+                    debug!(name = %name.short(), "publishing under it");
+                } else if let Some(local) = self.sinks.get(&name) {
+                    local.grant(sink, grant, &self.data);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                }
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_granted(&name, entry);
+                }
+                self.ask_histories(name);
+            }
+            event => self.route_event(now, event),
+        }
+    }
+
+    /// What concerns the routes alone.
+    fn route_event(&mut self, now: Now, event: Event) {
         let Some(routes) = &mut self.routes else { return };
         match event {
-            Event::SinkJoined { name, sink, peer } => {
+            Event::SinkJoined { name, sink, peer, role } => {
                 info!(peer = %peer.short(), "granted a subscriber");
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
-                routes.handle_sink_joined(&name, sink);
+                if role == Role::Subscribe {
+                    routes.handle_sink_joined(&name, sink);
+                }
             }
-            Event::SinkLeft { name, sink } => {
-                debug!(name = %name.short(), "a subscriber is gone");
+            Event::SinkLeft { name, sink, peer } => {
+                debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
+                routes.handle_sink_left(now.instant, &name, &sink);
+            }
+            Event::SinkCut { name, sink, peer, reason } => {
+                info!(peer = %peer.short(), %reason, "took a grant back; a new epoch begins");
+                debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 routes.handle_sink_left(now.instant, &name, &sink);
             }
             Event::SinkRefused { name, peer, reason } => {
@@ -459,20 +603,6 @@ impl<N: RosNetwork> Core<N> {
                 if self.control_drops.count_from("join_refused", peer.short()) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
-            }
-            Event::Recover(recover) => {
-                if let Some(share) = self.shares.get(&recover.name) {
-                    share.replay(recover, &self.replays);
-                }
-            }
-            Event::Granted { name, grant } => {
-                debug!(name = %name.short(), "granted");
-                let entry = grant.entry.as_deref().cloned();
-                if let Some(sink) = self.sinks.get(&name) {
-                    sink.grant(grant);
-                }
-                routes.handle_granted(&name, entry);
-                self.ask_histories(name);
             }
             Event::Refused { name, by } => {
                 warn!(reason = %by, "a topic is refused to this node; asking again later");
@@ -495,7 +625,33 @@ impl<N: RosNetwork> Core<N> {
                 warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
                 routes.handle_owner_refused(owner, by);
             }
+            Event::RenewAsked { .. }
+            | Event::Renewed { .. }
+            | Event::RenewRefused { .. }
+            | Event::Rekeyed { .. }
+            | Event::OwnGrant { .. }
+            | Event::Recover(_)
+            | Event::Granted { .. } => {}
         }
+    }
+
+    /// What the user wants from now on; nothing of it if the CAs cannot be trusted.
+    fn reconfigure(
+        &mut self,
+        shares: Vec<ShareRule>,
+        uses: Vec<UseRule>,
+        certificates: Vec<CertificateDer<'static>>,
+    ) -> Result<(), AnchorError> {
+        if !certificates.is_empty() {
+            let anchors = Arc::new(self.credentials.anchors().with_anchors(certificates)?);
+            self.router.set_anchors(anchors.clone());
+            self.set_anchors(anchors);
+        }
+        if let Some(routes) = &mut self.routes {
+            routes.reconfigure(Instant::now(), shares, uses);
+        }
+        self.drain();
+        Ok(())
     }
 
     /// Keeps what concerns who gets what of this node.
@@ -509,7 +665,16 @@ impl<N: RosNetwork> Core<N> {
                 let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
                 self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
             }
-            Event::SinkLeft { name, .. } => self.audit.write(about(AuditEvent::Left, name)),
+            Event::SinkLeft { name, peer, .. } => self.audit.write(about(AuditEvent::Left, name).peer(peer)),
+            Event::SinkCut { name, peer, reason, .. } => {
+                self.audit.write(about(AuditEvent::Cut, name).peer(peer).reason(reason));
+            }
+            Event::Rekeyed { name, grant } => {
+                self.audit.write(about(AuditEvent::Epoch, name).epoch(grant.epoch));
+            }
+            Event::Renewed { .. } => {
+                self.audit.write(AuditRecord::new(AuditEvent::Renewed).by("the fleet's authority"));
+            }
             Event::SinkRefused { name, peer, reason } => {
                 self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
             }
@@ -525,7 +690,12 @@ impl<N: RosNetwork> Core<N> {
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
                         debug!(%topic, %name, "shared");
-                        let share = LocalShare::new(name, self.data.clone(), self.alive.clone());
+                        let share = LocalShare::new(
+                            name,
+                            self.data.clone(),
+                            self.alive.clone(),
+                            self.epoch_messages_max,
+                        );
                         self.shares.insert(name, Arc::new(share));
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
@@ -538,6 +708,9 @@ impl<N: RosNetwork> Core<N> {
                 self.endpoint.unshare(now, &name);
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();
+                }
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
                 }
             }
             Command::MapSources { name, qos, class, own } => self.map_sources(name, &qos, class, own),
@@ -552,18 +725,22 @@ impl<N: RosNetwork> Core<N> {
                 self.endpoint.follow(now, &owner_name);
             }
             Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
-            // What `describe` asks for is in the join's request.
-            Command::Join { name, owner, transient_local, describe: _ } => {
+            Command::Join { name, owner, transient_local, describe } => {
                 let sink = LocalSink::new(name, transient_local, self.requests.clone());
                 self.sinks.insert(name, Arc::new(sink));
-                self.endpoint.join(now, name, owner);
+                self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
+            }
+            Command::Publish { name, owner, suite, class, reliable } => {
+                self.publish_under(name, owner, suite, class, reliable);
             }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
+                self.stop_publishing(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
                     sink.close();
                 }
                 self.history_due.retain(|(n, _), _| *n != name);
+                self.retire_due.remove(&name);
             }
             Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
             Command::CloseWriter { name, source } => {
@@ -580,10 +757,11 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn map_sources(&mut self, name: Name, qos: &Qos, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
-        let (Some(share), Some(grant)) = (self.shares.get(&name), self.endpoint.share_grant(&name).cloned())
+        let (Some(share), Some(grant)) = (self.shares.get(&name).cloned(), self.endpoint.share_grant(&name))
         else {
             return;
         };
+        let Some(message_key) = self.message_key(grant.suite) else { return };
         let old = share.map();
         let slot = |id, qos: &Qos, keeps_history: bool| {
             let depth = match qos.history {
@@ -599,8 +777,8 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
             };
-            let source = Arc::new(Mutex::new(Source::new(config, &grant)?));
-            Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
+            let source = Source::new(config, &grant, message_key.clone())?;
+            Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
         let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
@@ -612,7 +790,14 @@ impl<N: RosNetwork> Core<N> {
         }
         let kept = old.shared.clone().filter(|s| s.reliable == qos.is_reliable());
         map.shared = kept.or_else(|| slot(self.endpoint.new_source_id(), qos, false));
+        self.endpoint.set_sources(now(), &name, map.slots().map(|s| s.progress.clone()).collect());
         share.set_map(map);
+    }
+
+    /// The key that messages are signed with in this suite: one for the whole node, made when it is needed first.
+    fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
+        let suite = Suite::from_id(suite)?;
+        Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
     }
 
     fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
@@ -751,6 +936,7 @@ impl<N: RosNetwork> Core<N> {
                 peer: entry.link.peer().node_id.to_string(),
                 remote: entry.link.remote().to_string(),
                 url: entry.url.clone(),
+                kex: stats.key_exchange.label(),
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,

@@ -7,9 +7,12 @@
 
 pub mod admin;
 pub mod audit;
+mod authority;
 pub mod config;
 mod core;
+mod credentials;
 mod dataplane;
+mod fleet_file;
 mod links;
 mod node;
 mod outflow;
@@ -24,6 +27,7 @@ mod state;
 mod stats;
 mod status;
 
+pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };

@@ -9,7 +9,8 @@ use rand_core::{OsRng, TryRngCore};
 use sgc_router::LinkId;
 use sgc_transport::{AnyLink, CloseReason, Dialer, FlowError, Link, LinkError, LinkUrl, Listener};
 use sgc_wire::{Control, Decode, Encode};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
 use crate::core::CoreEvent;
@@ -20,6 +21,13 @@ use crate::stats::DataDrop;
 const CONTROL_FRAMES_MAX: usize = 8192;
 const BACKOFF_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MAX: Duration = Duration::from_secs(10);
+/// How long a link that replaces another may take until the other goes.
+const SETTLE_MAX: Duration = Duration::from_secs(5);
+/// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
+const QUIET_MIN: Duration = Duration::from_millis(100);
+const QUIET_RTTS: u32 = 4;
+/// How long it may take to answer a goodbye.
+const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
 /// Sends frames of the control task over a link, in order.
 pub(crate) struct ControlTx {
@@ -34,13 +42,23 @@ impl ControlTx {
 }
 
 /// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
-pub(crate) async fn keep_dialled(url: LinkUrl, dialer: Arc<Dialer>, core: mpsc::Sender<CoreEvent>) {
+///
+/// Each change of `redial` says that the credentials changed: a second link is made with what they are by then, and
+/// the first one taken down only when both sides have told each other what they know on the second. As long as that fails, the first stays.
+pub(crate) async fn keep_dialled(
+    url: LinkUrl,
+    dialer: Arc<Dialer>,
+    core: mpsc::Sender<CoreEvent>,
+    mut redial: watch::Receiver<()>,
+) {
     let mut failures = 0u32;
     loop {
+        // What changes from here on may come too late for this attempt.
+        redial.mark_unchanged();
         match dialer.dial(&url).await {
             Ok(link) => {
                 failures = 0;
-                let end = serve(link, Some(url.to_string()), &core).await;
+                let end = keep_renewed(link, &url, &dialer, &core, &mut redial).await;
                 info!(%url, "link ended: {end}");
             }
             Err(error) => {
@@ -56,9 +74,69 @@ pub(crate) async fn keep_dialled(url: LinkUrl, dialer: Arc<Dialer>, core: mpsc::
         if core.is_closed() {
             return;
         }
-        let wait = (BACKOFF_MIN * 2u32.saturating_pow(failures.saturating_sub(1).min(10))).min(BACKOFF_MAX);
-        let jitter = f64::from(OsRng.try_next_u32().unwrap_or(0) % 1000) / 1000.0;
-        tokio::time::sleep(wait.mul_f64(0.5 + jitter / 2.0)).await;
+        tokio::time::sleep(backoff(failures)).await;
+    }
+}
+
+/// How long to wait after so many failures in a row.
+fn backoff(failures: u32) -> Duration {
+    let wait = (BACKOFF_MIN * 2u32.saturating_pow(failures.saturating_sub(1).min(10))).min(BACKOFF_MAX);
+    let jitter = f64::from(OsRng.try_next_u32().unwrap_or(0) % 1000) / 1000.0;
+    wait.mul_f64(0.5 + jitter / 2.0)
+}
+
+/// Serves a link, and in its place each one that is made on request; returns when the last of them has ended.
+async fn keep_renewed(
+    link: AnyLink,
+    url: &LinkUrl,
+    dialer: &Dialer,
+    core: &mpsc::Sender<CoreEvent>,
+    redial: &mut watch::Receiver<()>,
+) -> LinkError {
+    let mut current = Served::start(link, Some(url.to_string()), core).await;
+    let mut failures = None;
+    loop {
+        let next = async {
+            match failures {
+                None => {
+                    if redial.changed().await.is_err() {
+                        std::future::pending::<()>().await;
+                    }
+                }
+                Some(failures) => tokio::time::sleep(backoff(failures)).await,
+            }
+            redial.mark_unchanged();
+            dialer.dial(url).await
+        };
+        tokio::select! {
+            end = current.end(core) => return end,
+            dialled = next => match dialled {
+                Ok(link) => {
+                    let next = Served::start(link, Some(url.to_string()), core).await;
+                    tokio::select! {
+                        () = next.settled() => {
+                            failures = None;
+                            let old = std::mem::replace(&mut current, next);
+                            tokio::spawn(old.retire(core.clone()));
+                        }
+                        end = next.end(core) => {
+                            warn!("the link with the new credentials ended: {end}; the old one stays and it is tried again");
+                            failures = Some(failures.unwrap_or(0).saturating_add(1));
+                        }
+                        end = current.end(core) => {
+                            info!(%url, "link ended: {end}");
+                            (current, failures) = (next, None);
+                        }
+                    }
+                }
+                Err(error) => {
+                    if failures.is_none() {
+                        warn!("cannot connect with the new credentials: {error}; the old link stays and it is tried again");
+                    }
+                    failures = Some(failures.unwrap_or(0).saturating_add(1));
+                }
+            }
+        }
     }
 }
 
@@ -78,7 +156,7 @@ pub(crate) async fn keep_accepting(
                 let core = core.clone();
                 tokio::spawn(async move {
                     let remote = link.remote();
-                    let end = serve(link, None, &core).await;
+                    let end = Served::start(link, None, &core).await.end(&core).await;
                     info!(%remote, "link ended: {end}");
                 });
             }
@@ -88,27 +166,75 @@ pub(crate) async fn keep_accepting(
     }
 }
 
-/// Reports a link to the control task and waits for its end.
-async fn serve(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> LinkError {
-    let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
-    let (reply, id) = oneshot::channel();
-    let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
-    let id = match (core.send(up).await, id.await) {
-        (Ok(()), Ok(Some((id, data)))) => {
-            info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
-            spawn_tasks(&link, id, data, outgoing, core);
-            Some(id)
-        }
-        _ => {
-            link.close(CloseReason::Goodbye);
-            None
-        }
-    };
-    let end = link.closed().await;
-    if let Some(id) = id {
-        let _ = core.send(CoreEvent::LinkDown { id }).await;
+/// A link that was reported to the control task.
+struct Served {
+    link: AnyLink,
+    /// Nothing if the node is stopping.
+    id: Option<LinkId>,
+    /// How many control frames came.
+    heard: watch::Receiver<u64>,
+}
+
+impl Served {
+    /// Reports it and starts to move what comes in.
+    async fn start(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> Self {
+        let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
+        let (reply, id) = oneshot::channel();
+        let (count, heard) = watch::channel(0);
+        let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
+        let id = match (core.send(up).await, id.await) {
+            (Ok(()), Ok(Some((id, data)))) => {
+                info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
+                spawn_tasks(&link, id, data, outgoing, count, core);
+                Some(id)
+            }
+            _ => {
+                link.close(CloseReason::Goodbye);
+                None
+            }
+        };
+        Self { link, id, heard }
     }
-    end
+
+    /// Waits for its end and reports that. Dropping the future loses nothing: it is to be called again.
+    async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
+        let end = self.link.closed().await;
+        if let Some(id) = self.id {
+            let _ = core.send(CoreEvent::LinkDown { id }).await;
+        }
+        end
+    }
+
+    /// Waits until both sides have told each other what they know. No frame says so: routes follow the greetings and
+    /// what they call for follows the routes, each within a round trip, so a few of those in silence have to do.
+    /// Never ready on a link that has ended; one on which nothing is said is ended here.
+    async fn settled(&self) {
+        let mut heard = self.heard.clone();
+        let deadline = Instant::now() + SETTLE_MAX;
+        if timeout_at(deadline, heard.wait_for(|frames| *frames > 0)).await.is_err() {
+            self.link.close(CloseReason::Protocol("no control frame came".into()));
+        }
+        while heard.has_changed().is_ok() {
+            let quiet = QUIET_MIN.max(QUIET_RTTS * self.link.stats().rtt);
+            heard.mark_unchanged();
+            if timeout_at(deadline.min(Instant::now() + quiet), heard.changed()).await.is_err() {
+                return;
+            }
+        }
+        std::future::pending().await
+    }
+
+    /// Takes it down. The goodbye makes the peer close it, and so tells that it has got everything before.
+    async fn retire(self, core: mpsc::Sender<CoreEvent>) {
+        let goodbye = async {
+            let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
+            self.link.closed().await
+        };
+        let _ = timeout(GOODBYE_MAX, goodbye).await;
+        self.link.close(CloseReason::Replaced);
+        self.end(&core).await;
+        info!(remote = %self.link.remote(), "a link with newer credentials took the place of this one");
+    }
 }
 
 fn spawn_tasks(
@@ -116,10 +242,11 @@ fn spawn_tasks(
     id: LinkId,
     data: Arc<DataPlane>,
     outgoing: mpsc::Receiver<Control>,
+    count: watch::Sender<u64>,
     core: &mpsc::Sender<CoreEvent>,
 ) {
     tokio::spawn(send_control(link.clone(), outgoing));
-    tokio::spawn(receive_control(link.clone(), id, core.clone()));
+    tokio::spawn(receive_control(link.clone(), id, count, core.clone()));
     tokio::spawn(receive_flows(link.clone(), id, data.clone()));
     tokio::spawn(receive_datagrams(link.clone(), id, data));
 }
@@ -133,13 +260,19 @@ async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
     }
 }
 
-async fn receive_control(link: AnyLink, id: LinkId, core: mpsc::Sender<CoreEvent>) {
+async fn receive_control(
+    link: AnyLink,
+    id: LinkId,
+    count: watch::Sender<u64>,
+    core: mpsc::Sender<CoreEvent>,
+) {
     while let Ok(bytes) = link.recv_control().await {
         match Control::from_slice(&bytes) {
             Ok(frame) => {
                 if core.send(CoreEvent::Frame { link: id, frame }).await.is_err() {
                     return;
                 }
+                count.send_modify(|n| *n += 1);
             }
             Err(error) => {
                 warn!(link = id.0, remote = %link.remote(), %error, "malformed control frame; the link is closed");
@@ -185,5 +318,212 @@ async fn receive_datagrams(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::future::Future;
+    use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+    use rand_core::OsRng;
+    use sgc_transport::{CredentialStore, LinkOptions, RefusalKind, TransportMetrics};
+    use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
+    use sgc_wire::Hello;
+
+    use super::*;
+    use crate::core::now;
+
+    /// What a control task was told, as far as links go.
+    #[derive(Debug, PartialEq)]
+    enum Told {
+        Up(LinkId, CertId),
+        Down(LinkId),
+    }
+
+    /// Greets on each link and closes those whose peers say goodbye, as the machines do.
+    fn control_task(
+        closes: Arc<AtomicBool>,
+        mute: Arc<AtomicBool>,
+        mut close: mpsc::Receiver<LinkId>,
+    ) -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<Told>) {
+        let (events, mut inbox) = mpsc::channel(64);
+        let (tell, told) = mpsc::channel(64);
+        tokio::spawn(async move {
+            let mut links: Vec<(AnyLink, ControlTx)> = Vec::new();
+            loop {
+                let event = tokio::select! {
+                    Some(id) = close.recv() => {
+                        links[id.0 as usize - 1].0.close(CloseReason::Goodbye);
+                        continue;
+                    }
+                    event = inbox.recv() => event,
+                };
+                let Some(event) = event else { return };
+                match event {
+                    CoreEvent::LinkUp { link, control, reply, .. } => {
+                        let id = LinkId(links.len() as u32 + 1);
+                        tell.send(Told::Up(id, link.peer().cert.clone())).await.unwrap();
+                        if !mute.load(Relaxed) {
+                            let hello = Hello { minor: 0, incarnation: 1, transit: true };
+                            assert!(control.send(Control::Hello(hello)));
+                        }
+                        links.push((link, control));
+                        assert!(reply.send(Some((id, Arc::default()))).is_ok());
+                    }
+                    CoreEvent::LinkDown { id } => tell.send(Told::Down(id)).await.unwrap(),
+                    CoreEvent::Frame { link, frame: Control::Hello(_) }
+                        if link.0 > 1 && closes.load(Relaxed) =>
+                    {
+                        links[link.0 as usize - 1].0.close(CloseReason::Overloaded);
+                    }
+                    CoreEvent::Frame { link, frame: Control::Goodbye } => {
+                        links[link.0 as usize - 1].0.close(CloseReason::Goodbye);
+                    }
+                    _ => {}
+                }
+            }
+        });
+        (events, told)
+    }
+
+    async fn soon<T>(future: impl Future<Output = T>) -> T {
+        timeout(Duration::from_secs(30), future).await.expect("it hangs")
+    }
+
+    /// A node that keeps a link to a router, both with control tasks of the test.
+    struct Bench {
+        fleet: Fleet,
+        arm: CredentialStore,
+        router: CredentialStore,
+        redial: watch::Sender<()>,
+        near: mpsc::Receiver<Told>,
+        far: mpsc::Receiver<Told>,
+        doors: Arc<TransportMetrics>,
+        /// Whether the router closes links but the first as soon as it is greeted on them.
+        far_closes: Arc<AtomicBool>,
+        /// Whether nobody greets.
+        mute: Arc<AtomicBool>,
+        close_far: mpsc::Sender<LinkId>,
+        _stop: oneshot::Sender<()>,
+    }
+
+    fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
+        let request = EnrollRequest::new(node.parse().unwrap(), now().unix);
+        Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+            let arm = CredentialStore::new(enroll(&fleet, "arm"));
+            let router = CredentialStore::new(enroll(&fleet, "router"));
+            let addr = "quic://127.0.0.1:0".parse().unwrap();
+            let options = LinkOptions::default();
+            let doors = Arc::<TransportMetrics>::default();
+            let listener = Listener::bind(&addr, router.clone(), options.clone(), doors.clone()).unwrap();
+            let url = listener.local().to_string().parse().unwrap();
+            let (far_closes, mute) = (Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
+            let (close_far, closing) = mpsc::channel(1);
+            let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
+            let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
+            let (stop, stopped) = oneshot::channel();
+            tokio::spawn(keep_accepting(listener, far_core, stopped));
+            let (redial, on_redial) = watch::channel(());
+            let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
+            tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));
+            Self { fleet, arm, router, redial, near, far, doors, far_closes, mute, close_far, _stop: stop }
+        }
+
+        fn cert(store: &CredentialStore) -> CertId {
+            store.identity().as_peer().cert.clone()
+        }
+
+        async fn expect(&mut self, near: Told, far: Told) {
+            assert_eq!(soon(self.near.recv()).await.unwrap(), near);
+            assert_eq!(soon(self.far.recv()).await.unwrap(), far);
+        }
+
+        async fn expect_up(&mut self, id: u32) {
+            let (near, far) = (Self::cert(&self.router), Self::cert(&self.arm));
+            self.expect(Told::Up(LinkId(id), near), Told::Up(LinkId(id), far)).await;
+        }
+    }
+
+    #[tokio::test]
+    async fn a_renewed_certificate_is_shown_on_a_second_link_before_the_first_goes() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        for id in 1..4 {
+            bench.arm.set_identity(enroll(&bench.fleet, "arm"));
+            bench.redial.send_replace(());
+            // Up before down, on both sides.
+            bench.expect_up(id + 1).await;
+            bench.expect(Told::Down(LinkId(id)), Told::Down(LinkId(id))).await;
+        }
+    }
+
+    #[tokio::test]
+    async fn the_old_link_stays_if_the_new_one_does_not_last() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        bench.far_closes.store(true, Relaxed);
+        bench.redial.send_replace(());
+        bench.expect_up(2).await;
+        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.far_closes.store(false, Relaxed);
+        // Each attempt that fails is followed by another.
+        loop {
+            let up = soon(bench.near.recv()).await.unwrap();
+            let Told::Up(id, _) = up else { panic!("{up:?}") };
+            assert!(matches!(soon(bench.far.recv()).await.unwrap(), Told::Up(..)));
+            let down = soon(bench.near.recv()).await.unwrap();
+            soon(bench.far.recv()).await.unwrap();
+            if down != Told::Down(id) {
+                assert_eq!(down, Told::Down(LinkId(1)));
+                return;
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_link_takes_over_at_once_where_the_old_one_ends_meanwhile() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        bench.mute.store(true, Relaxed);
+        bench.redial.send_replace(());
+        bench.expect_up(2).await;
+        // The second has not settled, since nobody greets on it.
+        bench.close_far.send(LinkId(1)).await.unwrap();
+        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        bench.close_far.send(LinkId(2)).await.unwrap();
+        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.expect_up(3).await;
+    }
+
+    #[tokio::test]
+    async fn the_old_link_stays_while_the_new_certificate_is_refused() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        let refused = enroll(&bench.fleet, "arm");
+        let serial = Arc::clone(&refused.as_peer().cert.serial);
+        let list = bench.fleet.revocation_list_of(&[(serial, now().unix)], 1, now().unix).unwrap();
+        let anchors = bench.router.anchors();
+        bench.router.set_anchors(anchors.with_crl(&list, now().unix).unwrap().unwrap());
+        bench.arm.set_identity(refused);
+        bench.redial.send_replace(());
+        let is_refused = async {
+            while bench.doors.refused(RefusalKind::Revoked) == 0 {
+                tokio::task::yield_now().await;
+            }
+        };
+        soon(is_refused).await;
+        assert!(bench.near.is_empty() && bench.far.is_empty());
+        // It is tried again by itself.
+        bench.router.set_anchors(anchors.as_ref().clone());
+        bench.expect_up(2).await;
+        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
     }
 }

@@ -14,9 +14,11 @@ use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosError, RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
-use sgc_transport::{CloseReason, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics};
+use sgc_transport::{
+    CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
+};
 use sgc_trust::{AnchorError, Identity, IdentityError};
-use tokio::sync::{Mutex, Notify, mpsc, oneshot};
+use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
@@ -24,6 +26,7 @@ use crate::admin;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
+use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
 use crate::reload::{ConfigSource, Reloader, Running};
 use crate::rules::{Rules, RulesError};
@@ -221,31 +224,41 @@ pub async fn run_on<N: RosNetwork>(
     let state = state_dir(&config, identity.node_name().as_str())?;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
     rules.warnings.iter().for_each(|warning| warn!("{warning}"));
-    let identity = Arc::new(identity.with_anchors(rules.partners.extend(&identity)?));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
     let transport = Arc::new(TransportMetrics::default());
+    let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
+    let credentials = CredentialStore::new(identity.clone());
+    credentials.set_anchors(anchors.clone());
+    let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, identity.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), link_options.clone(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(identity.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
-        transit: !config.listen.is_empty(),
+        transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
-        anchors: Arc::new(identity.anchors().clone()),
+        anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
     });
-    let endpoint_config =
-        EndpointConfig { identity: identity.clone(), limits: sgc_endpoint::Limits::default() };
+    let endpoint_config = EndpointConfig {
+        identity: identity.clone(),
+        authority: config.authority.is_some(),
+        limits: sgc_endpoint::Limits {
+            rotate_every: config.rotation.every,
+            ..sgc_endpoint::Limits::default()
+        },
+    };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
+    endpoint.set_anchors(now(), Arc::new(anchors));
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let mut followed = std::collections::BTreeSet::new();
@@ -254,15 +267,22 @@ pub async fn run_on<N: RosNetwork>(
                 endpoint.follow(now(), &rule.owner_name);
             }
         }
+        let secret = identity.naming_secrets().first().map_or(secret, |newest| &newest.secret);
         Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
     });
 
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
+    let (redial, on_redial) = watch::channel(());
     let (core, requested) = Core::new(CoreParts {
+        authority: config.authority.clone(),
+        epoch_messages_max: config.rotation.messages,
+        keeper: Keeper::spawn(state.clone(), config.identity.clone(), alive.clone()),
+        redial,
         alive,
         identity: identity.clone(),
+        credentials,
         router,
         endpoint,
         routes,
@@ -283,7 +303,12 @@ pub async fn run_on<N: RosNetwork>(
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
     for url in config.routers.iter().chain(&rules.routers) {
-        tasks.push(tokio::spawn(keep_dialled(url.clone(), dialer.clone(), events.clone())));
+        tasks.push(tokio::spawn(keep_dialled(
+            url.clone(),
+            dialer.clone(),
+            events.clone(),
+            on_redial.clone(),
+        )));
     }
     let mut accepting = Vec::new();
     for listener in listeners {

@@ -7,7 +7,7 @@ use std::io::{self, Read};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use sgc_ros::{ShareRule, UseRule};
+use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_transport::LinkUrl;
 use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{NodeId, UnixMillis};
@@ -104,6 +104,7 @@ impl Rules {
         }
         self.partners.trust(vec![token.ca.clone()]);
         self.uses.push(UseRule {
+            direction: Direction::Bring,
             owner: token.owner,
             owner_name: token.owner_name.to_string(),
             topic,
@@ -129,6 +130,7 @@ pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
 
 fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
     Some(UseRule {
+        direction: Direction::Bring,
         owner: identity.node_id_of(rule.from.as_str())?,
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),

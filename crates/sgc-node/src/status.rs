@@ -43,6 +43,8 @@ pub struct LinkStatus {
     pub remote: String,
     /// The URL dialled, if this node dialled.
     pub url: Option<String>,
+    /// How its keys were agreed on, as TLS names it.
+    pub kex: &'static str,
     /// Smoothed round-trip time, microseconds.
     pub rtt_us: u64,
     /// Bytes sent.

@@ -37,7 +37,7 @@ fn unix_now() -> UnixMillis {
 fn identity(name: &str, router: bool) -> Arc<Identity> {
     let mut request = EnrollRequest::new(name.parse::<NodeName>().unwrap(), unix_now());
     request.router = router;
-    Arc::new(fleet().enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+    Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
 }
 
 /// A node in a runtime of its own.

@@ -8,8 +8,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    Command, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes, SINKLESS_HOLD,
-    ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes,
+    SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -52,6 +52,7 @@ fn share(topic: &str, type_name: &str) -> ShareRule {
 
 fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
     UseRule {
+        direction: Direction::Bring,
         owner,
         owner_name: "owner".into(),
         topic: topic.into(),
@@ -494,4 +495,77 @@ fn what_is_not_as_the_token_says_is_not_brought_here() {
         assert!(matches!(said[..], [Command::Report(Problem::TokenEntry { .. })]), "{said:?}");
         assert!(matches!(b.granted(name, Some(right()))[..], [Command::OpenWriter { .. }]));
     }
+}
+
+fn publish_rule(topic: &str) -> UseRule {
+    UseRule { direction: Direction::Publish, ..use_of(OWNER, topic, None) }
+}
+
+#[test]
+fn a_topic_that_its_owner_lets_us_publish_on_is_read_while_someone_here_writes_it() {
+    let mut b = bench_of(Vec::new(), vec![publish_rule("/cmd")]);
+    let name = theirs("/cmd", STRING);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    let commands = b.catalogue(vec![listed.clone()]);
+    assert!(
+        matches!(commands[..], [Command::Publish { name: n, owner: OWNER, reliable: true, .. }] if n == name)
+    );
+    assert_eq!(b.granted(name, None), [], "nobody here publishes yet");
+    assert!(opens_reader(&b.appears(writer(1, "/cmd", Qos::default()))));
+    assert_eq!(b.appears(writer(2, "/cmd", Qos::default())), []);
+    assert_eq!(b.appears(endpoint(3, EndpointKind::Writer, "/cmd", "p/msg/Other", Qos::default())), []);
+    b.vanishes(1);
+    assert!(matches!(b.vanishes(2)[..], [Command::CloseReader { .. }]));
+    b.appears(writer(4, "/cmd", Qos::default()));
+    // Allowed no longer.
+    let commands = b.catalogue(vec![CatalogueEntry { subscribe: true, publish: false, ..listed }]);
+    assert!(matches!(commands[..], [Command::CloseReader { .. }, Command::Leave { .. }]), "{commands:?}");
+}
+
+#[test]
+fn a_topic_that_may_only_be_published_on_is_not_brought_here() {
+    let mut b = bench(&[], &[("/cmd", None)]);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    assert_eq!(b.catalogue(vec![listed]), []);
+}
+
+#[test]
+fn a_share_that_others_publish_on_is_there_without_a_local_publisher() {
+    let mut publish = Policy::default();
+    publish.publish.nodes.insert(OWNER);
+    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let name = mine("/cmd");
+    let commands = b.commands();
+    assert!(
+        matches!(&commands[0], Command::Share(spec) if spec.metadata.type_name == STRING),
+        "{commands:?}"
+    );
+    assert!(!opens_reader(&commands));
+    b.routes.handle_publishers(&name, true);
+    let commands = b.commands();
+    assert!(matches!(&commands[..], [Command::OpenWriter { source: None, .. }]), "{commands:?}");
+    b.routes.handle_publishers(&name, true);
+    assert_eq!(b.commands(), []);
+    // A publisher here comes and goes; the share stays.
+    b.appears(writer(1, "/cmd", Qos::default()));
+    b.vanishes(1);
+    assert!(!has(&b.passes(WRITERLESS_HOLD * 2), |c| matches!(c, Command::Unshare { .. })));
+    b.routes.handle_publishers(&name, false);
+    assert!(matches!(&b.commands()[..], [Command::CloseWriter { .. }]));
+    // Nobody may any more, and nobody here does.
+    let commands = b.reconfigured(vec![share("/cmd", STRING)], Vec::new());
+    assert!(has(&commands, |c| matches!(c, Command::Unshare { .. })), "{commands:?}");
+}
+
+#[test]
+fn a_running_share_keeps_its_name_when_the_secret_of_names_is_replaced() {
+    let mut b = bench(&[("/a", STRING), ("/b", STRING)], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    b.routes.set_secret(FleetSecret::from_bytes([8; 32]));
+    assert!(!has(&b.appears(writer(2, "/a", Qos::default())), |c| matches!(c, Command::Share(_))));
+    assert!(has(&b.appears(writer(3, "/b", Qos::default())), |c| matches!(c, Command::Share(_))));
+    assert!(b.routes.status().iter().any(|s| s.name == Some(mine("/a"))));
+    assert!(b.routes.status().iter().all(|s| s.name != Some(mine("/b"))));
 }

@@ -13,6 +13,10 @@ mod fib;
 mod links;
 mod rib;
 mod router;
+mod routes;
+mod tree;
+mod trust;
 
 pub use fib::FibEntry;
+pub use links::Neighbour;
 pub use router::{DropReason, Dropped, Limits, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats};

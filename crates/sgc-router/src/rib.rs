@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_trust::VerifiedPeer;
+use sgc_trust::{CertId, VerifiedPeer};
 use sgc_wire::{Name, NodeId, Role, Signed, SinkId};
 use smallvec::SmallVec;
 
@@ -46,6 +46,8 @@ impl Route {
 pub(crate) struct Branch {
     pub(crate) link: LinkId,
     pub(crate) peer: NodeId,
+    /// The certificates of its request.
+    pub(crate) certs: Arc<[CertId]>,
     pub(crate) role: Role,
     /// Until when the owner must answer; `None` once it granted.
     pub(crate) pending: Option<Instant>,
@@ -101,6 +103,11 @@ impl NameState {
     pub(crate) fn remove_route(&mut self, link: LinkId) -> Option<Route> {
         let at = self.routes.iter().position(|r| r.link == link)?;
         Some(self.routes.swap_remove(at))
+    }
+
+    /// All routes, in use or not.
+    pub(crate) fn routes(&self) -> impl Iterator<Item = &Route> {
+        self.routes.iter()
     }
 
     /// All routes' links.

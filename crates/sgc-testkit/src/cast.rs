@@ -1,8 +1,9 @@
 //! Who plays: fleets and identities, made once per process and the same in every process.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
+use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_trust::{EnrollRequest, Fleet, Identity};
@@ -20,12 +21,20 @@ pub struct Member {
     pub groups: Vec<String>,
     /// True for an identity without the fleet secret.
     pub router: bool,
+    /// True for a member that carries others' names.
+    pub may_route: bool,
 }
 
 impl Member {
     /// A member of the fleet that tests use unless they need two, in no group.
     pub fn new(name: &str) -> Self {
-        Self { name: name.to_owned(), fleet: "acme".to_owned(), groups: Vec::new(), router: false }
+        Self {
+            name: name.to_owned(),
+            fleet: "acme".to_owned(),
+            groups: Vec::new(),
+            router: false,
+            may_route: false,
+        }
     }
 }
 
@@ -35,26 +44,46 @@ struct Cast {
     identities: BTreeMap<Member, Arc<Identity>>,
 }
 
+impl Cast {
+    fn fleet(&mut self, name: &str) -> &mut Fleet {
+        self.fleets.entry(name.to_owned()).or_insert_with(|| {
+            let legal = name.parse().expect("tests name fleets legally");
+            Fleet::create(legal, GENESIS, &mut rng(name)).expect("the provider makes a CA")
+        })
+    }
+}
+
+fn cast() -> MutexGuard<'static, Cast> {
+    static CAST: OnceLock<Mutex<Cast>> = OnceLock::new();
+    CAST.get_or_init(Mutex::default).lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// The identity of a member; the same one whenever it is asked for.
 pub fn identity(member: &Member) -> Arc<Identity> {
-    static CAST: OnceLock<Mutex<Cast>> = OnceLock::new();
-    let mut cast = CAST.get_or_init(Mutex::default).lock().unwrap_or_else(PoisonError::into_inner);
+    let mut cast = cast();
     if let Some(identity) = cast.identities.get(member) {
         return identity.clone();
     }
-    let fleet = cast.fleets.entry(member.fleet.clone()).or_insert_with(|| {
-        let name = member.fleet.parse().expect("tests name fleets legally");
-        Fleet::create(name, GENESIS, &mut rng(&member.fleet)).expect("the provider makes a CA")
-    });
     let request = EnrollRequest {
         groups: member.groups.iter().map(|g| g.parse().expect("tests name groups legally")).collect(),
         router: member.router,
+        may_route: member.may_route,
         ..EnrollRequest::new(member.name.parse().expect("tests name nodes legally"), GENESIS)
     };
     let seed = format!("{}/{}", member.fleet, member.name);
-    let identity = Arc::new(fleet.enroll(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
+    let fleet = cast.fleet(&member.fleet);
+    let identity = Arc::new(fleet.issue(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
     cast.identities.insert(member.clone(), identity.clone());
     identity
+}
+
+/// A list of its fleet's CA that revokes these members, in that order of lists.
+pub fn revocation_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
+    let revoked: Vec<_> =
+        members.iter().map(|m| (identity(m).as_peer().cert.serial.clone(), GENESIS)).collect();
+    let mut cast = cast();
+    let fleet = cast.fleet(fleet);
+    fleet.revocation_list_of(&revoked, number, GENESIS).expect("a fresh CA signs").into()
 }
 
 /// A generator that depends on a text alone.

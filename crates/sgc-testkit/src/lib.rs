@@ -32,10 +32,11 @@ mod node;
 mod record;
 mod rng;
 mod ros;
+mod trust;
 mod wires;
 mod world;
 
-pub use cast::{Member, identity};
+pub use cast::{Member, identity, revocation_list};
 pub use clock::Clock;
 pub use model::Model;
 pub use node::{NodeKey, Sharing};

@@ -11,11 +11,11 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkLimits, Source,
-    SourceConfig,
+    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkDrop, SinkLimits,
+    Source, SourceConfig, Wish,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, Router, RouterConfig};
-use sgc_trust::{Grantees, Identity, Policy, Suite, derive_name};
+use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
+use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
@@ -28,6 +28,8 @@ const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
 /// How long a history is waited for before it is asked for again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
+/// How long packets of past epochs may take.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A node of a world.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -52,6 +54,10 @@ pub struct Sharing {
     pub depth: usize,
     /// True if links may lose it.
     pub best_effort: bool,
+    /// These nodes may publish too.
+    pub publishers: BTreeSet<NodeKey>,
+    /// How it is protected, unless as usual.
+    pub suite: Option<Suite>,
 }
 
 impl Sharing {
@@ -105,6 +111,10 @@ pub(crate) struct Node {
     pub(crate) runs: u64,
     /// What arrived while it was stopped in its tracks; `None` while it is not.
     pub(crate) frozen: Option<VecDeque<Arrival>>,
+    /// By how much its clock is ahead, milliseconds.
+    pub(crate) skew_ms: i64,
+    /// Whom it believes, revocations included; kept over restarts. `None` for what its identity says.
+    pub(crate) anchors: Option<Arc<TrustAnchors>>,
 }
 
 /// What may arrive at a node.
@@ -124,6 +134,8 @@ pub(crate) enum Effect {
     Close(LinkId, LinkClose),
     /// A message came through.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
+    /// Remember whom it believes.
+    Trust(Arc<TrustAnchors>),
     /// Something a test may want to see.
     Log(What),
 }
@@ -141,6 +153,8 @@ pub(crate) struct Running {
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
     identity: Arc<Identity>,
+    /// Whom it believes by now.
+    pub(crate) anchors: Arc<TrustAnchors>,
     next_link: u32,
     /// Wire and side of each link that is up.
     pub(crate) links: BTreeMap<LinkId, (usize, usize)>,
@@ -170,6 +184,8 @@ pub(crate) struct LocalSink {
     sources: Vec<SourceId>,
     sink: Option<Sink>,
     retry_at: Option<Instant>,
+    /// When the keys of past epochs are dropped.
+    retire_at: Option<Instant>,
 }
 
 impl Node {
@@ -177,20 +193,28 @@ impl Node {
     pub(crate) fn start(&mut self, now: Now, seed: u64, directory: &Directory) {
         self.runs += 1;
         self.frozen = None;
+        let own = || Arc::new(self.identity.anchors().clone());
+        let anchors = self.anchors.clone().unwrap_or_else(own);
         let router = Router::new(RouterConfig {
             node: self.identity.node_id(),
             transit: self.transit,
             incarnation: seed,
-            anchors: Arc::new(self.identity.anchors().clone()),
+            anchors: anchors.clone(),
             limits: self.router_limits.clone(),
         });
-        let config = EndpointConfig { identity: self.identity.clone(), limits: self.endpoint_limits.clone() };
-        let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        let config = EndpointConfig {
+            identity: self.identity.clone(),
+            authority: false,
+            limits: self.endpoint_limits.clone(),
+        };
+        let mut endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);
+        endpoint.set_anchors(now, anchors.clone());
         let mut running = Running {
             run: self.runs,
             router,
             endpoint,
             identity: self.identity.clone(),
+            anchors,
             next_link: 1,
             links: BTreeMap::new(),
             fib: BTreeMap::new(),
@@ -215,11 +239,11 @@ impl Node {
 }
 
 impl Running {
-    pub(crate) fn new_link(&mut self, wire: usize, side: usize, peer: NodeId) -> LinkId {
+    pub(crate) fn new_link(&mut self, now: Now, wire: usize, side: usize, peer: Neighbour) -> LinkId {
         let link = LinkId(self.next_link);
         self.next_link += 1;
         self.links.insert(link, (wire, side));
-        self.router.handle_link_up(link, peer);
+        self.router.handle_link_up(now, link, peer);
         link
     }
 
@@ -250,6 +274,13 @@ impl Running {
         for name in due {
             self.ask_history(now, name);
         }
+        for local in self.sinks.values_mut() {
+            if local.retire_at.take_if(|at| *at <= now.instant).is_some()
+                && let Some(sink) = &mut local.sink
+            {
+                sink.retire_epochs();
+            }
+        }
     }
 
     pub(crate) fn share(
@@ -259,19 +290,9 @@ impl Running {
         sharing: &Sharing,
         directory: &Directory,
     ) -> Option<Name> {
-        let secret = self.identity.fleet_secret()?;
-        let own = self.identity.as_peer();
-        let id = |node: &NodeKey| {
-            directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
-        };
-        let policy = Policy {
-            subscribe: Grantees {
-                fleets: sharing.fleet.then_some(own.ca).into_iter().collect(),
-                nodes: sharing.nodes.iter().map(id).collect(),
-                groups: sharing.groups.iter().map(|g| (own.ca, secret.group_tag(g))).collect(),
-            },
-            ..Policy::default()
-        };
+        self.identity.fleet_secret()?;
+        let suite = sharing.suite.unwrap_or(Suite::DEFAULT);
+        let policy = policy(&self.identity, sharing, directory);
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {
             0 => Vec::new(),
@@ -280,7 +301,7 @@ impl Running {
         let spec = ShareSpec {
             metadata: metadata(self.identity.node_name().as_str(), topic),
             policy,
-            suite: Suite::Group,
+            suite,
             class: Class::Default,
             keyless: true,
             type_hash: None,
@@ -297,7 +318,9 @@ impl Running {
             history_bytes_max: HISTORY_BYTES_MAX,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
-        let source = Source::new(config, grant).expect("the group suite is in every build");
+        let message_key = MessageKey::generate(suite);
+        let source = Source::new(config, &grant, message_key).expect("a key of that suite");
+        self.endpoint.set_sources(now, &name, vec![source.progress()]);
         self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
         Some(name)
     }
@@ -320,13 +343,12 @@ impl Running {
         self.reconcile(now, owner);
     }
 
-    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
+    pub(crate) fn stop_using(&mut self, now: Now, owner: NodeKey, topic: &str) {
         self.uses.remove(&(owner, topic.to_owned()));
         self.reconcile(now, owner);
         if self.uses.iter().all(|(o, _)| *o != owner) {
-            if let (Some(secret), Some(id)) = (self.identity.fleet_secret(), self.owners.remove(&owner)) {
-                let name = derive_name(secret, &id, &Metadata::catalogue(&directory.names[owner.0]));
-                self.endpoint.leave(now, &name);
+            if let Some(id) = self.owners.remove(&owner) {
+                self.endpoint.unfollow(now, &id);
             }
             self.catalogues.remove(&owner);
         }
@@ -339,7 +361,10 @@ impl Running {
         let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
         let source = local.source.id();
         let mut packets = Vec::new();
-        local.source.publish(&head, &payload, |p| packets.push(p)).expect("tests publish what fits");
+        local
+            .source
+            .publish(&head, payload.into(), false, |p| packets.push(p))
+            .expect("tests publish what fits");
         for packet in packets {
             // As in the driver: what nobody asked for is not sent.
             if self.fib.contains_key(&packet.header.name) {
@@ -362,7 +387,8 @@ impl Running {
         if let sgc_endpoint::Output::Timeout(Some(at)) = self.endpoint.poll_output() {
             wake = Some(wake.map_or(at, |w: Instant| w.min(at)));
         }
-        self.wake = self.sinks.values().filter_map(|s| s.retry_at).chain(wake).min();
+        let sinks = self.sinks.values().flat_map(|s| [s.retry_at, s.retire_at]).flatten();
+        self.wake = sinks.chain(wake).min();
         std::mem::take(&mut self.effects)
     }
 
@@ -382,6 +408,12 @@ impl Running {
                 }
                 sgc_router::Output::Close { link, reason } => {
                     self.effects.push(Effect::Close(link, reason));
+                }
+                sgc_router::Output::Trust(anchors) => {
+                    self.anchors = anchors.clone();
+                    self.effects.push(Effect::Trust(anchors.clone()));
+                    self.endpoint.set_anchors(now, anchors);
+                    self.drain_endpoint(now);
                 }
                 sgc_router::Output::Dropped(dropped) => {
                     self.effects.push(Effect::Log(What::RouterDrop(dropped)));
@@ -414,16 +446,29 @@ impl Running {
 
     fn handle_event(&mut self, now: Now, event: Event) {
         match event {
-            Event::Granted { name, grant } => {
-                if let Some(local) = self.sinks.get_mut(&name) {
-                    match &mut local.sink {
-                        Some(sink) => sink.regrant(grant),
-                        None => {
-                            let limits = SinkLimits::default();
-                            local.sink = Some(Sink::new(name, grant, local.transient_local, limits));
-                        }
+            Event::Granted { name, sink: id, grant } => {
+                let Some(local) = self.sinks.get_mut(&name) else { return };
+                let mut released = Vec::new();
+                match &mut local.sink {
+                    Some(sink) => sink.regrant(id, grant, |delivery| released.push(delivery)),
+                    None => {
+                        let limits = SinkLimits::default();
+                        local.sink = Some(Sink::new(name, id, grant, local.transient_local, limits));
                     }
-                    self.ask_history(now, name);
+                }
+                local.retire_at = Some(now.instant + EPOCH_GRACE);
+                for delivery in released {
+                    self.delivered(now, name, delivery);
+                }
+                self.ask_history(now, name);
+            }
+            Event::Rekeyed { name, grant } => {
+                let mut packets = Vec::new();
+                if let Some(local) = self.sources.get_mut(&name) {
+                    let _ = local.source.rekey(&grant, |p| packets.push(p));
+                }
+                for packet in packets {
+                    self.forward(now, LinkId::LOCAL, packet);
                 }
             }
             Event::Catalogue { owner, catalogue } => {
@@ -435,7 +480,7 @@ impl Running {
             }
             Event::Recover(recover) => {
                 let mut packets = Vec::new();
-                if let Some(local) = self.sources.get(&recover.name)
+                if let Some(local) = self.sources.get_mut(&recover.name)
                     && local.source.id() == recover.source
                 {
                     local.source.replay(recover.sink, recover.from, recover.to, |p| packets.push(p));
@@ -450,14 +495,11 @@ impl Running {
 
     /// Joins what is wanted and in the owner's catalogue, leaves what is not.
     fn reconcile(&mut self, now: Now, owner: NodeKey) {
-        let (Some(secret), Some(owner_id)) = (self.identity.fleet_secret(), self.owners.get(&owner).copied())
-        else {
-            return;
-        };
+        let Some(owner_id) = self.owners.get(&owner).copied() else { return };
         let mut wanted = BTreeMap::new();
         for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries) {
             if self.uses.contains(&(owner, entry.metadata.ros_name.clone())) {
-                wanted.insert(derive_name(secret, &owner_id, &entry.metadata), entry.clone());
+                wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
             }
         }
         let gone: Vec<_> = self
@@ -491,9 +533,10 @@ impl Running {
                 sources,
                 sink: None,
                 retry_at: None,
+                retire_at: None,
             };
             self.sinks.insert(name, local);
-            self.endpoint.join(now, name, owner_id);
+            self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
         }
     }
 
@@ -544,13 +587,17 @@ impl Running {
 
     fn deliver(&mut self, now: Now, packet: &Packet) {
         let name = packet.header.name;
-        let Some(local) = self.sinks.get_mut(&name) else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        let Some(sink) = &mut local.sink else {
-            return self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted);
-        };
-        match sink.handle_packet(packet) {
+        let sink = self.sinks.get_mut(&name).and_then(|local| local.sink.as_mut());
+        match sink.map(|sink| sink.handle_packet(packet)) {
+            Some(delivery) => self.delivered(now, name, delivery),
+            None => self.drop_packet(name, LinkId::LOCAL, DataDrop::NotGranted),
+        }
+    }
+
+    /// What a packet came to.
+    fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
+        let Some(local) = self.sinks.get_mut(&name) else { return };
+        match delivery {
             Ok(Delivery::Message(message)) => {
                 let (owner, topic, use_number) = (local.owner, local.topic.clone(), local.use_number);
                 self.effects.push(Effect::Delivered { owner, topic, id: number(&message), use_number });
@@ -560,17 +607,34 @@ impl Running {
                 self.endpoint.recover(name, source, 1, u64::MAX);
             }
             Ok(Delivery::Synced(_)) => {
-                if sink.unsynced().next().is_none() {
+                if local.sink.as_ref().is_none_or(|sink| sink.unsynced().next().is_none()) {
                     local.retry_at = None;
                 }
             }
-            Ok(Delivery::Incomplete) => {}
+            Ok(Delivery::Incomplete | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }
     }
 
     fn drop_packet(&mut self, name: Name, ingress: LinkId, why: DataDrop) {
         self.effects.push(Effect::Log(What::DataDrop { name, ingress, why }));
+    }
+}
+
+/// Who may join, as a node's policy says it.
+pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory) -> Policy {
+    let ca = owner.as_peer().ca;
+    let id = |node: &NodeKey| {
+        directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
+    };
+    let group = |g: &String| owner.fleet_secret().map(|s| (ca, s.group_tag(g)));
+    Policy {
+        subscribe: Grantees {
+            fleets: sharing.fleet.then_some(ca).into_iter().collect(),
+            nodes: sharing.nodes.iter().map(id).collect(),
+            groups: sharing.groups.iter().filter_map(group).collect(),
+        },
+        publish: Grantees { nodes: sharing.publishers.iter().map(id).collect(), ..Grantees::default() },
     }
 }
 

@@ -130,7 +130,10 @@ impl FakeDomain {
         }
         if let Some(reader) = reader {
             let mut handler = reader.lock().unwrap_or_else(PoisonError::into_inner);
-            missed.into_iter().for_each(&mut *handler);
+            let last = missed.len().saturating_sub(1);
+            for (n, sample) in missed.into_iter().enumerate() {
+                handler(Sample { more: n < last, ..sample });
+            }
         }
         guid
     }
@@ -205,7 +208,7 @@ impl Drop for FakeWriter {
 
 impl RosWriter for FakeWriter {
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
-        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, payload };
+        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, payload, more: false };
         let readers: Vec<_> = {
             let mut state = self.domain.lock();
             let Some(writer) = state.endpoints.get_mut(&self.guid) else { return Ok(()) };

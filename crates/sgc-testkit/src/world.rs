@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{Event, JoinStatus};
-use sgc_router::{LinkId, RouterStats};
+use sgc_endpoint::{Event, JoinStatus, Wish};
+use sgc_router::{LinkId, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
@@ -95,7 +95,7 @@ pub struct World {
     dice: Dice,
     pub(crate) nodes: Vec<Node>,
     pub(crate) members: Vec<Member>,
-    directory: Directory,
+    pub(crate) directory: Directory,
     pub(crate) cables: Vec<Cable>,
     wires: Vec<Wire>,
     queue: BTreeMap<(Instant, u64), Pending>,
@@ -157,6 +157,7 @@ impl World {
     /// Adds and starts a node that is any member and carries others' names or not.
     pub fn node(&mut self, member: Member, transit: bool) -> NodeKey {
         let key = NodeKey(self.nodes.len());
+        let member = Member { may_route: member.may_route || transit, ..member };
         let identity = identity(&member);
         self.directory.by_id.insert(identity.node_id(), key);
         self.directory.names.push(member.name.clone());
@@ -173,6 +174,8 @@ impl World {
             running: None,
             runs: 0,
             frozen: None,
+            skew_ms: 0,
+            anchors: None,
         });
         self.members.push(member);
         self.start(key);
@@ -185,7 +188,7 @@ impl World {
             return;
         }
         self.note(format!("start {node:?}"));
-        let (now, seed) = (self.clock.now(), self.dice.number());
+        let (now, seed) = (self.now_at(node), self.dice.number());
         self.nodes[node.0].start(now, seed, &self.directory);
         self.settle(node);
         for cable in self.cables_of(node) {
@@ -220,7 +223,7 @@ impl World {
             return;
         }
         self.note(format!("shut down {node:?}"));
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Some(running) = &mut self.nodes[node.0].running else { return };
         running.endpoint.withdraw_all(now);
         self.settle(node);
@@ -287,7 +290,7 @@ impl World {
     /// Shares a topic, now and after every restart; the name it has.
     pub fn share(&mut self, node: NodeKey, topic: &str, sharing: Sharing) -> Name {
         self.note(format!("share {node:?} {topic} {sharing:?}"));
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Node { shares, running, .. } = &mut self.nodes[node.0];
         if let Some(running) = running {
             running.share(now, topic, &sharing, &self.directory);
@@ -300,7 +303,7 @@ impl World {
     /// Ends a share.
     pub fn unshare(&mut self, node: NodeKey, topic: &str) {
         self.note(format!("unshare {node:?} {topic}"));
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Node { shares, running, .. } = &mut self.nodes[node.0];
         shares.remove(topic);
         if let Some(running) = running {
@@ -312,7 +315,7 @@ impl World {
     /// Uses a topic whenever the owner's catalogue shows it, now and after every restart.
     pub fn use_topic(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
         self.note(format!("use {node:?} {owner:?}:{topic}"));
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Node { uses, running, .. } = &mut self.nodes[node.0];
         uses.insert((owner, topic.to_owned()));
         if let Some(running) = running {
@@ -324,11 +327,11 @@ impl World {
     /// Uses a topic no longer.
     pub fn stop_using(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
         self.note(format!("stop using {node:?} {owner:?}:{topic}"));
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Node { uses, running, .. } = &mut self.nodes[node.0];
         uses.remove(&(owner, topic.to_owned()));
         if let Some(running) = running {
-            running.stop_using(now, owner, topic, &self.directory);
+            running.stop_using(now, owner, topic);
         }
         self.settle(node);
     }
@@ -336,9 +339,9 @@ impl World {
     /// Joins a name without looking into its owner's catalogue, until the node stops.
     pub fn join_blindly(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
         self.note(format!("join blindly {node:?} {owner:?}:{topic}"));
-        let (now, name, id) = (self.clock.now(), self.name(owner, topic), self.identity(owner).node_id());
+        let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
-            running.endpoint.join(now, name, id);
+            running.endpoint.join(now, name, id, Wish::Subscribe { describe: false });
         }
         self.settle(node);
     }
@@ -350,7 +353,7 @@ impl World {
 
     /// Publishes a message of that size.
     pub fn publish_bytes(&mut self, node: NodeKey, topic: &str, bytes: usize) -> MessageId {
-        let (now, id) = (self.clock.now(), MessageId(self.published.len() as u64));
+        let (now, id) = (self.now_at(node), MessageId(self.published.len() as u64));
         let Node { running, frozen: None, .. } = &mut self.nodes[node.0] else {
             panic!("{node:?} is frozen and cannot publish")
         };
@@ -697,13 +700,14 @@ impl World {
         }
         let wire = self.wires.len();
         self.cables[cable].wire = Some(wire);
-        let now = self.clock.instant();
+        let instant = self.clock.instant();
+        let nows = [0, 1].map(|side| self.now_at(ends[side]));
         let ends = [0, 1].map(|side| {
-            let peer = self.identity(ends[1 - side]).node_id();
+            let peer = Neighbour::from(self.identity(ends[1 - side]).as_peer());
             let running = self.nodes[ends[side].0].running.as_mut().expect("checked above");
-            let link = running.new_link(wire, side, peer);
+            let link = running.new_link(nows[side], wire, side, peer);
             let (run, data) = (running.run, BTreeMap::new());
-            WireEnd { node: ends[side], run, link, up: true, control: now, data }
+            WireEnd { node: ends[side], run, link, up: true, control: instant, data }
         });
         let nodes = [ends[0].node, ends[1].node];
         self.wires.push(Wire { cable, carries: true, ends });
@@ -822,7 +826,7 @@ impl World {
             let (_, pending) = self.queue.pop_first().expect("one is due");
             self.deliver(pending);
         } else if let Some((_, node)) = wake {
-            let now = self.clock.now();
+            let now = self.now_at(node);
             let running = self.nodes[node.0].running.as_mut().expect("only running nodes have timers");
             running.handle_timeout(now);
             self.settle(node);
@@ -870,7 +874,7 @@ impl World {
     }
 
     fn arrive(&mut self, node: NodeKey, arrival: Arrival) {
-        let now = self.clock.now();
+        let now = self.now_at(node);
         let Node { running, frozen, .. } = &mut self.nodes[node.0];
         match (frozen, running) {
             (Some(backlog), _) => backlog.push_back(arrival),
@@ -883,8 +887,8 @@ impl World {
     }
 
     /// Drains a node and does what it wants done.
-    fn settle(&mut self, node: NodeKey) {
-        let now = self.clock.now();
+    pub(crate) fn settle(&mut self, node: NodeKey) {
+        let now = self.now_at(node);
         let mut effects = VecDeque::new();
         loop {
             match &mut self.nodes[node.0].running {
@@ -921,6 +925,7 @@ impl World {
                 let (at, run) = (self.clock.elapsed(), self.nodes[node.0].runs);
                 self.received.push(Received { id, at, node, run, use_number, owner, topic });
             }
+            Effect::Trust(anchors) => self.nodes[node.0].anchors = Some(anchors),
             Effect::Log(what) => self.write_log(node, what),
         }
     }

@@ -4,8 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use sgc_trust::Identity;
-
+use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, Refusal};
 use crate::link::AnyLink;
 use crate::metrics::TransportMetrics;
@@ -24,16 +23,16 @@ enum Kind {
 }
 
 impl Listener {
-    /// Binds the address. Needs a tokio runtime around it.
+    /// Binds the address. Needs a tokio runtime around it. Each handshake uses what the store holds then.
     pub fn bind(
         addr: &ListenAddr,
-        identity: Arc<Identity>,
+        credentials: impl Into<CredentialStore>,
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> io::Result<Self> {
         match addr.scheme {
             Scheme::Quic => {
-                let listener = QuicListener::bind(addr.addr, identity, options, metrics)?;
+                let listener = QuicListener::bind(addr.addr, credentials.into(), options, metrics)?;
                 let addr = ListenAddr { addr: listener.local_addr(), ..addr.clone() };
                 Ok(Self { addr, kind: Kind::Quic(listener) })
             }
@@ -83,9 +82,14 @@ pub struct Dialer {
 }
 
 impl Dialer {
-    /// A dialer for this identity. Sockets are opened with the first dial and then shared by all.
-    pub fn new(identity: Arc<Identity>, options: LinkOptions, metrics: Arc<TransportMetrics>) -> Self {
-        Self { quic: QuicDialer::new(identity, options, metrics) }
+    /// A dialer with these credentials; each dial uses what the store holds then. Sockets are opened with the first
+    /// dial and then shared by all.
+    pub fn new(
+        credentials: impl Into<CredentialStore>,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> Self {
+        Self { quic: QuicDialer::new(credentials.into(), options, metrics) }
     }
 
     /// Makes a link: looks the host up, tries its addresses, and returns once the far node has accepted. It tries

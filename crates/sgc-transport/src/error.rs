@@ -37,6 +37,12 @@ pub enum CloseReason {
     /// The node has too much to do.
     #[error("it is overloaded")]
     Overloaded,
+    /// The certificate of the node that is told so was revoked.
+    #[error("the certificate was revoked")]
+    Revoked,
+    /// The certificate of the node that is told so is over.
+    #[error("the certificate expired")]
+    Expired,
     /// A reason that this version does not know.
     #[error("reason {code}: {text}")]
     Other {
@@ -55,6 +61,8 @@ impl CloseReason {
             Self::Protocol(text) => (2, text.as_str()),
             Self::Denied(text) => (3, text.as_str()),
             Self::Overloaded => (4, ""),
+            Self::Revoked => (5, ""),
+            Self::Expired => (6, ""),
             Self::Other { code, text } => (u32::try_from(*code).unwrap_or(u32::MAX), text.as_str()),
         };
         (code, printable(text.as_bytes()))
@@ -67,6 +75,8 @@ impl CloseReason {
             2 => Self::Protocol(printable(text)),
             3 => Self::Denied(printable(text)),
             4 => Self::Overloaded,
+            5 => Self::Revoked,
+            6 => Self::Expired,
             code => Self::Other { code, text: printable(text) },
         }
     }
@@ -134,7 +144,7 @@ pub enum PeerRefusal {
     #[error("to it our certificate is expired or not yet valid: enroll again, or compare the clocks")]
     Expired,
     /// Our certificate was revoked.
-    #[error("our certificate was revoked")]
+    #[error("our certificate was revoked: the keeper of the fleet has to enroll this node again")]
     Revoked,
     /// It cannot use our certificate.
     #[error("it cannot use our certificate (alert {0}); its log says why")]
@@ -142,6 +152,12 @@ pub enum PeerRefusal {
     /// It speaks another version of the protocol, or another protocol.
     #[error("it does not speak this version of SGC: are both nodes of one release?")]
     Version,
+    /// It accepts no key exchange that we offer.
+    #[error(
+        "it accepts no key exchange of ours: one of the two requires post-quantum X25519MLKEM768 and the other does \
+         not have it; upgrade that one, or turn `post_quantum` off in both fleets"
+    )]
+    KeyExchange,
     /// It has too much to do.
     #[error("it is overloaded: try again later")]
     Overloaded,
@@ -167,6 +183,7 @@ impl PeerRefusal {
                 44 => Self::Revoked,
                 alert @ (42 | 43 | 46 | 49 | 51) => Self::BadCertificate(alert),
                 70 | 120 => Self::Version,
+                40 => Self::KeyExchange,
                 alert => Self::Other(format!("TLS alert {alert}")),
             },
             _ => Self::Other(format!("{code}: {}", printable(text))),
@@ -195,7 +212,7 @@ pub enum ProtocolError {
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum LinkError {
     /// It was closed.
-    #[error("closed by {}: {reason}", if *by_peer { "the peer" } else { "this node" })]
+    #[error("{}", Closing(*by_peer, reason))]
     Closed {
         /// By the peer, or here.
         by_peer: bool,
@@ -331,6 +348,16 @@ pub enum Refusal {
     /// It speaks another version, or another protocol.
     #[error("it does not speak this version of SGC: {0}")]
     Version(String),
+    /// It offers no key exchange that is accepted here.
+    #[error(
+        "it offers no key exchange that this node accepts{}",
+        if *post_quantum { ": post-quantum X25519MLKEM768 is required here and it does not have it; upgrade it, or \
+         turn `post_quantum` off in this fleet" } else { "" }
+    )]
+    KeyExchange {
+        /// True if only post-quantum ones are.
+        post_quantum: bool,
+    },
     /// Its greeting is none.
     #[error("{0}")]
     Greeting(#[source] ProtocolError),
@@ -371,8 +398,10 @@ impl Refusal {
                 RefusalKind::Expired
             }
             Self::Certificate(CertError::NotYetValid { .. }) => RefusalKind::NotYetValid,
+            Self::Certificate(CertError::Revoked { .. }) => RefusalKind::Revoked,
             Self::Certificate(_) => RefusalKind::BadCertificate,
             Self::Version(_) => RefusalKind::Version,
+            Self::KeyExchange { .. } => RefusalKind::KeyExchange,
             Self::Greeting(_) => RefusalKind::BadGreeting,
             Self::TimedOut { .. } => RefusalKind::TimedOut,
             Self::TooMany { .. } => RefusalKind::TooMany,
@@ -417,6 +446,26 @@ impl fmt::Display for Attempts<'_> {
     }
 }
 
+/// Who closed a link, and why; where the cause lies with one of the two, which one.
+struct Closing<'a>(bool, &'a CloseReason);
+
+impl fmt::Display for Closing<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self(by_peer, reason) = self;
+        let what = match reason {
+            CloseReason::Revoked => "certificate was revoked",
+            CloseReason::Expired => "certificate expired",
+            reason if *by_peer => return write!(f, "closed by the peer: {reason}"),
+            reason => return write!(f, "closed by this node: {reason}"),
+        };
+        if *by_peer {
+            write!(f, "closed by the peer: this node's {what}; renew it, or have it enrolled again")
+        } else {
+            write!(f, "closed by this node: the peer's {what}")
+        }
+    }
+}
+
 /// Text of a peer, fit for a log.
 fn printable(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
@@ -435,6 +484,8 @@ mod tests {
             CloseReason::Protocol("x".into()),
             CloseReason::Denied("y".into()),
             CloseReason::Overloaded,
+            CloseReason::Revoked,
+            CloseReason::Expired,
             CloseReason::Other { code: 77, text: "z".into() },
         ] {
             let (code, text) = reason.to_wire();

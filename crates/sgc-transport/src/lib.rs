@@ -8,6 +8,7 @@
 //! ended; what follows from that is the node's. QUIC is the one transport so far.
 #![forbid(unsafe_code)]
 
+mod credentials;
 mod endpoint;
 mod error;
 mod flow;
@@ -18,11 +19,12 @@ mod options;
 mod quic;
 mod url;
 
+pub use credentials::CredentialStore;
 pub use endpoint::{Dialer, Listener, RefusedPeer};
 pub use error::{CloseReason, DialError, FlowEnd, FlowError, LinkError, PeerRefusal, ProtocolError, Refusal};
 pub use flow::{FlowRx, FlowTx};
 pub use framing::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
-pub use link::{AnyLink, Link, LinkStats};
+pub use link::{AnyLink, KeyExchange, Link, LinkStats};
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;

@@ -58,6 +58,29 @@ pub trait Link: Clone + Send + Sync + 'static {
     fn closed(&self) -> impl Future<Output = LinkError> + Send;
 }
 
+/// How the two ends of a link agreed on its keys.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum KeyExchange {
+    /// Not known.
+    #[default]
+    Unknown,
+    /// X25519 alone.
+    X25519,
+    /// X25519 and ML-KEM-768, which also stands against quantum computers.
+    X25519MlKem768,
+}
+
+impl KeyExchange {
+    /// Its name in TLS (IANA, supported groups).
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::X25519 => "X25519",
+            Self::X25519MlKem768 => "X25519MLKEM768",
+        }
+    }
+}
+
 /// What a transport measures of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LinkStats {
@@ -79,6 +102,8 @@ pub struct LinkStats {
     pub congestion_window_bytes: u64,
     /// Longest packet of the transport that the path carries, bytes.
     pub mtu_bytes: u16,
+    /// How its keys were agreed on.
+    pub key_exchange: KeyExchange,
 }
 
 /// A link over any transport.

@@ -13,10 +13,14 @@ pub enum RefusalKind {
     Expired,
     /// The certificate has not begun.
     NotYetValid,
+    /// The certificate was revoked.
+    Revoked,
     /// The certificate is altered, malformed or for something else.
     BadCertificate,
     /// It speaks another version of the protocol, or another protocol.
     Version,
+    /// It offers no key exchange that is accepted here.
+    KeyExchange,
     /// It connected and then said something that is no greeting.
     BadGreeting,
     /// It did not finish in time.
@@ -31,13 +35,15 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// Every kind, in the order of the counters.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 13] = [
         Self::NoCertificate,
         Self::OtherCa,
         Self::Expired,
         Self::NotYetValid,
+        Self::Revoked,
         Self::BadCertificate,
         Self::Version,
+        Self::KeyExchange,
         Self::BadGreeting,
         Self::TimedOut,
         Self::TooMany,
@@ -52,8 +58,10 @@ impl RefusalKind {
             Self::OtherCa => "other_ca",
             Self::Expired => "expired",
             Self::NotYetValid => "not_yet_valid",
+            Self::Revoked => "revoked",
             Self::BadCertificate => "bad_certificate",
             Self::Version => "version",
+            Self::KeyExchange => "key_exchange",
             Self::BadGreeting => "bad_greeting",
             Self::TimedOut => "timed_out",
             Self::TooMany => "too_many",

@@ -34,6 +34,10 @@ pub struct LinkOptions {
     pub handshakes_max: usize,
     /// From how many on a peer first has to prove that it receives at its address (QUIC Retry).
     pub handshakes_unvalidated_max: usize,
+    /// Key exchange that also stands against quantum computers (X25519MLKEM768). True: nothing else is offered or
+    /// accepted, so no one can talk the two ends out of it. False: X25519 is preferred, and a peer that requires the
+    /// other gets it. An identity of a fleet that requires it requires it here too.
+    pub post_quantum: bool,
     /// Makes the congestion controllers; `None` is quinn's default.
     pub congestion: Option<Arc<dyn ControllerFactory + Send + Sync + 'static>>,
 }
@@ -53,6 +57,7 @@ impl Default for LinkOptions {
             datagram_receive_bytes: 1 << 20,
             handshakes_max: 256,
             handshakes_unvalidated_max: 32,
+            post_quantum: false,
             congestion: None,
         }
     }
@@ -68,6 +73,7 @@ impl fmt::Debug for LinkOptions {
             .field("send_window_bytes", &self.send_window_bytes)
             .field("flows_max", &self.flows_max)
             .field("handshakes_max", &self.handshakes_max)
+            .field("post_quantum", &self.post_quantum)
             .finish_non_exhaustive()
     }
 }

@@ -1,110 +1,19 @@
 //! What links do for their users, over loopback; misbehaving peers are played by bare quinn.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
-use std::future::Future;
-use std::net::SocketAddr;
+mod support;
+
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
-use quinn::crypto::rustls::QuicClientConfig;
-use quinn::{Connection, ConnectionError, Endpoint, VarInt};
-use rand_chacha::ChaCha20Rng;
-use rand_core::SeedableRng as _;
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
+use quinn::{ConnectionError, VarInt};
 use sgc_transport::*;
-use sgc_trust::{CertError, EnrollRequest, Fleet, Identity};
+use sgc_trust::{CertError, Identity};
 use sgc_wire::{
     Class, DecodeError, Encode, HOP_LIMIT, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis,
 };
-use tokio::sync::mpsc;
-
-const MINUTE: u64 = 60_000;
-
-fn now() -> UnixMillis {
-    UnixMillis(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64)
-}
-
-fn fleet(seed: u64) -> Fleet {
-    let created = UnixMillis(now().0 - 100 * 24 * 60 * MINUTE);
-    Fleet::create("acme".parse().unwrap(), created, &mut ChaCha20Rng::seed_from_u64(seed)).unwrap()
-}
-
-fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
-    enroll_at(fleet, node, now())
-}
-
-fn enroll_at(fleet: &Fleet, node: &str, now: UnixMillis) -> Arc<Identity> {
-    let valid = Duration::from_secs(3600);
-    let request = EnrollRequest { valid, ..EnrollRequest::new(node.parse().unwrap(), now) };
-    Arc::new(fleet.enroll(&request, &mut ChaCha20Rng::seed_from_u64(node.len() as u64)).unwrap())
-}
-
-/// Whatever hangs fails.
-async fn soon<T>(future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(Duration::from_secs(30), future).await.expect("it hangs")
-}
-
-/// A listener whose results come by a channel.
-struct Server {
-    url: LinkUrl,
-    addr: SocketAddr,
-    metrics: Arc<TransportMetrics>,
-    results: mpsc::Receiver<Result<AnyLink, RefusedPeer>>,
-}
-
-impl Server {
-    fn start(identity: Arc<Identity>, options: LinkOptions) -> Self {
-        Self::start_at("quic://127.0.0.1:0", identity, options)
-    }
-
-    fn start_at(addr: &str, identity: Arc<Identity>, options: LinkOptions) -> Self {
-        let metrics = Arc::new(TransportMetrics::default());
-        let mut listener =
-            Listener::bind(&addr.parse().unwrap(), identity, options, Arc::clone(&metrics)).unwrap();
-        let url = listener.local().to_string().parse().unwrap();
-        let addr = listener.local().addr;
-        let (tx, results) = mpsc::channel(16);
-        tokio::spawn(async move {
-            while let Some(result) = listener.accept().await {
-                if tx.send(result).await.is_err() {
-                    break;
-                }
-            }
-        });
-        Self { url, addr, metrics, results }
-    }
-
-    async fn link(&mut self) -> AnyLink {
-        soon(self.results.recv()).await.unwrap().unwrap()
-    }
-
-    async fn refusal(&mut self) -> RefusedPeer {
-        soon(self.results.recv()).await.unwrap().unwrap_err()
-    }
-}
-
-fn dialer(identity: Arc<Identity>) -> Dialer {
-    Dialer::new(identity, LinkOptions::default(), Arc::new(TransportMetrics::default()))
-}
-
-async fn dial(identity: Arc<Identity>, url: &LinkUrl) -> Result<AnyLink, LinkError> {
-    match soon(dialer(identity).dial(url)).await {
-        Ok(link) => Ok(link),
-        Err(DialError::Failed { mut attempts, .. }) => Err(attempts.pop().unwrap().1),
-        Err(other) => panic!("{other}"),
-    }
-}
-
-/// A dialled link and its other end.
-async fn pair(options: LinkOptions) -> (AnyLink, AnyLink) {
-    let fleet = fleet(1);
-    let mut server = Server::start(enroll(&fleet, "router"), options.clone());
-    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
-    let near = soon(dialer.dial(&server.url)).await.unwrap();
-    (near, server.link().await)
-}
+use support::*;
 
 fn packet(seq: u64, payload: Bytes) -> Packet {
     let header = PacketHeader {
@@ -247,85 +156,6 @@ async fn nobody_at_the_address_is_said() {
 }
 
 // Bare peers.
-
-#[derive(Debug)]
-struct TrustAnyone;
-
-impl ServerCertVerifier for TrustAnyone {
-    fn verify_server_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: &ServerName<'_>,
-        _: &[u8],
-        _: UnixTime,
-    ) -> Result<ServerCertVerified, rustls::Error> {
-        Ok(ServerCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &rustls::DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &rustls::DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
-        vec![rustls::SignatureScheme::ECDSA_NISTP256_SHA256]
-    }
-}
-
-/// A bare QUIC connection, as yet without greeting.
-async fn bare(
-    addr: SocketAddr,
-    identity: Option<&Identity>,
-    alpn: &str,
-) -> Result<Connection, ConnectionError> {
-    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
-    let tls = rustls::ClientConfig::builder_with_provider(provider)
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .unwrap()
-        .dangerous()
-        .with_custom_certificate_verifier(Arc::new(TrustAnyone));
-    let mut tls = match identity {
-        None => tls.with_no_client_auth(),
-        Some(i) => {
-            tls.with_client_cert_resolver(Arc::new(rustls::sign::SingleCertAndKey::from(i.certified_key())))
-        }
-    };
-    tls.alpn_protocols = vec![alpn.into()];
-    let config = quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()));
-    let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
-    soon(endpoint.connect_with(config, addr, "x.invalid").unwrap()).await
-}
-
-fn frame(body: &[u8]) -> Vec<u8> {
-    [&(body.len() as u32).to_be_bytes(), body].concat()
-}
-
-const GREETING: [u8; 6] = [0, 1, 0, 0, 0, 0];
-
-/// A bare connection that has greeted, with its control stream, and the link at the listener.
-async fn greeted(server: &mut Server, identity: &Identity) -> (Connection, quinn::SendStream, AnyLink) {
-    let connection = bare(server.addr, Some(identity), "sgc/1").await.unwrap();
-    let (mut tx, mut rx) = soon(connection.open_bi()).await.unwrap();
-    tx.write_all(&frame(&GREETING)).await.unwrap();
-    let mut answer = [0; 10];
-    soon(rx.read_exact(&mut answer)).await.unwrap();
-    assert_eq!(answer[..], frame(&GREETING));
-    (connection, tx, server.link().await)
-}
 
 #[tokio::test]
 async fn a_dialer_without_a_certificate_is_refused() {

@@ -6,10 +6,12 @@ use rustls::crypto::hpke::{EncapsulatedSecret, Hpke, HpkePrivateKey, HpkePublicK
 use sgc_wire::{Decode, DecodeError, Encode, GrantContent, Name, SinkId};
 use zeroize::Zeroizing;
 
+use crate::{hpke, xwing};
+
 /// Why a grant could not be sealed or opened.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GrantError {
-    /// The request's reply key is not an X25519 public key.
+    /// The request's reply key is neither an X25519 nor an X-Wing public key.
     #[error("the request's reply key is not usable")]
     ReplyKey,
     /// The seal does not verify: altered, or for another request.
@@ -20,17 +22,61 @@ pub enum GrantError {
     Content(#[from] DecodeError),
 }
 
-/// A fresh key pair of one join.
+/// How the secret of a grant travels. The one who asks chooses; the owner answers in kind.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kem {
+    /// X25519.
+    #[default]
+    X25519,
+    /// X-Wing: X25519 and ML-KEM-768, which also stands against quantum computers.
+    XWing,
+}
+
+impl Kem {
+    /// What a node of a fleet with or without post-quantum cryptography asks with.
+    pub fn for_fleet(post_quantum: bool) -> Self {
+        if post_quantum { Self::XWing } else { Self::X25519 }
+    }
+
+    /// Length of a reply key, by which a request says what it chose.
+    pub fn reply_key_bytes(self) -> usize {
+        match self {
+            Self::X25519 => 32,
+            Self::XWing => xwing::PUBLIC_BYTES,
+        }
+    }
+
+    fn of_reply_key(key: &[u8]) -> Option<Self> {
+        [Self::X25519, Self::XWing].into_iter().find(|kem| kem.reply_key_bytes() == key.len())
+    }
+}
+
+/// A fresh key pair of one join. Both private keys are cleared when dropped.
 pub struct ReplyKey {
     public: Bytes,
-    private: HpkePrivateKey,
+    private: Private,
+}
+
+enum Private {
+    X25519(HpkePrivateKey),
+    XWing(Box<xwing::PrivateKey>),
 }
 
 impl ReplyKey {
     /// Makes a key pair. The provider draws the randomness.
-    pub fn generate() -> Self {
-        let (public, private) = HPKE.generate_key_pair().expect("the provider makes X25519 keys or aborts");
-        Self { public: public.0.into(), private }
+    pub fn generate(kem: Kem) -> Self {
+        match kem {
+            Kem::X25519 => {
+                let (public, private) =
+                    HPKE.generate_key_pair().expect("the provider makes X25519 keys or aborts");
+                Self { public: public.0.into(), private: Private::X25519(private) }
+            }
+            Kem::XWing => {
+                let (private, public) =
+                    xwing::PrivateKey::generate().expect("the provider makes X-Wing keys or aborts");
+                Self { public: public.into(), private: Private::XWing(Box::new(private)) }
+            }
+        }
     }
 
     /// The public key, as it goes into the request.
@@ -47,16 +93,18 @@ impl ReplyKey {
         enc: &[u8],
         sealed: &[u8],
     ) -> Result<GrantContent, GrantError> {
-        let plain = HPKE
-            .open(
-                &EncapsulatedSecret(enc.to_vec()),
-                &info(name, sink),
-                &serial.to_be_bytes(),
-                sealed,
-                &self.private,
-            )
-            .map_err(|_| GrantError::NotForUs)?;
-        Ok(GrantContent::from_slice(&Zeroizing::new(plain))?)
+        let (info, aad) = (info(name, sink), serial.to_be_bytes());
+        let plain = match &self.private {
+            Private::X25519(private) => HPKE
+                .open(&EncapsulatedSecret(enc.to_vec()), &info, &aad, sealed, private)
+                .map(Zeroizing::new)
+                .ok(),
+            Private::XWing(private) => private
+                .decapsulate(enc)
+                .and_then(|secret| hpke::Context::new(&hpke::XWING, &secret, &info).ok())
+                .and_then(|context| context.open(&aad, sealed).ok()),
+        };
+        Ok(GrantContent::from_slice(&plain.ok_or(GrantError::NotForUs)?)?)
     }
 }
 
@@ -66,7 +114,7 @@ impl std::fmt::Debug for ReplyKey {
     }
 }
 
-/// Seals a grant's content to a request: the encapsulated key and the sealed content.
+/// Seals a grant's content to a request, in the kind of its reply key: the encapsulated key and the sealed content.
 pub fn seal_grant(
     reply_key: &[u8],
     name: &Name,
@@ -75,10 +123,22 @@ pub fn seal_grant(
     content: &GrantContent,
 ) -> Result<(Bytes, Bytes), GrantError> {
     let plain = Zeroizing::new(content.to_vec());
-    let (enc, sealed) = HPKE
-        .seal(&info(name, sink), &serial.to_be_bytes(), &plain, &HpkePublicKey(reply_key.to_vec()))
-        .map_err(|_| GrantError::ReplyKey)?;
-    Ok((enc.0.into(), sealed.into()))
+    let (info, aad) = (info(name, sink), serial.to_be_bytes());
+    match Kem::of_reply_key(reply_key).ok_or(GrantError::ReplyKey)? {
+        Kem::X25519 => {
+            let (enc, sealed) = HPKE
+                .seal(&info, &aad, &plain, &HpkePublicKey(reply_key.to_vec()))
+                .map_err(|_| GrantError::ReplyKey)?;
+            Ok((enc.0.into(), sealed.into()))
+        }
+        Kem::XWing => {
+            let (enc, secret) = xwing::encapsulate(reply_key).ok_or(GrantError::ReplyKey)?;
+            let sealed = hpke::Context::new(&hpke::XWING, &secret, &info)
+                .and_then(|context| context.seal(&aad, &plain))
+                .map_err(|_| GrantError::ReplyKey)?;
+            Ok((enc.into(), sealed.into()))
+        }
+    }
 }
 
 fn info(name: &Name, sink: &SinkId) -> Vec<u8> {
@@ -91,26 +151,70 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn only_the_request_that_asked_opens_the_grant() {
-        let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
-        let content = GrantContent::Topic(TopicGrant {
+    const NAME: Name = Name([1; 32]);
+    const SINK: SinkId = SinkId([2; 16]);
+
+    fn content() -> GrantContent {
+        GrantContent::Topic(TopicGrant {
             epoch: 1,
             suite: 1,
             key: SecretBytes::new([9; 32]),
             sources: Vec::new(),
             entry: None,
-        });
-        let asked = ReplyKey::generate();
-        let (enc, sealed) = seal_grant(asked.public(), &name, &sink, 4, &content).unwrap();
-        assert_eq!(asked.open(&name, &sink, 4, &enc, &sealed), Ok(content.clone()));
-        let refused = |k: &ReplyKey, n: Name, s: SinkId, serial| {
-            assert_eq!(k.open(&n, &s, serial, &enc, &sealed), Err(GrantError::NotForUs));
-        };
-        refused(&ReplyKey::generate(), name, sink, 4);
-        refused(&asked, Name([3; 32]), sink, 4);
-        refused(&asked, name, SinkId([3; 16]), 4);
-        refused(&asked, name, sink, 5);
-        assert_eq!(seal_grant(b"short", &name, &sink, 4, &content), Err(GrantError::ReplyKey));
+        })
+    }
+
+    #[test]
+    fn only_the_request_that_asked_opens_the_grant() {
+        for kem in [Kem::X25519, Kem::XWing] {
+            let asked = ReplyKey::generate(kem);
+            assert_eq!(asked.public().len(), kem.reply_key_bytes());
+            let (enc, sealed) = seal_grant(asked.public(), &NAME, &SINK, 4, &content()).unwrap();
+            assert_eq!(asked.open(&NAME, &SINK, 4, &enc, &sealed), Ok(content()));
+            let refused = |k: &ReplyKey, n: Name, s: SinkId, serial| {
+                assert_eq!(k.open(&n, &s, serial, &enc, &sealed), Err(GrantError::NotForUs));
+            };
+            refused(&ReplyKey::generate(Kem::X25519), NAME, SINK, 4);
+            refused(&ReplyKey::generate(Kem::XWing), NAME, SINK, 4);
+            refused(&asked, Name([3; 32]), SINK, 4);
+            refused(&asked, NAME, SinkId([3; 16]), 4);
+            refused(&asked, NAME, SINK, 5);
+        }
+    }
+
+    #[test]
+    fn an_altered_grant_does_not_open() {
+        for kem in [Kem::X25519, Kem::XWing] {
+            let asked = ReplyKey::generate(kem);
+            let (enc, sealed) = seal_grant(asked.public(), &NAME, &SINK, 4, &content()).unwrap();
+            let refused = |enc: &[u8], sealed: &[u8]| {
+                assert_eq!(asked.open(&NAME, &SINK, 4, enc, sealed), Err(GrantError::NotForUs), "{kem:?}");
+            };
+            // X25519 ignores the topmost bit of a point (RFC 7748, 5), yet HPKE binds it.
+            for at in 0..enc.len() * 8 {
+                let mut altered = enc.to_vec();
+                altered[at / 8] ^= 1 << (at % 8);
+                refused(&altered, &sealed);
+            }
+            for at in 0..sealed.len() * 8 {
+                let mut altered = sealed.to_vec();
+                altered[at / 8] ^= 1 << (at % 8);
+                refused(&enc, &altered);
+            }
+            refused(&enc[1..], &sealed);
+            refused(&[&enc[..], &[0]].concat(), &sealed);
+            refused(&enc, &sealed[1..]);
+            refused(&enc, b"");
+        }
+    }
+
+    #[test]
+    fn a_reply_key_that_is_none_is_refused() {
+        for bytes in [0, 5, 31, 33, 1184, 1215, 1217, 2048] {
+            let key = vec![1; bytes];
+            assert_eq!(seal_grant(&key, &NAME, &SINK, 4, &content()), Err(GrantError::ReplyKey), "{bytes}");
+        }
+        assert_eq!(seal_grant(&[0xff; 1216], &NAME, &SINK, 4, &content()), Err(GrantError::ReplyKey));
+        assert_eq!(seal_grant(&[0; 32], &NAME, &SINK, 4, &content()), Err(GrantError::ReplyKey));
     }
 }

@@ -7,7 +7,7 @@ use aws_lc_rs::{digest, hkdf, hmac};
 use sgc_wire::{Blind, Encode, Metadata, Name, NodeId};
 use zeroize::Zeroize;
 
-use crate::FleetSecret;
+use crate::{CaFingerprint, FleetSecret};
 
 /// The secret of one interface: enough to derive its name, and no other name.
 #[derive(Clone, Zeroize)]
@@ -70,6 +70,17 @@ pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
     let mut out = [0; 32];
     out.copy_from_slice(context.finish().as_ref());
     Name(out)
+}
+
+/// The blind under which the authority of a fleet is asked for certificates: known to all who know its CA, also to
+/// routers, which hold no secret.
+pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc renewal v1");
+    context.update(&ca.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Blind(out)
 }
 
 /// The name of an interface, by one who holds the fleet secret.

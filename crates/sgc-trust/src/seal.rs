@@ -1,36 +1,18 @@
 //! Sealing and opening the fragments of a message, each under its source's key (`docs/spec/trust.md`).
 //!
 //! One pass at the source (plaintext into the packet) and one at the sink (packet into the message); nothing
-//! here keeps state about messages, see [`crate::ReplayWindow`] for that.
+//! here keeps state about messages, see [`crate::ReplayWindow`] for that. Who sealed is said by
+//! [`crate::BatchVerifier`].
 
-use aws_lc_rs::aead::{AES_256_GCM, Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
+use aws_lc_rs::aead::{Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 use aws_lc_rs::hkdf;
-use sgc_wire::{MESSAGE_HEAD_BYTES, MessageHead, Name, PacketHeader, SourceId, TopicGrant};
+use sgc_wire::{MESSAGE_HEAD_BYTES, MessageHead, Name, PacketHeader, SinkId, SourceId, TopicGrant};
 use zeroize::Zeroizing;
+
+use crate::{Suite, trailer_bytes_max};
 
 /// Bytes that sealing adds to a fragment.
 pub const TAG_BYTES: usize = 16;
-
-/// How payloads of a topic are protected.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Suite {
-    /// AES-256-GCM with the topic's key: members trust each other not to forge one another.
-    Group,
-}
-
-impl Suite {
-    /// Id on the wire. 2–15 are reserved for signed suites and other ciphers.
-    pub fn id(self) -> u8 {
-        match self {
-            Self::Group => 1,
-        }
-    }
-
-    /// The suite with that id, if this build has it.
-    pub fn from_id(id: u8) -> Option<Self> {
-        (id == 1).then_some(Self::Group)
-    }
-}
 
 /// Why a packet could not be opened. The packet is dropped and counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
@@ -53,31 +35,54 @@ pub enum OpenError {
     /// The seal does not verify: altered, or sealed by one without the key.
     #[error("the seal does not verify")]
     Forged,
+    /// Index, count and path behind the tag contradict each other.
+    #[error("the place in its batch is impossible")]
+    Trailer,
+    /// The source did not sign it: altered, or made by another member who holds the topic's key.
+    #[error("the source did not sign it")]
+    Signature,
 }
 
-/// The key of one source in one epoch.
+/// The key of one source in one epoch: for packets to all, or for those to one sink.
 pub struct SourceKey {
     key: LessSafeKey,
     suite: Suite,
     epoch: u32,
+    to: Option<SinkId>,
 }
 
 impl SourceKey {
-    /// `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source id)`; `None` for a suite that this
-    /// build does not have.
+    /// The key of packets to all: `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source id)`;
+    /// `None` for a suite that this build does not have.
     pub fn derive(grant: &TopicGrant, name: &Name, source: &SourceId) -> Option<Self> {
+        Self::expand(grant, name, source, None)
+    }
+
+    /// The key of packets to one sink: the same with the sink's id behind the source's. History that was sent to
+    /// another sink, or to this node when it asked under another id, never opens with it.
+    pub fn derive_addressed(
+        grant: &TopicGrant,
+        name: &Name,
+        source: &SourceId,
+        sink: &SinkId,
+    ) -> Option<Self> {
+        Self::expand(grant, name, source, Some(*sink))
+    }
+
+    fn expand(grant: &TopicGrant, name: &Name, source: &SourceId, to: Option<SinkId>) -> Option<Self> {
         let suite = Suite::from_id(grant.suite)?;
         let mut bytes = Zeroizing::new([0; 32]);
+        let sink = to.as_ref().map_or(&[][..], |sink| sink.as_bytes());
         hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc source v1")
             .extract(grant.key.expose())
             .expand(
-                &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes()],
+                &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes(), sink],
                 hkdf::HKDF_SHA256,
             )
             .and_then(|okm| okm.fill(&mut bytes[..]))
             .expect("HKDF-SHA-256 always yields 32 bytes");
-        let key = UnboundKey::new(&AES_256_GCM, &bytes[..]).expect("32 bytes are an AES-256 key");
-        Some(Self { key: LessSafeKey::new(key), suite, epoch: grant.epoch })
+        let key = UnboundKey::new(suite.cipher(), &bytes[..]).expect("both ciphers take keys of 32 bytes");
+        Some(Self { key: LessSafeKey::new(key), suite, epoch: grant.epoch, to })
     }
 
     /// Suite.
@@ -90,16 +95,24 @@ impl SourceKey {
         self.epoch
     }
 
-    /// Appends the sealed fragment to `out`: `fragment`, and behind the first one the message's head.
+    /// The sink whose packets it is for; `None` for those to all.
+    pub fn to(&self) -> Option<SinkId> {
+        self.to
+    }
+
+    /// A sealed fragment: `fragment`, behind the first one the message's head, and the tag; with room for a trailer.
     ///
-    /// The caller must use each (sequence, index) of a source once: the nonce is made of them.
-    pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8], out: &mut Vec<u8>) {
+    /// The header must be of this key's suite, epoch and addressee. The caller must seal one text only under each
+    /// (sequence, index): the nonce is made of them.
+    pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8]) -> Vec<u8> {
         use sgc_wire::Encode;
         debug_assert_eq!(fragment.len(), header.fragment_bytes());
+        debug_assert_eq!((header.suite, header.epoch, header.to), (self.suite.id(), self.epoch, self.to));
         let head = if header.index == 0 { head.to_vec() } else { Vec::new() };
-        let start = out.len();
-        out.resize(start + fragment.len() + head.len() + TAG_BYTES, 0);
-        let (text, rest) = out[start..].split_at_mut(fragment.len());
+        let sealed = fragment.len() + head.len() + TAG_BYTES;
+        let mut out = Vec::with_capacity(sealed + trailer_bytes_max(self.suite));
+        out.resize(sealed, 0);
+        let (text, rest) = out.split_at_mut(fragment.len());
         self.key
             .seal_out_of_place_scatter(
                 nonce(header),
@@ -110,22 +123,35 @@ impl SourceKey {
                 rest,
             )
             .expect("fragments are far below the AEAD's length limit");
+        out
     }
 
-    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes.
-    pub fn open(&self, header: &PacketHeader, sealed: &[u8], out: &mut [u8]) -> Result<(), OpenError> {
+    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes; what it holds after an error is
+    /// not to be used. What stands behind the tag is not looked at.
+    pub fn open(&self, header: &PacketHeader, payload: &[u8], out: &mut [u8]) -> Result<(), OpenError> {
         if header.suite != self.suite.id() {
             return Err(OpenError::Suite { found: header.suite });
         }
         if header.epoch != self.epoch {
             return Err(OpenError::Epoch { found: header.epoch });
         }
-        if sealed.len() != opened_bytes(header) + TAG_BYTES || out.len() != opened_bytes(header) {
+        let text_bytes = opened_bytes(header);
+        let length_fits = match payload.len().checked_sub(text_bytes + TAG_BYTES) {
+            Some(trailer) => self.suite.is_signed() || trailer == 0,
+            None => false,
+        };
+        if !length_fits || out.len() != text_bytes {
             return Err(OpenError::Length);
         }
-        let (text, tag) = sealed.split_at(opened_bytes(header));
+        let (text, rest) = payload.split_at(text_bytes);
         self.key
-            .open_separate_gather(nonce(header), Aad::from(header.associated_data()), text, tag, out)
+            .open_separate_gather(
+                nonce(header),
+                Aad::from(header.associated_data()),
+                text,
+                &rest[..TAG_BYTES],
+                out,
+            )
             .map_err(|_| OpenError::Forged)
     }
 }
@@ -144,30 +170,33 @@ fn nonce(header: &PacketHeader) -> Nonce {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::{Class, MessageKind, SecretBytes};
+    use sgc_wire::{Class, Decode, MessageKind, SecretBytes};
 
     use super::*;
 
-    fn grant() -> TopicGrant {
+    const CIPHERS: [Suite; 2] = [Suite::Group, Suite::GroupChacha];
+
+    fn grant(suite: Suite) -> TopicGrant {
         TopicGrant {
             epoch: 1,
-            suite: Suite::Group.id(),
+            suite: suite.id(),
             key: SecretBytes::new([7; 32]),
             sources: Vec::new(),
             entry: None,
         }
     }
 
-    fn key(source: u8) -> SourceKey {
-        SourceKey::derive(&grant(), &Name([1; 32]), &SourceId([source; 16])).unwrap()
+    fn key(h: &PacketHeader) -> SourceKey {
+        let grant = grant(Suite::from_id(h.suite).unwrap());
+        SourceKey::expand(&grant, &Name([1; 32]), &SourceId([2; 16]), h.to).unwrap()
     }
 
-    fn header(total: u32, index: u16) -> PacketHeader {
+    fn header(suite: Suite, total: u32, index: u16) -> PacketHeader {
         PacketHeader {
             reliable: true,
             class: Class::Default,
             hops: 9,
-            suite: Suite::Group.id(),
+            suite: suite.id(),
             epoch: 1,
             name: Name([1; 32]),
             source: SourceId([2; 16]),
@@ -182,71 +211,77 @@ mod tests {
     const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 99 };
 
     fn sealed(h: &PacketHeader) -> Vec<u8> {
-        let mut out = Vec::new();
-        key(2).seal(h, &HEAD, &vec![5; h.fragment_bytes()], &mut out);
-        out
+        key(h).seal(h, &HEAD, &vec![5; h.fragment_bytes()])
     }
 
-    fn opened(h: &PacketHeader, sealed: &[u8]) -> Result<Vec<u8>, OpenError> {
+    fn opened(h: &PacketHeader, key: &SourceKey, sealed: &[u8]) -> Result<Vec<u8>, OpenError> {
         let mut out = vec![0; opened_bytes(h)];
-        key(2).open(h, sealed, &mut out).map(|()| out)
+        key.open(h, sealed, &mut out).map(|()| out)
     }
 
     #[test]
     fn what_is_sealed_opens_and_the_head_is_behind_the_first_fragment() {
-        use sgc_wire::Decode;
-        for (total, index, bytes) in [(0, 0, 0), (5, 0, 5), (40, 0, 16), (40, 1, 16), (40, 2, 8)] {
-            let h = header(total, index);
-            let plain = opened(&h, &sealed(&h)).unwrap();
-            assert_eq!(&plain[..bytes], &vec![5; bytes]);
-            if index == 0 {
-                assert_eq!(MessageHead::from_slice(&plain[bytes..]), Ok(HEAD));
-            } else {
-                assert_eq!(plain.len(), bytes);
+        for suite in CIPHERS {
+            for (total, index, bytes) in [(0, 0, 0), (5, 0, 5), (40, 0, 16), (40, 1, 16), (40, 2, 8)] {
+                let h = header(suite, total, index);
+                let plain = opened(&h, &key(&h), &sealed(&h)).unwrap();
+                assert_eq!(&plain[..bytes], &vec![5; bytes]);
+                if index == 0 {
+                    assert_eq!(MessageHead::from_slice(&plain[bytes..]), Ok(HEAD));
+                } else {
+                    assert_eq!(plain.len(), bytes);
+                }
             }
         }
     }
 
     #[test]
     fn any_altered_bit_of_payload_or_header_is_detected() {
-        let h = header(40, 1);
-        let good = sealed(&h);
-        for bit in 0..good.len() * 8 {
-            let mut bad = good.clone();
-            bad[bit / 8] ^= 1 << (bit % 8);
-            assert_eq!(opened(&h, &bad), Err(OpenError::Forged));
+        for suite in CIPHERS {
+            let h = header(suite, 40, 1);
+            let (key, good) = (key(&h), sealed(&h));
+            for bit in 0..good.len() * 8 {
+                let mut bad = good.clone();
+                bad[bit / 8] ^= 1 << (bit % 8);
+                assert_eq!(opened(&h, &key, &bad), Err(OpenError::Forged));
+            }
+            let altered = [
+                PacketHeader { seq: 2, ..h.clone() },
+                PacketHeader { index: 0, total: 4, ..h.clone() },
+                PacketHeader { reliable: false, ..h.clone() },
+                PacketHeader { class: Class::Realtime, ..h.clone() },
+                PacketHeader { name: Name([9; 32]), ..h.clone() },
+                PacketHeader { source: SourceId([9; 16]), ..h.clone() },
+                PacketHeader { total: 48, ..h.clone() },
+                PacketHeader { to: Some(SinkId([1; 16])), ..h.clone() },
+            ];
+            for h in altered {
+                assert!(opened(&h, &key, &good).is_err(), "{h:?}");
+            }
+            let epoch = PacketHeader { epoch: 2, ..h.clone() };
+            assert_eq!(opened(&epoch, &key, &good), Err(OpenError::Epoch { found: 2 }));
+            let other = PacketHeader { suite: 9, ..h.clone() };
+            assert_eq!(opened(&other, &key, &good), Err(OpenError::Suite { found: 9 }));
+            assert_eq!(opened(&h, &key, &good[1..]), Err(OpenError::Length));
+            assert_eq!(opened(&h, &key, &[&good[..], &[0]].concat()), Err(OpenError::Length));
         }
-        let altered = [
-            PacketHeader { seq: 2, ..h.clone() },
-            PacketHeader { index: 0, total: 4, ..h.clone() },
-            PacketHeader { reliable: false, ..h.clone() },
-            PacketHeader { class: Class::Realtime, ..h.clone() },
-            PacketHeader { name: Name([9; 32]), ..h.clone() },
-            PacketHeader { source: SourceId([9; 16]), ..h.clone() },
-            PacketHeader { total: 48, ..h.clone() },
-        ];
-        for h in altered {
-            assert!(opened(&h, &good).is_err(), "{h:?}");
-        }
-        assert_eq!(
-            opened(&PacketHeader { epoch: 2, ..h.clone() }, &good),
-            Err(OpenError::Epoch { found: 2 })
-        );
-        assert_eq!(
-            opened(&PacketHeader { suite: 9, ..h.clone() }, &good),
-            Err(OpenError::Suite { found: 9 })
-        );
-        assert_eq!(opened(&h, &good[1..]), Err(OpenError::Length));
     }
 
     #[test]
-    fn sources_epochs_and_names_have_keys_of_their_own() {
-        let h = header(5, 0);
+    fn suites_sources_names_and_addressees_have_keys_of_their_own() {
+        let h = PacketHeader { to: Some(SinkId([3; 16])), ..header(Suite::Group, 5, 0) };
         let good = sealed(&h);
-        let mut out = vec![0; opened_bytes(&h)];
-        assert_eq!(key(3).open(&h, &good, &mut out), Err(OpenError::Forged));
-        let elsewhere = SourceKey::derive(&grant(), &Name([8; 32]), &SourceId([2; 16])).unwrap();
-        assert_eq!(elsewhere.open(&h, &good, &mut out), Err(OpenError::Forged));
-        assert!(SourceKey::derive(&TopicGrant { suite: 0, ..grant() }, &h.name, &h.source).is_none());
+        assert!(opened(&h, &key(&h), &good).is_ok());
+        let g = grant(Suite::Group);
+        let sink = SinkId([3; 16]);
+        for key in [
+            SourceKey::derive_addressed(&g, &h.name, &SourceId([9; 16]), &sink).unwrap(),
+            SourceKey::derive_addressed(&g, &Name([8; 32]), &h.source, &sink).unwrap(),
+            SourceKey::derive_addressed(&g, &h.name, &h.source, &SinkId([4; 16])).unwrap(),
+            SourceKey::derive(&g, &h.name, &h.source).unwrap(),
+        ] {
+            assert_eq!(opened(&h, &key, &good), Err(OpenError::Forged));
+        }
+        assert!(SourceKey::derive(&TopicGrant { suite: 0, ..g }, &h.name, &h.source).is_none());
     }
 }

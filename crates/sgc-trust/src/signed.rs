@@ -8,7 +8,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustls_pki_types::CertificateDer;
-use sgc_wire::{AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, Signed, UnixMillis};
+use sgc_wire::{
+    AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, RefuseReason, RejectReason, Signed,
+    UnixMillis,
+};
 
 use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
 
@@ -39,6 +42,29 @@ pub enum SignedError {
         /// The verifier's time.
         now: UnixMillis,
     },
+}
+
+impl SignedError {
+    /// What a router tells the requester: a wrong clock and a certificate that is over have other cures than a
+    /// forged request; more than that a stranger is not told.
+    pub fn reject_reason(&self) -> RejectReason {
+        match self {
+            Self::Clock { .. } => RejectReason::Clock,
+            Self::Cert(error) if error.is_expiry() => RejectReason::Expired,
+            Self::Cert(CertError::Revoked { .. }) => RejectReason::Revoked,
+            _ => RejectReason::NotVerified,
+        }
+    }
+
+    /// The same as an owner tells it.
+    pub fn refuse_reason(&self) -> RefuseReason {
+        match self {
+            Self::Clock { .. } => RefuseReason::Clock,
+            Self::Cert(error) if error.is_expiry() => RefuseReason::Expired,
+            Self::Cert(CertError::Revoked { .. }) => RefuseReason::Revoked,
+            _ => RefuseReason::NotVerified,
+        }
+    }
 }
 
 /// An advertisement whose owner and names are proven.

@@ -4,6 +4,7 @@
 //! full path validation. It does not decide what a peer may do (that is the policy) and it reads no clock. Host
 //! names are not looked at anywhere: a peer is who its certificate says, wherever it is reached.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 
@@ -12,7 +13,8 @@ use rustls_pki_types::{CertificateDer, SignatureVerificationAlgorithm, TrustAnch
 use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, GroupTag, NodeId, Pseudonym, UnixMillis};
 use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, aws_lc_rs as algs};
 
-use crate::x509::{Validity, split_spki};
+use crate::crl::RevocationList;
+use crate::x509::{Validity, split_spki, without_zeros};
 
 /// Most groups of one node: that many fit into [`CERT_BYTES_MAX`].
 pub const GROUPS_MAX: usize = 32;
@@ -24,8 +26,8 @@ pub(crate) const GROUP_URI: &str = "sgc:group:";
 /// In certificates of nodes that may carry others' names.
 pub(crate) const ROUTER_URI: &str = "sgc:role:router";
 
-/// What certificates may be signed with.
-const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
+/// What certificates and revocation lists may be signed with.
+pub(crate) const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::ECDSA_P256_SHA256,
     algs::ECDSA_P256_SHA384,
     algs::ECDSA_P384_SHA256,
@@ -48,18 +50,20 @@ const OBJECT_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
 ];
 
-/// The CAs whose nodes are believed.
+/// The CAs whose nodes are believed, and what each of them has revoked. Cloning shares.
 #[derive(Clone)]
 pub struct TrustAnchors {
-    anchors: Arc<[Anchor]>,
+    pub(crate) anchors: Arc<[Anchor]>,
     /// The same once more, in the form that path building wants.
-    paths: Arc<[TrustAnchor<'static>]>,
+    pub(crate) paths: Arc<[TrustAnchor<'static>]>,
+    /// One list for each CA at most.
+    pub(crate) lists: Arc<BTreeMap<CaFingerprint, RevocationList>>,
 }
 
-struct Anchor {
-    der: CertificateDer<'static>,
-    spki: Box<[u8]>,
-    fingerprint: CaFingerprint,
+pub(crate) struct Anchor {
+    pub(crate) der: CertificateDer<'static>,
+    pub(crate) spki: Box<[u8]>,
+    pub(crate) fingerprint: CaFingerprint,
     validity: Validity,
 }
 
@@ -80,11 +84,25 @@ impl TrustAnchors {
         if anchors.is_empty() {
             return Err(AnchorError::None);
         }
-        Ok(Self { anchors: anchors.into(), paths: paths.into() })
+        Ok(Self { anchors: anchors.into(), paths: paths.into(), lists: Arc::default() })
+    }
+
+    /// With more CAs, such as a partner's; one that is trusted already is not taken twice. Revocation lists stay.
+    pub fn with_anchors(
+        &self,
+        more: impl IntoIterator<Item = CertificateDer<'static>>,
+    ) -> Result<Self, AnchorError> {
+        let mut certificates: Vec<_> = self.certificates().cloned().collect();
+        for certificate in more {
+            if !certificates.contains(&certificate) {
+                certificates.push(certificate);
+            }
+        }
+        Ok(Self { lists: Arc::clone(&self.lists), ..Self::new(certificates)? })
     }
 
     /// Verifies a chain, leaf first, at the time `now`: path to one of the CAs, signatures, validity, key usage,
-    /// and that the leaf names a node of SGC.
+    /// that no certificate of it is revoked, and that the leaf names a node of SGC.
     pub fn verify(&self, chain: &[CertificateDer<'_>], now: UnixMillis) -> Result<VerifiedPeer, CertError> {
         let (leaf_der, intermediates) = chain.split_first().ok_or(CertError::NoCertificate)?;
         if chain.len() > CHAIN_CERTS_MAX {
@@ -105,26 +123,25 @@ impl TrustAnchors {
             .and_then(|index| self.anchors.get(index))
             .ok_or(CertError::UnknownIssuer)?;
         ca.check_validity(now)?;
-        VerifiedPeer::of_leaf(&leaf, leaf_der, ca)
+        // From the CA down: each certificate by the key that made it.
+        let mut issuer = ca.fingerprint;
+        let mut certs = Vec::with_capacity(chain.len());
+        let mut between: Vec<_> = path.intermediate_certificates().collect();
+        between.reverse();
+        for certificate in between {
+            certs.push(CertId::new(issuer, certificate.serial()));
+            issuer = CaFingerprint(sha256(&[&certificate.subject_public_key_info()]));
+        }
+        certs.push(CertId::new(issuer, leaf.serial()));
+        if let Some(at) = certs.iter().find_map(|c| self.revoked_at(c)) {
+            return Err(CertError::Revoked { at });
+        }
+        VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)
     }
 
     /// The CA certificates, DER.
     pub fn certificates(&self) -> impl Iterator<Item = &CertificateDer<'static>> {
         self.anchors.iter().map(|a| &a.der)
-    }
-
-    /// With more CAs; those that are known already count once.
-    pub fn with_anchors(
-        &self,
-        more: impl IntoIterator<Item = CertificateDer<'static>>,
-    ) -> Result<Self, AnchorError> {
-        let mut certificates: Vec<_> = self.certificates().cloned().collect();
-        for certificate in more {
-            if !certificates.contains(&certificate) {
-                certificates.push(certificate);
-            }
-        }
-        Self::new(certificates)
     }
 
     /// The CAs, by their public keys, in the order of [`TrustAnchors::certificates`].
@@ -192,10 +209,16 @@ impl fmt::Debug for CaFingerprint {
 /// One certificate: its CA and the serial number that the CA gave it. What revocation lists name.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CertId {
-    /// The CA.
+    /// The CA that made it: an intermediate one, if there is one in between.
     pub ca: CaFingerprint,
     /// The serial number, big-endian, without leading zeros (RFC 5280, 4.1.2.2).
     pub serial: Arc<[u8]>,
+}
+
+impl CertId {
+    pub(crate) fn new(ca: CaFingerprint, serial: &[u8]) -> Self {
+        Self { ca, serial: without_zeros(serial).into() }
+    }
 }
 
 impl fmt::Debug for CertId {
@@ -219,12 +242,14 @@ pub struct VerifiedPeer {
     pub not_before: UnixMillis,
     /// Last moment at which its certificate holds.
     pub not_after: UnixMillis,
-    /// The CA that vouches for it.
+    /// The CA that vouches for it: the trusted one at the end of its path.
     pub ca: CaFingerprint,
-    /// The certificate.
+    /// Its certificate.
     pub cert: CertId,
     /// True if its certificate lets it carry others' names (`sgc:role:router`).
     pub may_route: bool,
+    /// All certificates of its path, from the one below the CA to its own.
+    pub path: Arc<[CertId]>,
     key: Arc<[u8]>,
     algorithm: &'static dyn SignatureVerificationAlgorithm,
 }
@@ -247,7 +272,12 @@ impl VerifiedPeer {
         self.groups.binary_search(group).is_ok()
     }
 
-    fn of_leaf(leaf: &EndEntityCert<'_>, der: &[u8], ca: &Anchor) -> Result<Self, CertError> {
+    fn of_leaf(
+        leaf: &EndEntityCert<'_>,
+        der: &[u8],
+        ca: &Anchor,
+        path: Vec<CertId>,
+    ) -> Result<Self, CertError> {
         let mut pseudonym = None;
         let mut groups = Vec::new();
         let mut may_route = false;
@@ -271,9 +301,7 @@ impl VerifiedPeer {
         groups.sort_unstable();
         groups.dedup();
         let pseudonym = pseudonym.ok_or(CertError::NoPseudonym)?;
-        let serial = leaf.serial();
-        let zeros = serial.iter().take_while(|b| **b == 0).count();
-        let serial = serial.get(zeros..).unwrap_or_default().into();
+        let cert = path.last().cloned().ok_or(CertError::NoCertificate)?;
         let Validity { not_before, not_after } =
             Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
         let spki = leaf.subject_public_key_info();
@@ -289,8 +317,9 @@ impl VerifiedPeer {
             not_before,
             not_after,
             ca: ca.fingerprint,
-            cert: CertId { ca: ca.fingerprint, serial },
+            cert,
             may_route,
+            path: path.into(),
             key: key.into(),
             algorithm,
         })
@@ -387,7 +416,10 @@ pub enum CertError {
     #[error("the certificate cannot be used: {0}")]
     Malformed(String),
     /// The leaf does not say which node it is for.
-    #[error("the certificate names no SGC node: it was not made by `sgc fleet enroll`")]
+    #[error(
+        "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign a \
+         request that `sgc fleet request` made, with its subject alternative names"
+    )]
     NoPseudonym,
     /// The leaf names too many groups.
     #[error("the certificate names more than {GROUPS_MAX} groups")]
@@ -422,6 +454,15 @@ pub enum CertError {
         /// The time of the check.
         now: UnixMillis,
     },
+    /// Its CA took it back.
+    #[error(
+        "the certificate was revoked by its CA at {at}: if that is a mistake, the keeper of the fleet has to enroll \
+         the node again"
+    )]
+    Revoked {
+        /// Since when, as the CA says.
+        at: UnixMillis,
+    },
     /// The CA's own certificate is over.
     #[error("the fleet's CA expired at {not_after} and the clock here says {now}")]
     CaExpired {
@@ -433,6 +474,11 @@ pub enum CertError {
 }
 
 impl CertError {
+    /// True if the certificate, or its CA's, does not hold at the time of the check.
+    pub fn is_expiry(&self) -> bool {
+        matches!(self, Self::Expired { .. } | Self::NotYetValid { .. } | Self::CaExpired { .. })
+    }
+
     fn from_webpki(error: webpki::Error) -> Self {
         use webpki::Error as E;
         let millis = |t: UnixTime| UnixMillis(t.as_secs().saturating_mul(1000));

@@ -27,7 +27,7 @@ fn request(node: &str) -> EnrollRequest {
 }
 
 fn enroll(fleet: &Fleet, request: &EnrollRequest) -> Identity {
-    fleet.enroll(request, &mut rng(7)).unwrap()
+    fleet.issue(request, &mut rng(7)).unwrap()
 }
 
 fn at(offset: i64) -> UnixMillis {
@@ -100,7 +100,7 @@ fn a_certificate_with_all_groups_fits() {
     assert_eq!(full.groups().len(), GROUPS_MAX);
     assert!(full.chain()[0].len() <= CERT_BYTES_MAX, "{}", full.chain()[0].len());
     let over = EnrollRequest { groups: groups(GROUPS_MAX + 1), ..request("a") };
-    assert!(matches!(fleet.enroll(&over, &mut rng(1)), Err(FleetError::TooManyGroups { groups: 33 })));
+    assert!(matches!(fleet.issue(&over, &mut rng(1)), Err(FleetError::TooManyGroups { groups: 33 })));
 }
 
 #[test]
@@ -137,7 +137,7 @@ fn a_leaf_never_outlives_its_ca_and_an_expired_ca_is_not_believed() {
     assert_eq!(arm.not_after(), fleet.not_after());
     let after = UnixMillis(fleet.not_after().0 + 1000);
     assert!(matches!(
-        fleet.enroll(&EnrollRequest { now: after, ..request("b") }, &mut rng(1)),
+        fleet.issue(&EnrollRequest { now: after, ..request("b") }, &mut rng(1)),
         Err(FleetError::CaExpired { .. })
     ));
     assert!(matches!(
@@ -259,7 +259,7 @@ fn leaves_of_an_existing_pki_are_judged_by_what_they_say() {
 fn signatures_hold_for_their_signer_message_and_context_only() {
     let fleet = fleet(1);
     let arm = enroll(&fleet, &request("arm-1"));
-    let desk = fleet.enroll(&request("desk"), &mut rng(8)).unwrap();
+    let desk = fleet.issue(&request("desk"), &mut rng(8)).unwrap();
     let peer = fleet.anchors().verify(arm.chain(), NOW).unwrap();
     let signature = arm.sign("test v1", b"message");
     assert_eq!(peer.verify_signature("test v1", b"message", &signature), Ok(()));
@@ -345,7 +345,7 @@ fn block<'a>(text: &'a str, label: &str) -> &'a str {
 fn broken_identity_files_name_the_block() {
     let (ours, theirs) = (fleet(1), fleet(2));
     let text = enroll(&ours, &request("arm-1")).to_text();
-    let foreign = theirs.enroll(&request("arm-1"), &mut rng(9)).unwrap().to_text();
+    let foreign = theirs.issue(&request("arm-1"), &mut rng(9)).unwrap().to_text();
     let refused = |text: &str| Identity::parse(text).unwrap_err();
     for label in ["SGC IDENTITY", "CERTIFICATE", "PRIVATE KEY", "SGC CA CERTIFICATE"] {
         let error = refused(&without(&text, label));
@@ -357,7 +357,7 @@ fn broken_identity_files_name_the_block() {
     assert_eq!(refused(&swap("SGC CA CERTIFICATE")), IdentityError::Chain(CertError::UnknownIssuer));
     assert_eq!(refused(&swap("PRIVATE KEY")), IdentityError::KeyMismatch);
     assert!(matches!(refused(&swap("SGC FLEET SECRET")), IdentityError::NameMismatch { .. }));
-    let desk = ours.enroll(&request("desk"), &mut rng(9)).unwrap().to_text();
+    let desk = ours.issue(&request("desk"), &mut rng(9)).unwrap().to_text();
     let renamed = text.replace(block(&text, "SGC IDENTITY"), block(&desk, "SGC IDENTITY"));
     assert!(matches!(refused(&renamed), IdentityError::NameMismatch { node } if node.as_str() == "desk"));
     let twice = format!("{}{}", text.as_str(), block(&text, "PRIVATE KEY"));

@@ -31,7 +31,7 @@ pub use ids::{
 pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use packet::{
-    Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, MESSAGE_BYTES_MAX, PACKET_VERSION, PAYLOAD_BYTES_MAX,
-    Packet, PacketHeader, Payload,
+    AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, MESSAGE_BYTES_MAX, PACKET_VERSION,
+    PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
 };
 pub use qos::{Durability, History, Liveliness, Qos, Reliability};

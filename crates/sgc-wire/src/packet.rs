@@ -1,8 +1,8 @@
 //! Data packets: one sealed fragment of one message, under its name.
 //!
-//! The header is what routers read; they never see inside the payload. All of it but the hop limit and the
-//! addressee is authenticated by the seal (`sgc-trust`), so a router may only lower the one and choose the
-//! branch by the other. Layout: `docs/spec/wire.md`.
+//! The header is what routers read; they never see inside the payload. All of it but the hop limit is
+//! authenticated by the seal (`sgc-trust`), so a router may lower that and change nothing else unnoticed.
+//! Layout: `docs/spec/wire.md`.
 
 use bytes::{BufMut, Bytes};
 use smallvec::SmallVec;
@@ -16,8 +16,9 @@ pub const PACKET_VERSION: u8 = 1;
 pub const HEADER_BYTES_MAX: usize = HEADER_BYTES + 16;
 /// Header without an addressee, bytes.
 pub const HEADER_BYTES: usize = 76;
-/// Longest payload of one packet, bytes: the largest fragment and what a suite adds.
-pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 512;
+/// Longest payload of one packet, bytes: a fragment of 32 KiB and what a suite adds to it, which is a message
+/// head (12), a tag (16) and the trailer of a batch of 64 under RSA-3072 (6 · 32 + 4 + 384), rounded up.
+pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 1024;
 /// Longest message, bytes of plaintext.
 pub const MESSAGE_BYTES_MAX: u32 = 64 * 1024 * 1024;
 /// Hops that a packet may take.
@@ -60,7 +61,7 @@ pub struct PacketHeader {
     pub index: u16,
     /// Bytes of every fragment but the last, unsealed.
     pub grid: u16,
-    /// The only sink it is for; `None` for all. Not authenticated: it selects branches, nothing more.
+    /// The only sink it is for; `None` for all. Routers choose the branch by it, sinks the key.
     pub to: Option<SinkId>,
 }
 
@@ -86,16 +87,16 @@ impl PacketHeader {
         u32::from(self.index) + 1 == self.fragments()
     }
 
-    /// The bytes that the seal authenticates: the encoding with hop limit zero and no addressee.
-    pub fn associated_data(&self) -> [u8; HEADER_BYTES] {
-        let mut out = [0; HEADER_BYTES];
-        self.put(&mut &mut out[..], 0, None);
-        out
+    /// The bytes that the seal authenticates: the encoding with hop limit zero.
+    pub fn associated_data(&self) -> AssociatedData {
+        let mut bytes = [0; HEADER_BYTES_MAX];
+        self.put(&mut &mut bytes[..], 0);
+        AssociatedData { bytes, len: self.encoded_bytes() }
     }
 
     /// Appends the encoding.
     pub fn put_into(&self, out: &mut impl BufMut) {
-        self.put(out, self.hops, self.to);
+        self.put(out, self.hops);
     }
 
     /// Length of the encoding, bytes.
@@ -103,9 +104,9 @@ impl PacketHeader {
         if self.to.is_some() { HEADER_BYTES_MAX } else { HEADER_BYTES }
     }
 
-    fn put(&self, out: &mut impl BufMut, hops: u8, to: Option<SinkId>) {
+    fn put(&self, out: &mut impl BufMut, hops: u8) {
         let flags = (if self.reliable { FLAG_RELIABLE } else { 0 })
-            | (if to.is_some() { FLAG_TO } else { 0 })
+            | (if self.to.is_some() { FLAG_TO } else { 0 })
             | ((self.class as u8) << CLASS_SHIFT);
         out.put_u8(PACKET_VERSION << 4);
         out.put_u8(flags);
@@ -119,9 +120,22 @@ impl PacketHeader {
         out.put_u16(self.index);
         out.put_u16(self.grid);
         out.put_u32(0); // reserved: a label, once links agree on them
-        if let Some(to) = to {
+        if let Some(to) = self.to {
             out.put_slice(&to.0);
         }
+    }
+}
+
+/// What a seal authenticates of a header; see [`PacketHeader::associated_data`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AssociatedData {
+    bytes: [u8; HEADER_BYTES_MAX],
+    len: usize,
+}
+
+impl AsRef<[u8]> for AssociatedData {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes[..self.len]
     }
 }
 
@@ -286,12 +300,14 @@ mod tests {
     }
 
     #[test]
-    fn hops_and_addressee_are_outside_the_seal() {
+    fn only_the_hops_are_outside_the_seal() {
         let a = header();
-        let b = PacketHeader { hops: 3, to: Some(SinkId([9; 16])), ..header() };
-        assert_eq!(a.associated_data(), b.associated_data());
-        let c = PacketHeader { seq: 43, ..header() };
-        assert_ne!(a.associated_data(), c.associated_data());
+        assert_eq!(a.associated_data().as_ref().len(), HEADER_BYTES);
+        assert_eq!(a.associated_data(), PacketHeader { hops: 3, ..header() }.associated_data());
+        assert_ne!(a.associated_data(), PacketHeader { seq: 43, ..header() }.associated_data());
+        let addressed = |n| PacketHeader { to: Some(SinkId([n; 16])), ..header() }.associated_data();
+        assert_eq!(addressed(9).as_ref().len(), HEADER_BYTES_MAX);
+        assert_ne!(addressed(9), addressed(8));
     }
 
     #[test]

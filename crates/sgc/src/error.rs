@@ -12,7 +12,7 @@ use clap::error::ErrorKind;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
 use sgc_node::{NodeError, RulesError, StateError};
-use sgc_trust::{FleetError, LabelError, TokenError};
+use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
 
@@ -66,16 +66,40 @@ pub(crate) enum CliError {
         hint: &'static str,
     },
     /// A file of secrets that others may read.
-    #[error(
-        "{}: its mode {mode:04o} lets others at the CA's private key: chmod 600 {}",
-        path.display(),
-        path.display()
-    )]
-    FleetExposed {
+    #[error("{}: its mode {mode:04o} lets others at {what}: chmod 600 {}", path.display(), path.display())]
+    Exposed {
         /// The file.
         path: PathBuf,
         /// Its permission bits.
         mode: u32,
+        /// What is in it.
+        what: &'static str,
+    },
+    /// A file that is not what was asked for.
+    #[error("{}: it holds no {what}: {hint}", path.display())]
+    NotInFile {
+        /// The file.
+        path: PathBuf,
+        /// What is missing.
+        what: &'static str,
+        /// What would be right.
+        hint: &'static str,
+    },
+    /// A file of blocks that is broken.
+    #[error("{}: {source}", path.display())]
+    Pem {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: PemError,
+    },
+    /// Parts of an identity that do not fit together.
+    #[error("{}: {source}", path.display())]
+    Identity {
+        /// The file that they are from.
+        path: PathBuf,
+        /// What is wrong.
+        source: IdentityError,
     },
     /// A fleet file that is broken, or a fleet that cannot enrol.
     #[error("{}: {source}", path.display())]
@@ -249,7 +273,10 @@ impl CliError {
             | Self::Arguments { .. }
             | Self::Label(_)
             | Self::Exists { .. }
-            | Self::FleetExposed { .. }
+            | Self::Exposed { .. }
+            | Self::NotInFile { .. }
+            | Self::Pem { .. }
+            | Self::Identity { .. }
             | Self::Fleet { .. }
             | Self::NoFleetHere
             | Self::SeveralFleets { .. }

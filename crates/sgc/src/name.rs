@@ -65,8 +65,8 @@ pub(crate) fn name_of(
     owner: &NodeName,
     share: &ShareConfig,
 ) -> Result<Name, CliError> {
-    let (Some(secret), Some(owner_id)) = (identity.fleet_secret(), identity.node_id_of(owner.as_str()))
-    else {
+    let newest = identity.naming_secrets().first().map(|n| &n.secret);
+    let (Some(secret), Some(owner_id)) = (newest, identity.node_id_of(owner.as_str())) else {
         return Err(CliError::RouterCannotName { path: identity_path.to_owned() });
     };
     let extra = share.metadata.clone();

@@ -133,13 +133,21 @@ pub(crate) fn node_name(config: &Config) -> Result<String, CliError> {
     }
 }
 
-/// The socket of the one node that this user runs with nothing said about its socket.
-fn only_socket() -> Result<PathBuf, CliError> {
+/// The sockets of this user's nodes that are in their usual place, whether somebody answers there or not.
+pub(crate) fn usual_sockets() -> Vec<PathBuf> {
     let usual = sgc_node::default_socket_path("node");
     let dir = usual.parent().unwrap_or(Path::new("/"));
-    let mut found = files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default();
+    files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default()
+}
+
+/// The socket of the one node that this user runs with nothing said about its socket.
+fn only_socket() -> Result<PathBuf, CliError> {
+    let mut found = usual_sockets();
     match found.len() {
-        0 => Err(CliError::NoNodeHere { dir: dir.to_owned() }),
+        0 => {
+            let usual = sgc_node::default_socket_path("node");
+            Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })
+        }
         1 => Ok(found.swap_remove(0)),
         _ => Err(CliError::SeveralNodes { sockets: found.iter().map(|p| p.display().to_string()).collect() }),
     }

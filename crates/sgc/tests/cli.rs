@@ -348,7 +348,7 @@ fn an_expired_identity_is_found_by_check_and_by_run() {
     let mut rng = <rand_chacha::ChaCha20Rng as rand_core::SeedableRng>::from_seed([5; 32]);
     let then = UnixMillis(now().0 - 100 * 86_400_000);
     let fleet = Fleet::create("lab".parse().unwrap(), then, &mut rng).unwrap();
-    let old = fleet.enroll(&EnrollRequest::new("arm-1".parse().unwrap(), then), &mut rng).unwrap();
+    let old = fleet.issue(&EnrollRequest::new("arm-1".parse().unwrap(), then), &mut rng).unwrap();
     place.write("arm-1.identity", &old.to_text());
     place.set_mode("arm-1.identity", 0o600);
     place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://127.0.0.1:1']\n");

@@ -17,12 +17,12 @@ impl<R: RngCore> Routes<R> {
     ///
     /// Rules for shares are told apart by topic, those for uses by owner and topic.
     pub fn reconfigure(&mut self, now: Instant, shares: Vec<ShareRule>, uses: Vec<UseRule>) {
-        self.reconfigure_shares(shares);
+        self.reconfigure_shares(now, shares);
         self.reconfigure_uses(uses);
         self.handle_timeout(now);
     }
 
-    fn reconfigure_shares(&mut self, rules: Vec<ShareRule>) {
+    fn reconfigure_shares(&mut self, now: Instant, rules: Vec<ShareRule>) {
         let old = std::mem::replace(&mut self.share_rules, rules);
         let place = |topic: &str| self.share_rules.iter().position(|r| r.metadata.ros_name == topic);
         let (mut gone, mut kept) = (Vec::new(), Vec::new());
@@ -41,11 +41,15 @@ impl<R: RngCore> Routes<R> {
         for (name, index, is_changed) in kept {
             let Some(route) = self.shares.get_mut(&name) else { continue };
             route.rule = index;
+            if route.writers.is_empty() && self.share_rules[index].policy.publish.is_empty() {
+                route.writerless_until.get_or_insert(now);
+            }
             if is_changed {
                 let policy = self.share_rules[index].policy.clone();
                 self.commands.push_back(Command::UpdatePolicy { name, policy });
             }
         }
+        self.begin_inbound();
         // Publishers that are there already, for what is new; those of a kept share are in it.
         let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);

@@ -2,8 +2,6 @@
 //!
 //! From the first grant on they are use routes like others.
 
-use std::collections::BTreeMap;
-
 use rand_core::RngCore;
 use sgc_trust::name_of;
 use sgc_wire::{CatalogueEntry, Name};
@@ -36,15 +34,7 @@ impl<R: RngCore> Routes<R> {
             route.entry = entry;
             return;
         }
-        let route = UseRoute {
-            rule: index,
-            entry,
-            granted: false,
-            refused: None,
-            writers: BTreeMap::new(),
-            unreachable_until: None,
-        };
-        self.uses.insert(name, route);
+        self.uses.insert(name, UseRoute::new(index, entry));
         for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
             self.check_local(&endpoint);
         }

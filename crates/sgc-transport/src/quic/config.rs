@@ -6,16 +6,19 @@ use std::time::Duration;
 use aws_lc_rs::{hmac, rand};
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use quinn::{ConnectionId, ConnectionIdGenerator, EndpointConfig, IdleTimeout, TransportConfig, VarInt};
-use rustls::crypto::CryptoProvider;
+use rustls::crypto::aws_lc_rs::kx_group;
+use rustls::crypto::{CryptoProvider, SupportedKxGroup};
 use rustls::server::NoServerSessionStorage;
 use rustls::sign::SingleCertAndKey;
-use sgc_trust::Identity;
 
-use super::verifier::{PeerVerifier, Verdict};
+use super::verifier::{Findings, PeerVerifier, Presenter};
+use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
 
-pub(super) static PROVIDER: LazyLock<Arc<CryptoProvider>> =
-    LazyLock::new(|| Arc::new(rustls::crypto::aws_lc_rs::default_provider()));
+static CLASSICAL: LazyLock<Arc<CryptoProvider>> =
+    LazyLock::new(|| provider_with(vec![kx_group::X25519, kx_group::X25519MLKEM768]));
+static POST_QUANTUM: LazyLock<Arc<CryptoProvider>> =
+    LazyLock::new(|| provider_with(vec![kx_group::X25519MLKEM768]));
 
 /// The application protocol (RFC 7301) of version 1.
 const ALPN: &[u8] = b"sgc/1";
@@ -25,6 +28,16 @@ const INCOMING_BYTES_MAX: u64 = 64 << 10;
 const INCOMING_BYTES_TOTAL_MAX: u64 = 8 << 20;
 const RESET_DOMAIN: &[u8] = b"sgc stateless reset v1";
 const CONNECTION_ID_BYTES: usize = 8;
+
+fn provider_with(kx_groups: Vec<&'static dyn SupportedKxGroup>) -> Arc<CryptoProvider> {
+    Arc::new(CryptoProvider { kx_groups, ..rustls::crypto::aws_lc_rs::default_provider() })
+}
+
+/// A node that does not require post-quantum key exchange still has it, second: so a fleet can be switched node by node,
+/// and one that has not been reached yet is not locked out by those that have.
+fn provider(post_quantum: bool) -> &'static Arc<CryptoProvider> {
+    if post_quantum { &POST_QUANTUM } else { &CLASSICAL }
+}
 
 /// Everything that belongs to neither side's handshake.
 pub(super) fn transport(options: &LinkOptions) -> Arc<TransportConfig> {
@@ -49,15 +62,24 @@ pub(super) fn transport(options: &LinkOptions) -> Arc<TransportConfig> {
 
 /// For one incoming connection, with a verdict of its own.
 pub(super) fn server(
-    identity: &Identity,
+    credentials: &CredentialStore,
+    options: &LinkOptions,
     transport: &Arc<TransportConfig>,
-) -> (quinn::ServerConfig, Verdict) {
-    let (verifier, verdict) = PeerVerifier::new(identity.anchors());
-    let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(&PROVIDER))
+) -> (quinn::ServerConfig, Arc<Findings>) {
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
+    let presenter = Presenter {
+        key: identity.certified_key(),
+        accepted: provider.kx_groups.iter().map(|g| g.name()).collect(),
+        findings: Arc::clone(&findings),
+    };
+    let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(provider))
         .with_protocol_versions(&[&rustls::version::TLS13])
         .expect("the provider has cipher suites of TLS 1.3")
         .with_client_cert_verifier(verifier)
-        .with_cert_resolver(Arc::new(SingleCertAndKey::from(identity.certified_key())));
+        .with_cert_resolver(Arc::new(presenter));
     tls.alpn_protocols = vec![ALPN.to_vec()];
     // A resumed session would skip the certificate, and with it expiry and revocation.
     tls.session_storage = Arc::new(NoServerSessionStorage {});
@@ -69,16 +91,16 @@ pub(super) fn server(
     config.transport_config(Arc::clone(transport));
     // Retry makes its own tokens; those for later connections are not worth their state.
     config.validation_token.sent(0);
-    (config, verdict)
+    (config, findings)
 }
 
 /// For the listening endpoint itself.
 pub(super) fn listener(
-    identity: &Identity,
-    transport: &Arc<TransportConfig>,
+    credentials: &CredentialStore,
     options: &LinkOptions,
+    transport: &Arc<TransportConfig>,
 ) -> quinn::ServerConfig {
-    let (mut config, _) = server(identity, transport);
+    let (mut config, _) = server(credentials, options, transport);
     config
         .max_incoming(options.handshakes_max)
         .incoming_buffer_size(INCOMING_BYTES_MAX)
@@ -88,16 +110,21 @@ pub(super) fn listener(
 
 /// For one outgoing connection, with a verdict of its own.
 pub(super) fn client(
-    identity: &Identity,
+    credentials: &CredentialStore,
+    options: &LinkOptions,
     transport: &Arc<TransportConfig>,
-) -> (quinn::ClientConfig, Verdict) {
-    let (verifier, verdict) = PeerVerifier::new(identity.anchors());
-    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(&PROVIDER))
+) -> (quinn::ClientConfig, Arc<Findings>) {
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
+    let key = identity.certified_key();
+    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(provider))
         .with_protocol_versions(&[&rustls::version::TLS13])
         .expect("the provider has cipher suites of TLS 1.3")
         .dangerous()
         .with_custom_certificate_verifier(verifier)
-        .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(identity.certified_key())));
+        .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(key)));
     tls.alpn_protocols = vec![ALPN.to_vec()];
     tls.resumption = rustls::client::Resumption::disabled();
     tls.enable_early_data = false;
@@ -108,7 +135,7 @@ pub(super) fn client(
     let mut config = quinn::ClientConfig::new(Arc::new(crypto));
     config.transport_config(Arc::clone(transport));
     config.token_store(Arc::new(quinn::NoneTokenStore));
-    (config, verdict)
+    (config, findings)
 }
 
 /// For the socket of a listener. With the identity's reset key, peers of a listener that was killed and started again on

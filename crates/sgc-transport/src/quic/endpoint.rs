@@ -8,18 +8,22 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use quinn::crypto::rustls::HandshakeData;
 use quinn::{Connecting, Connection, ConnectionError, Endpoint, Incoming, TransportConfig, VarInt};
-use sgc_trust::{CertError, Identity};
+use rustls::NamedGroup;
+use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use super::verifier::Verdict;
+use super::verifier::Findings;
 use super::{
     ControlRx, Fate, Inlet, Outlet, PRIORITY_CONTROL, QuicLink, Shared, canonical, close, config, send_frame,
 };
+use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, Pieces};
+use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::url::LinkUrl;
@@ -46,7 +50,7 @@ pub(crate) struct QuicListener {
 
 /// What every incoming handshake needs.
 struct Acceptor {
-    identity: Arc<Identity>,
+    credentials: CredentialStore,
     options: LinkOptions,
     transport: Arc<TransportConfig>,
     metrics: Arc<TransportMetrics>,
@@ -73,18 +77,18 @@ impl Overload {
 impl QuicListener {
     pub(crate) fn bind(
         addr: SocketAddr,
-        identity: Arc<Identity>,
+        credentials: CredentialStore,
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> std::io::Result<Self> {
         let socket = UdpSocket::bind(addr)?;
         let local = socket.local_addr()?;
         let transport = config::transport(&options);
-        let server = config::listener(&identity, &transport, &options);
+        let server = config::listener(&credentials, &options, &transport);
         let runtime = quinn::default_runtime().ok_or_else(|| std::io::Error::other("no tokio runtime"))?;
-        let endpoint_config = config::endpoint(identity.reset_key(), local.port());
+        let endpoint_config = config::endpoint(credentials.identity().reset_key(), local.port());
         let endpoint = Endpoint::new(endpoint_config, Some(server), socket, runtime)?;
-        let acceptor = Arc::new(Acceptor { identity, options, transport, metrics });
+        let acceptor = Arc::new(Acceptor { credentials, options, transport, metrics });
         Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), overload: Overload::default() })
     }
 
@@ -153,8 +157,8 @@ impl Acceptor {
     }
 
     async fn link(&self, incoming: Incoming) -> Result<QuicLink, Refusal> {
-        let (server, verdict) = config::server(&self.identity, &self.transport);
-        let refusal = |e: ConnectionError| refusal(&verdict, &e, &self.options);
+        let (server, findings) = config::server(&self.credentials, &self.options, &self.transport);
+        let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         let fate = Fate::new(self.options.idle_timeout);
         let greeted = async {
@@ -166,7 +170,7 @@ impl Acceptor {
             Ok((tx, rx))
         };
         match greeted.await {
-            Ok(control) => link(connection, &verdict, false, control, fate).map_err(Refusal::Certificate),
+            Ok(control) => link(connection, &findings, false, control, fate).map_err(Refusal::Certificate),
             Err(error) => Err(ungreeted(&connection, &fate, error)),
         }
     }
@@ -174,7 +178,7 @@ impl Acceptor {
 
 /// Dials QUIC links, all from one socket for each address family.
 pub(crate) struct QuicDialer {
-    identity: Arc<Identity>,
+    credentials: CredentialStore,
     options: LinkOptions,
     transport: Arc<TransportConfig>,
     metrics: Arc<TransportMetrics>,
@@ -188,16 +192,20 @@ struct Endpoints {
 }
 
 impl QuicDialer {
-    pub(crate) fn new(identity: Arc<Identity>, options: LinkOptions, metrics: Arc<TransportMetrics>) -> Self {
+    pub(crate) fn new(
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> Self {
         let transport = config::transport(&options);
-        Self { identity, options, transport, metrics, endpoints: Mutex::default() }
+        Self { credentials, options, transport, metrics, endpoints: Mutex::default() }
     }
 
     pub(crate) async fn dial(&self, url: &LinkUrl) -> Result<QuicLink, DialError> {
         let addresses = self.resolve(url).await?;
         let failed = |attempts| DialError::Failed { url: url.clone(), attempts };
-        let (remote, connection, verdict) = self.connect(addresses).await.map_err(failed)?;
-        let link = self.greet(connection, verdict).await.map_err(|e| failed(vec![(remote, e)]))?;
+        let (remote, connection, findings) = self.connect(addresses).await.map_err(failed)?;
+        let link = self.greet(connection, findings).await.map_err(|e| failed(vec![(remote, e)]))?;
         self.metrics.count_dialed();
         Ok(link)
     }
@@ -228,17 +236,17 @@ impl QuicDialer {
     async fn connect(
         &self,
         addresses: Vec<SocketAddr>,
-    ) -> Result<(SocketAddr, Connection, Verdict), Vec<(SocketAddr, LinkError)>> {
+    ) -> Result<(SocketAddr, Connection, Arc<Findings>), Vec<(SocketAddr, LinkError)>> {
         let mut rest = addresses.into_iter();
         let mut racing = JoinSet::new();
         let mut failed = Vec::new();
         loop {
             match rest.next() {
                 Some(address) => match self.start(address) {
-                    Ok((connecting, verdict)) => {
+                    Ok((connecting, findings)) => {
                         let options = self.options.clone();
                         racing.spawn(async move {
-                            (address, finish(connecting, &verdict, &options).await.map(|c| (c, verdict)))
+                            (address, finish(connecting, &findings, &options).await.map(|c| (c, findings)))
                         });
                     }
                     Err(error) => {
@@ -253,7 +261,7 @@ impl QuicDialer {
             tokio::select! {
                 Some(done) = racing.join_next() => match done {
                     // The others are dropped with the set, before any of them has become a link over there.
-                    Ok((address, Ok((connection, verdict)))) => return Ok((address, connection, verdict)),
+                    Ok((address, Ok((connection, findings)))) => return Ok((address, connection, findings)),
                     Ok((address, Err(error))) => failed.push((address, error)),
                     Err(error) => tracing::error!(%error, "an attempt to connect ended abnormally"),
                 },
@@ -262,13 +270,13 @@ impl QuicDialer {
         }
     }
 
-    fn start(&self, address: SocketAddr) -> Result<(Connecting, Verdict), LinkError> {
-        let (client, verdict) = config::client(&self.identity, &self.transport);
+    fn start(&self, address: SocketAddr) -> Result<(Connecting, Arc<Findings>), LinkError> {
+        let (client, findings) = config::client(&self.credentials, &self.options, &self.transport);
         let endpoint = self.endpoint(address)?;
         let connecting = endpoint
             .connect_with(client, address, SERVER_NAME)
             .map_err(|e| LinkError::Transport(e.to_string()))?;
-        Ok((connecting, verdict))
+        Ok((connecting, findings))
     }
 
     fn endpoint(&self, remote: SocketAddr) -> Result<Endpoint, LinkError> {
@@ -283,7 +291,7 @@ impl QuicDialer {
         }
     }
 
-    async fn greet(&self, connection: Connection, verdict: Verdict) -> Result<QuicLink, LinkError> {
+    async fn greet(&self, connection: Connection, findings: Arc<Findings>) -> Result<QuicLink, LinkError> {
         let fate = Fate::new(self.options.idle_timeout);
         let after = self.options.handshake_timeout;
         let greeted = async {
@@ -296,7 +304,7 @@ impl QuicDialer {
             Ok((tx, rx))
         };
         match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
-            Ok(control) => link(connection, &verdict, true, control, fate).map_err(LinkError::RefusedHere),
+            Ok(control) => link(connection, &findings, true, control, fate).map_err(LinkError::RefusedHere),
             Err(error) => {
                 if let LinkError::Protocol(why) = &error {
                     close(&connection, &fate, &CloseReason::Protocol(why.to_string()), error.clone());
@@ -310,13 +318,13 @@ impl QuicDialer {
 /// Waits for an outgoing handshake.
 async fn finish(
     connecting: Connecting,
-    verdict: &Verdict,
+    findings: &Findings,
     options: &LinkOptions,
 ) -> Result<Connection, LinkError> {
     let after = options.handshake_timeout;
     match timeout(after, connecting).await {
         Ok(Ok(connection)) => Ok(connection),
-        Ok(Err(error)) => Err(match verdict.get() {
+        Ok(Err(error)) => Err(match findings.verdict() {
             Some(Err(cert)) => LinkError::RefusedHere(cert.clone()),
             _ => LinkError::from_quinn(&error, options.idle_timeout),
         }),
@@ -332,26 +340,40 @@ async fn hear_greeting(rx: &mut ControlRx) -> Result<(), LinkError> {
 
 fn link(
     connection: Connection,
-    verdict: &Verdict,
+    findings: &Findings,
     is_dialer: bool,
     (control_tx, control_rx): (Outlet, ControlRx),
     fate: Arc<Fate>,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
-    let peer = verdict.get().cloned().unwrap_or(Err(CertError::NoCertificate))?;
+    let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
+    let key_exchange = key_exchange(&connection);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
-    Ok(QuicLink { shared: Arc::new(Shared { connection, peer, is_dialer, control_tx, control_rx, fate }) })
+    let shared = Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, fate };
+    Ok(QuicLink { shared: Arc::new(shared) })
+}
+
+fn key_exchange(connection: &Connection) -> KeyExchange {
+    let data = connection.handshake_data().and_then(|data| data.downcast::<HandshakeData>().ok());
+    match data.map(|data| data.negotiated_key_exchange_group) {
+        Some(NamedGroup::X25519) => KeyExchange::X25519,
+        Some(NamedGroup::X25519MLKEM768) => KeyExchange::X25519MlKem768,
+        _ => KeyExchange::Unknown,
+    }
 }
 
 /// Why an incoming handshake failed.
-fn refusal(verdict: &Verdict, error: &ConnectionError, options: &LinkOptions) -> Refusal {
+fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) -> Refusal {
     const ALERT_CERTIFICATE_REQUIRED: u64 = 0x100 + 116;
     const ALERT_PROTOCOL_VERSION: u64 = 0x100 + 70;
     const ALERT_NO_APPLICATION_PROTOCOL: u64 = 0x100 + 120;
-    if let Some(Err(cert)) = verdict.get() {
+    if let Some(Err(cert)) = findings.verdict() {
         return Refusal::Certificate(cert.clone());
     }
     match error {
+        ConnectionError::TransportError(_) if findings.lacks_key_exchange() => {
+            Refusal::KeyExchange { post_quantum: findings.post_quantum }
+        }
         ConnectionError::TransportError(e) => match u64::from(e.code) {
             ALERT_CERTIFICATE_REQUIRED => Refusal::Certificate(CertError::NoCertificate),
             ALERT_PROTOCOL_VERSION | ALERT_NO_APPLICATION_PROTOCOL => Refusal::Version(e.reason.clone()),

@@ -25,7 +25,7 @@ use tokio::sync::Mutex;
 use crate::error::{CloseReason, FlowEnd, FlowError, LinkError, ProtocolError};
 use crate::flow::{self, Chunks, FlowRx, FlowTx};
 use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
-use crate::link::{Link, LinkStats};
+use crate::link::{KeyExchange, Link, LinkStats};
 
 const PRIORITY_CONTROL: i32 = 3;
 /// How many pieces one read takes at most: it bounds what is received and not yet consumed.
@@ -41,6 +41,7 @@ struct Shared {
     connection: Connection,
     peer: VerifiedPeer,
     is_dialer: bool,
+    key_exchange: KeyExchange,
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
     fate: Arc<Fate>,
@@ -271,6 +272,7 @@ impl Link for QuicLink {
             lost_bytes: stats.path.lost_bytes,
             congestion_window_bytes: stats.path.cwnd,
             mtu_bytes: stats.path.current_mtu,
+            key_exchange: self.shared.key_exchange,
         }
     }
 

@@ -8,31 +8,59 @@ use std::fmt;
 use std::sync::{Arc, OnceLock};
 
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use rustls::crypto::WebPkiSupportedAlgorithms;
+use rustls::crypto::{CryptoProvider, WebPkiSupportedAlgorithms};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::server::{ClientHello, ResolvesServerCert};
+use rustls::sign::CertifiedKey;
 use rustls::{
-    CertificateError, DigitallySignedStruct, DistinguishedName, Error, PeerIncompatible, SignatureScheme,
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error, NamedGroup, PeerIncompatible,
+    SignatureScheme,
 };
 use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
-use sgc_trust::{CertError, TrustAnchors, VerifiedPeer};
+use sgc_trust::{CertError, VerifiedPeer};
 use sgc_wire::UnixMillis;
 
-use super::config::PROVIDER;
+use crate::credentials::CredentialStore;
 
-/// What was found of the peer; empty as long as no certificate came.
-pub(super) type Verdict = Arc<OnceLock<Result<VerifiedPeer, CertError>>>;
+/// What a handshake found out about the peer.
+#[derive(Debug, Default)]
+pub(super) struct Findings {
+    /// Empty as long as no certificate came.
+    verdict: OnceLock<Result<VerifiedPeer, CertError>>,
+    /// Whether only post-quantum key exchanges are accepted.
+    pub(super) post_quantum: bool,
+    /// Whether a dialer's groups hold one that is accepted here; empty as long as it offered none.
+    offers_group: OnceLock<bool>,
+}
+
+impl Findings {
+    /// Who the peer is, or why it is not believed.
+    pub(super) fn verdict(&self) -> Option<&Result<VerifiedPeer, CertError>> {
+        self.verdict.get()
+    }
+
+    /// True if it was heard out and offers no key exchange that is accepted here.
+    pub(super) fn lacks_key_exchange(&self) -> bool {
+        self.offers_group.get() == Some(&false)
+    }
+}
 
 pub(super) struct PeerVerifier {
-    anchors: TrustAnchors,
+    credentials: CredentialStore,
     algorithms: WebPkiSupportedAlgorithms,
-    verdict: Verdict,
+    findings: Arc<Findings>,
 }
 
 impl PeerVerifier {
-    pub(super) fn new(anchors: &TrustAnchors) -> (Arc<Self>, Verdict) {
-        let verdict = Verdict::default();
-        let algorithms = PROVIDER.signature_verification_algorithms;
-        (Arc::new(Self { anchors: anchors.clone(), algorithms, verdict: Arc::clone(&verdict) }), verdict)
+    pub(super) fn new(
+        credentials: &CredentialStore,
+        provider: &CryptoProvider,
+        post_quantum: bool,
+    ) -> (Arc<Self>, Arc<Findings>) {
+        let (credentials, findings) =
+            (credentials.clone(), Arc::new(Findings { post_quantum, ..Findings::default() }));
+        let algorithms = provider.signature_verification_algorithms;
+        (Arc::new(Self { credentials, algorithms, findings: Arc::clone(&findings) }), findings)
     }
 
     fn judge(
@@ -42,18 +70,64 @@ impl PeerVerifier {
         now: UnixTime,
     ) -> Result<(), Error> {
         let chain: Vec<CertificateDer<'_>> = std::iter::once(leaf).chain(intermediates).cloned().collect();
-        let result = self.anchors.verify(&chain, UnixMillis(now.as_secs().saturating_mul(1000)));
+        // Read here and not when the handshake began: what was revoked since counts.
+        let anchors = self.credentials.anchors();
+        let result = anchors.verify(&chain, UnixMillis(now.as_secs().saturating_mul(1000)));
         let answer = result.as_ref().map(drop).map_err(|e| Error::InvalidCertificate(alert(e)));
         // The first verdict stands: a handshake asks once.
-        let _ = self.verdict.set(result);
+        let _ = self.findings.verdict.set(result);
         answer
+    }
+}
+
+/// Shows the listener's certificate, and notes what the dialer offers: an alert says nothing of it.
+#[derive(Debug)]
+pub(super) struct Presenter {
+    pub(super) key: Arc<CertifiedKey>,
+    pub(super) accepted: Vec<NamedGroup>,
+    pub(super) findings: Arc<Findings>,
+}
+
+impl ResolvesServerCert for Presenter {
+    fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        if let Some(offered) = hello.named_groups() {
+            let _ = self.findings.offers_group.set(offered.iter().any(|g| self.accepted.contains(g)));
+        }
+        Some(Arc::clone(&self.key))
     }
 }
 
 impl fmt::Debug for PeerVerifier {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("PeerVerifier").field(&self.anchors).finish()
+        f.debug_tuple("PeerVerifier").field(&self.credentials).finish()
     }
+}
+
+/// Rustls asks both of its verifiers for the same three things. Signatures are those of TLS 1.3, by the provider.
+macro_rules! handshake_signatures {
+    () => {
+        fn verify_tls12_signature(
+            &self,
+            _message: &[u8],
+            _cert: &CertificateDer<'_>,
+            _dss: &DigitallySignedStruct,
+        ) -> Result<HandshakeSignatureValid, Error> {
+            Err(PeerIncompatible::Tls12NotOffered.into())
+        }
+
+        fn verify_tls13_signature(
+            &self,
+            message: &[u8],
+            cert: &CertificateDer<'_>,
+            dss: &DigitallySignedStruct,
+        ) -> Result<HandshakeSignatureValid, Error> {
+            rustls::crypto::verify_tls13_signature(message, cert, dss, &self.algorithms)
+        }
+
+        fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+            self.algorithms.supported_schemes()
+        }
+    };
 }
 
 impl ServerCertVerifier for PeerVerifier {
@@ -68,27 +142,7 @@ impl ServerCertVerifier for PeerVerifier {
         self.judge(end_entity, intermediates, now).map(|()| ServerCertVerified::assertion())
     }
 
-    fn verify_tls12_signature(
-        &self,
-        _message: &[u8],
-        _cert: &CertificateDer<'_>,
-        _dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Err(PeerIncompatible::Tls12NotOffered.into())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        cert: &CertificateDer<'_>,
-        dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        rustls::crypto::verify_tls13_signature(message, cert, dss, &self.algorithms)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.algorithms.supported_schemes()
-    }
+    handshake_signatures!();
 }
 
 impl ClientCertVerifier for PeerVerifier {
@@ -106,33 +160,14 @@ impl ClientCertVerifier for PeerVerifier {
         self.judge(end_entity, intermediates, now).map(|()| ClientCertVerified::assertion())
     }
 
-    fn verify_tls12_signature(
-        &self,
-        _message: &[u8],
-        _cert: &CertificateDer<'_>,
-        _dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Err(PeerIncompatible::Tls12NotOffered.into())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        cert: &CertificateDer<'_>,
-        dss: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        rustls::crypto::verify_tls13_signature(message, cert, dss, &self.algorithms)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.algorithms.supported_schemes()
-    }
+    handshake_signatures!();
 }
 
 /// What the peer is told: the alert that fits, and no more.
 fn alert(error: &CertError) -> CertificateError {
     match error {
         CertError::UnknownIssuer => CertificateError::UnknownIssuer,
+        CertError::Revoked { .. } => CertificateError::Revoked,
         CertError::BadSignature => CertificateError::BadSignature,
         CertError::Expired { .. } | CertError::CaExpired { .. } => CertificateError::Expired,
         CertError::NotYetValid { .. } => CertificateError::NotValidYet,

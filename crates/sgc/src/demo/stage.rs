@@ -169,7 +169,7 @@ fn identity_file(node: &str) -> String {
 fn enroll(fleet: &Fleet, node: &str, router: bool) -> Result<Identity, CliError> {
     let request = EnrollRequest { router, ..EnrollRequest::new(node.parse()?, fleet::unix_now()) };
     fleet
-        .enroll(&request, &mut fleet::system_rng()?)
+        .issue(&request, &mut fleet::system_rng()?)
         .map_err(|source| CliError::Fleet { path: FLEET.into(), source })
 }
 

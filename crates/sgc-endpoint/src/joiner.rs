@@ -1,0 +1,333 @@
+//! As one who joins others' names: topics to receive or to publish on, catalogues, and the authority of the fleet.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+
+use sgc_trust::{
+    Identity, Kem, ReplyKey, TopicSecret, VerifiedPeer, name_of, renewal_blind, verify_advert, verify_answer,
+};
+use sgc_wire::{
+    Answer, AnswerBody, Control, Decode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Recover,
+    RefuseReason, RejectReason, Signed, SinkId, SourceId,
+};
+
+use crate::endpoint::{Dropped, Endpoint, Event};
+use crate::joins::{Join, JoinState, LostReason, RefusedBy, Wish};
+
+impl Endpoint {
+    /// Follows a fleet member's catalogue; false if this identity holds no fleet secret to find it with.
+    pub fn follow(&mut self, now: Now, owner_name: &str) -> bool {
+        self.now = now;
+        let Some(owner) = self.config.identity.node_id_of(owner_name) else { return false };
+        self.followed_names.insert(owner, owner_name.to_owned());
+        self.refollow();
+        true
+    }
+
+    /// Follows a catalogue no longer.
+    pub fn unfollow(&mut self, now: Now, owner: &NodeId) {
+        self.now = now;
+        self.followed_names.remove(owner);
+        self.refollow();
+    }
+
+    /// Follows the catalogues of all followed owners under all secrets in use, and no others: while a secret is
+    /// being replaced, some owners are found under the old one and some under the new.
+    pub(crate) fn refollow(&mut self) {
+        let identity = self.config.identity.clone();
+        let names = |(owner, owner_name): (&NodeId, &String)| {
+            let metadata = Metadata::catalogue(owner_name);
+            let secrets = identity.naming_secrets().iter();
+            let blinds = secrets.map(|s| TopicSecret::derive(&s.secret, &metadata).blind());
+            blinds.map(|blind| (name_of(owner, &blind), *owner)).collect::<Vec<_>>()
+        };
+        let wanted: Vec<_> = self.followed_names.iter().flat_map(names).collect();
+        let gone: Vec<_> =
+            self.followed.keys().filter(|n| wanted.iter().all(|(w, _)| w != *n)).copied().collect();
+        for name in gone {
+            self.leave(self.now, &name);
+        }
+        for (name, owner) in wanted {
+            self.followed.insert(name, owner);
+            self.join(self.now, name, owner, Wish::Follow);
+        }
+    }
+
+    /// Asks the fleet's authority for credentials; asks anew if it did before. False if the identity names none.
+    pub fn renew(&mut self, now: Now, csr: Bytes) -> bool {
+        let identity = &self.config.identity;
+        let Some(authority) = identity.authority() else { return false };
+        let name = name_of(&authority, &renewal_blind(&identity.as_peer().ca));
+        self.leave(now, &name);
+        self.join(now, name, authority, Wish::Renew(csr));
+        true
+    }
+
+    /// Joins a name of `owner`; waits for it if need be, and joins again whenever it must.
+    pub fn join(&mut self, now: Now, name: Name, owner: NodeId, wish: Wish) {
+        self.now = now;
+        if self.joins.contains_key(&name) {
+            return;
+        }
+        self.joins.insert(name, Join::new(owner, wish));
+        self.send(Control::Interest { names: vec![name] });
+    }
+
+    /// Leaves a name.
+    pub fn leave(&mut self, now: Now, name: &Name) {
+        self.now = now;
+        let Some(join) = self.joins.remove(name) else { return };
+        self.followed.remove(name);
+        if let Some(sink) = join.sink() {
+            self.send(Control::Leave { name: *name, sink });
+        }
+        self.send(Control::Uninterest { names: vec![*name] });
+    }
+
+    /// The sink under which a name is granted to this node.
+    pub fn sink_of(&self, name: &Name) -> Option<SinkId> {
+        self.is_granted(name).then(|| self.joins.get(name)?.sink()).flatten()
+    }
+
+    /// Asks a source of a granted name for its messages `from..=to`.
+    pub fn recover(&mut self, name: Name, source: SourceId, from: u64, to: u64) {
+        if let Some(JoinState::Granted { sink, .. }) = self.joins.get(&name).map(|j| &j.state) {
+            let recover = Recover { name, sink: *sink, source, from, to };
+            self.send(Control::Recover(recover));
+        }
+    }
+
+    /// Asks for everything granted once more, under the present certificate. Nothing is interrupted.
+    pub(crate) fn refresh_joins(&mut self) {
+        let identity = self.config.identity.clone();
+        let frames: Vec<_> = self
+            .joins
+            .iter()
+            .filter_map(|(name, join)| match &join.state {
+                JoinState::Granted { sink, reply_key, .. } if !matches!(join.wish, Wish::Renew(_)) => {
+                    Some(self.join_frame(&identity, *name, *sink, &join.wish, reply_key.public().clone()))
+                }
+                _ => None,
+            })
+            .collect();
+        frames.into_iter().for_each(|frame| self.send(frame));
+    }
+
+    fn join_frame(
+        &self,
+        identity: &Arc<Identity>,
+        name: Name,
+        sink: SinkId,
+        wish: &Wish,
+        reply_key: Bytes,
+    ) -> Control {
+        let body = JoinBody {
+            name,
+            sink,
+            request: wish.request(),
+            issued_at: self.now.unix,
+            chain: identity.chain_bytes(),
+            reply_key,
+        };
+        Control::Join { signed: identity.sign_join(&body) }
+    }
+
+    pub(crate) fn ask_due(&mut self) {
+        let now = self.now.instant;
+        let due: Vec<_> = self
+            .joins
+            .iter()
+            .filter(|(_, j)| j.deadline().is_some_and(|at| at <= now))
+            .map(|(n, _)| *n)
+            .collect();
+        for name in due {
+            if let Some(Join { state: JoinState::ExpectAnswer { sink, .. }, .. }) = self.joins.get(&name) {
+                let sink = *sink;
+                self.send(Control::Leave { name, sink });
+            }
+            self.ask(name);
+        }
+    }
+
+    pub(crate) fn handle_advert(&mut self, signed: &Signed) {
+        let advert = match verify_advert(&self.anchors, signed, self.now.unix) {
+            Ok(advert) => advert,
+            Err(why) => return self.drop_frame(Dropped::NotVerified { what: "advertisement", why }),
+        };
+        for name in advert.names {
+            let Some(join) = self.joins.get_mut(&name).filter(|j| j.owner == advert.owner.node_id) else {
+                continue; // another name of the same batch
+            };
+            if advert.body.withdraw {
+                self.lose(name, LostReason::Withdrawn, true);
+                continue;
+            }
+            join.reachable = Some(advert.owner.clone());
+            match join.state {
+                JoinState::ExpectAdvert | JoinState::ExpectRetry { refused: None, .. } => self.ask(name),
+                _ => {}
+            }
+        }
+    }
+
+    /// The way to a name's owner is gone.
+    pub(crate) fn lose(&mut self, name: Name, reason: LostReason, withdrawn: bool) {
+        let Some(join) = self.joins.get_mut(&name) else { return };
+        join.reachable = None;
+        let was = std::mem::replace(&mut join.state, JoinState::ExpectAdvert);
+        join.succeeded();
+        if let JoinState::Granted { .. } = was {
+            self.lost(name, reason);
+        } else if withdrawn && let Some(owner) = self.followed.get(&name) {
+            self.owner_lost(*owner, reason);
+        }
+    }
+
+    fn lost(&mut self, name: Name, reason: LostReason) {
+        match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
+            (Some(owner), _) => self.owner_lost(*owner, reason),
+            (None, Some(Wish::Renew(_))) => {}
+            (None, _) => self.event(Event::Lost { name, reason }),
+        }
+    }
+
+    /// One catalogue of an owner is lost; the owner is once all are.
+    fn owner_lost(&mut self, owner: NodeId, reason: LostReason) {
+        if !self.hears(&owner) {
+            self.event(Event::OwnerLost { owner, reason });
+        }
+    }
+
+    fn hears(&self, owner: &NodeId) -> bool {
+        self.followed.iter().any(|(name, o)| o == owner && self.is_granted(name))
+    }
+
+    fn refused(&mut self, name: Name, by: RefusedBy) {
+        match (self.followed.get(&name).copied(), self.joins.get(&name).map(|j| &j.wish)) {
+            (Some(owner), _) if self.hears(&owner) => {}
+            (Some(owner), _) => self.event(Event::OwnerRefused { owner, by }),
+            (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
+            (None, _) => self.event(Event::Refused { name, by }),
+        }
+    }
+
+    /// Asks the owner of `name`, if there is a way to it.
+    fn ask(&mut self, name: Name) {
+        let identity = self.config.identity.clone();
+        let Some(join) = self.joins.get_mut(&name) else { return };
+        if join.reachable.is_none() {
+            join.state = JoinState::ExpectAdvert;
+            return;
+        }
+        let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
+        let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
+        let wish = join.wish.clone();
+        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        self.send(frame);
+    }
+
+    pub(crate) fn handle_answer(&mut self, signed: &Signed) {
+        let Ok(claimed) = AnswerBody::from_slice(&signed.body) else {
+            return self.unexpected("answer");
+        };
+        let Some(owner) = self.joins.get(&claimed.name).and_then(|j| j.reachable.clone()) else {
+            return self.unexpected("answer");
+        };
+        match verify_answer(&owner, signed) {
+            Ok(body) => self.handle_verified_answer(&owner, body),
+            Err(why) => self.drop_frame(Dropped::NotVerified { what: "answer", why }),
+        }
+    }
+
+    fn handle_verified_answer(&mut self, owner: &VerifiedPeer, body: AnswerBody) {
+        let AnswerBody { name, sink, serial, answer } = body;
+        let Some(join) = self.joins.get_mut(&name).filter(|j| j.sink() == Some(sink)) else {
+            return self.unexpected("answer");
+        };
+        let state = std::mem::replace(&mut join.state, JoinState::ExpectAdvert);
+        let (reply_key, last, was_granted) = match state {
+            JoinState::ExpectAnswer { reply_key, .. } => (reply_key, 0, false),
+            JoinState::Granted { reply_key, serial, .. } => (reply_key, serial, true),
+            other => {
+                join.state = other;
+                return;
+            }
+        };
+        if serial <= last {
+            join.state = JoinState::Granted { sink, reply_key, serial: last };
+            return self.unexpected("answer");
+        }
+        let (enc, sealed) = match answer {
+            Answer::Grant { enc, sealed } => (enc, sealed),
+            Answer::Refuse { reason } => {
+                let by = RefusedBy::Owner(reason);
+                join.retry(self.now.instant, Some(by), &mut self.rng);
+                if was_granted {
+                    self.lost(name, LostReason::Refused(reason));
+                }
+                // That a share has ended is no refusal: it is what the owner wanted.
+                if !(was_granted && reason == RefuseReason::NotShared) {
+                    self.refused(name, by);
+                }
+                return;
+            }
+        };
+        match reply_key.open(&name, &sink, serial, &enc, &sealed) {
+            Ok(content) => {
+                join.succeeded();
+                join.state = JoinState::Granted { sink, reply_key, serial };
+                self.granted_content(owner.node_id, name, sink, serial, content);
+            }
+            Err(why) => {
+                join.retry(self.now.instant, None, &mut self.rng);
+                self.send(Control::Leave { name, sink });
+                self.drop_frame(why.into());
+            }
+        }
+    }
+
+    fn granted_content(
+        &mut self,
+        owner: NodeId,
+        name: Name,
+        sink: SinkId,
+        serial: u64,
+        content: GrantContent,
+    ) {
+        let wish = self.joins.get(&name).map(|j| &j.wish);
+        match (content, wish) {
+            (GrantContent::Catalogue(catalogue), Some(Wish::Follow)) => {
+                self.event(Event::Catalogue { owner, catalogue });
+            }
+            (GrantContent::Topic(grant), Some(Wish::Subscribe { .. } | Wish::Publish(_))) => {
+                self.event(Event::Granted { name, sink, grant });
+                if serial > 1 {
+                    // A new epoch waits for it.
+                    self.send(Control::Ack { name, sink, serial });
+                }
+            }
+            (GrantContent::Credentials(credentials), Some(Wish::Renew(_))) => {
+                self.event(Event::Renewed { credentials });
+            }
+            _ => self.unexpected("kind of grant"),
+        }
+    }
+
+    pub(crate) fn handle_reject(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
+        let Some(join) = self.joins.get_mut(&name).filter(|j| j.sink() == Some(sink)) else {
+            return self.unexpected("reject");
+        };
+        let was_granted = matches!(join.state, JoinState::Granted { .. });
+        let by = RefusedBy::Router(reason);
+        // A broken way mends by itself; anything else the user should see while it is retried.
+        let visible = !matches!(reason, RejectReason::RouteLost | RejectReason::NoRoute);
+        join.retry(self.now.instant, visible.then_some(by), &mut self.rng);
+        if was_granted {
+            self.lost(name, LostReason::Cut(reason));
+        }
+        if visible {
+            self.refused(name, by);
+        }
+    }
+}

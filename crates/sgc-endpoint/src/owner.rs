@@ -1,0 +1,585 @@
+//! As the owner of names: shares, whom they are granted to, epochs, the catalogue, and for an authority the
+//! credentials of members.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
+use sgc_wire::{
+    Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
+    Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason, Request, Role,
+    SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
+};
+
+use crate::SourceProgress;
+use crate::endpoint::{Dropped, Endpoint, Event};
+use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
+
+impl Endpoint {
+    /// Shares an interface under the name that its metadata gives with the newest secret.
+    pub fn share(&mut self, now: Now, spec: ShareSpec) -> Result<Name, ShareError> {
+        self.now = now;
+        let secrets = self.config.identity.naming_secrets();
+        let secret = secrets.first().ok_or(ShareError::NoSecret)?;
+        let blind = TopicSecret::derive(&secret.secret, &spec.metadata).blind();
+        let name = name_of(&self.config.identity.node_id(), &blind);
+        if self.shares.shares.contains_key(&name) {
+            let Metadata { ros_name, type_name, .. } = spec.metadata;
+            return Err(ShareError::Duplicate { ros_name, type_name });
+        }
+        if self.shares.shares.len() >= self.config.limits.shares_max {
+            return Err(ShareError::Limit { max: self.config.limits.shares_max });
+        }
+        let share = Share {
+            spec,
+            blind,
+            epoch: Epoch::new(1, &mut self.rng),
+            rotation: None,
+            rotate_at: now.instant + self.config.limits.rotate_every,
+            own: Vec::new(),
+            sinks: BTreeMap::new(),
+        };
+        self.shares.shares.insert(name, share);
+        self.withdrawn.remove(&blind);
+        self.unadvertised.insert(blind);
+        self.catalogue_dirty = true;
+        self.tell_own(name);
+        Ok(name)
+    }
+
+    /// Changes what a share offers; its name and key stay.
+    pub fn update_share(&mut self, now: Now, name: &Name, qos: Qos, sources: Vec<CatalogueSource>) {
+        self.now = now;
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        if share.spec.qos == qos && share.spec.sources == sources {
+            return;
+        }
+        share.spec.qos = qos;
+        share.spec.sources = sources;
+        let described = |s: &&GrantedSink| matches!(s.request, Request::Subscribe { describe: true });
+        let anyone = share.sinks.values().any(|s| described(&s));
+        self.catalogue_dirty = true;
+        if anyone {
+            self.regrant(*name);
+        }
+    }
+
+    /// Changes who may join a share. Who no longer may is cut at once, and the others get a new key.
+    pub fn update_policy(&mut self, now: Now, name: &Name, policy: Policy) {
+        self.now = now;
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        if share.spec.policy == policy {
+            return;
+        }
+        share.spec.policy = policy;
+        self.catalogue_dirty = true;
+        self.enforce();
+    }
+
+    /// Which sources of this node publish under a share.
+    pub fn set_sources(&mut self, now: Now, name: &Name, sources: Vec<Arc<SourceProgress>>) {
+        self.now = now;
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        let ids = |all: &[Arc<SourceProgress>]| all.iter().map(|s| s.announce().source).collect::<Vec<_>>();
+        if ids(&share.own) == ids(&sources) {
+            return;
+        }
+        share.own = sources;
+        self.regrant(*name);
+    }
+
+    /// Ends a share: withdrawn everywhere, its sinks told.
+    pub fn unshare(&mut self, now: Now, name: &Name) {
+        self.now = now;
+        let Some(share) = self.shares.shares.remove(name) else { return };
+        for (sink, granted) in share.sinks {
+            self.refuse(*name, sink, granted.serial + 1, RefuseReason::NotShared);
+            self.event(Event::SinkLeft { name: *name, sink, peer: granted.peer.node_id });
+        }
+        self.unadvertised.remove(&share.blind);
+        self.withdrawn.insert(share.blind);
+        self.catalogue_dirty = true;
+    }
+
+    /// The key of a share, for its sources.
+    pub fn share_grant(&self, name: &Name) -> Option<TopicGrant> {
+        self.shares.shares.get(name).map(|s| s.grant(&s.epoch, None))
+    }
+
+    /// Begins a new epoch of a share.
+    pub fn rotate(&mut self, now: Now, name: &Name) {
+        self.now = now;
+        self.begin_epoch(*name);
+    }
+
+    /// Takes back all names, for a clean shutdown.
+    pub fn withdraw_all(&mut self, now: Now) {
+        for name in self.shares.shares.keys().copied().collect::<Vec<_>>() {
+            self.unshare(now, &name);
+        }
+        self.unadvertised.clear();
+        for (name, blind) in std::mem::take(&mut self.catalogue_names) {
+            self.end_catalogue(name, blind);
+        }
+        if let Some((_, blind)) = self.renewal_name.take() {
+            self.withdrawn.insert(blind);
+        }
+        self.renew_at = None;
+    }
+
+    /// Answers [`Event::RenewAsked`], once or again when something changed.
+    pub fn answer_renewal(&mut self, now: Now, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
+        self.now = now;
+        let Some((name, _)) = self.renewal_name else { return };
+        let Some(asked) = self.renewals.get_mut(&sink) else { return };
+        asked.serial += 1;
+        let (serial, reply_key) = (asked.serial, asked.reply_key.clone());
+        let granted = match answer {
+            Ok(credentials) => {
+                self.grant(name, sink, serial, &reply_key, &GrantContent::Credentials(credentials))
+            }
+            Err(reason) => {
+                self.refuse(name, sink, serial, reason);
+                false
+            }
+        };
+        if !granted {
+            self.renewals.remove(&sink);
+        }
+    }
+
+    /// Who asked this authority and is still there: sink, node, and signing request.
+    pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
+        self.renewals.iter().filter_map(|(sink, asked)| match &asked.request {
+            Request::Renew { csr } => Some((*sink, &asked.peer, csr)),
+            Request::Subscribe { .. } | Request::Publish { .. } => None,
+        })
+    }
+
+    pub(crate) fn end_catalogue(&mut self, name: Name, blind: Blind) {
+        self.unadvertised.remove(&blind);
+        self.withdrawn.insert(blind);
+        let sinks: Vec<_> =
+            self.shares.followers.keys().filter(|(n, _)| *n == name).map(|(_, s)| *s).collect();
+        for sink in sinks {
+            if let Some(granted) = self.shares.followers.remove(&(name, sink)) {
+                self.refuse(name, sink, granted.serial + 1, RefuseReason::NotShared);
+            }
+        }
+    }
+
+    /// Cuts everyone who has lost the right to what was granted, and begins new epochs for those who stay.
+    pub(crate) fn enforce(&mut self) {
+        let mut cut = Vec::new();
+        for (name, share) in &self.shares.shares {
+            for (sink, granted) in &share.sinks {
+                let denied = self.standing(&granted.peer).or_else(|| {
+                    let role = granted.request.role();
+                    share.spec.policy.permits(&granted.peer, role).err().map(refusal)
+                });
+                cut.extend(denied.map(|reason| (*name, *sink, reason)));
+            }
+        }
+        let mut names = Vec::new();
+        for (name, sink, reason) in cut {
+            let Some(share) = self.shares.shares.get_mut(&name) else { continue };
+            let Some(granted) = share.sinks.remove(&sink) else { continue };
+            self.refuse(name, sink, granted.serial + 1, reason);
+            self.event(Event::SinkCut { name, sink, peer: granted.peer.node_id, reason });
+            names.push(name);
+        }
+        names.dedup();
+        for name in names {
+            self.begin_epoch(name);
+        }
+        let lost = |(key, granted): (&(Name, SinkId), &GrantedSink)| {
+            self.standing(&granted.peer).map(|reason| (*key, granted.serial + 1, reason))
+        };
+        let followers: Vec<_> = self.shares.followers.iter().filter_map(lost).collect();
+        for ((name, sink), serial, reason) in followers {
+            self.shares.followers.remove(&(name, sink));
+            self.refuse(name, sink, serial, reason);
+        }
+        let standing: Vec<_> = self.renewals.keys().copied().collect();
+        for sink in standing {
+            let reason = self.renewals.get(&sink).and_then(|asked| self.standing(&asked.peer));
+            if let Some(reason) = reason {
+                self.answer_renewal(self.now, sink, Err(reason));
+            }
+        }
+    }
+
+    /// Why a peer whose certificate was good when it asked may not have anything any more.
+    fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
+        if self.anchors.is_peer_revoked(peer) {
+            Some(RefuseReason::Revoked)
+        } else if peer.not_after < self.now.unix {
+            Some(RefuseReason::Expired)
+        } else {
+            None
+        }
+    }
+
+    /// Makes the key of the next epoch and grants it. Sources use it once all sinks have it, or after a while.
+    fn begin_epoch(&mut self, name: Name) {
+        let limits = &self.config.limits;
+        let (wait, every) = (limits.rotate_wait, limits.rotate_every);
+        let Some(share) = self.shares.shares.get_mut(&name) else { return };
+        // An epoch that some were granted and that never began is skipped: one of them may be who was cut.
+        let epoch = Epoch::new(share.newest().number.saturating_add(1), &mut self.rng);
+        share.rotate_at = self.now.instant + every;
+        let deadline = self.now.instant + wait;
+        share.rotation = Some(Rotation { epoch, waiting: BTreeMap::new(), deadline });
+        self.regrant(name);
+        if let Some(Share { rotation: Some(rotation), sinks, .. }) = self.shares.shares.get_mut(&name) {
+            rotation.waiting = sinks.iter().map(|(sink, s)| (*sink, s.serial)).collect();
+        }
+        self.finish_epoch(name);
+    }
+
+    /// Puts a new epoch into use if nothing keeps it waiting.
+    fn finish_epoch(&mut self, name: Name) {
+        let now = self.now.instant;
+        let Some(share) = self.shares.shares.get_mut(&name) else { return };
+        let ready = |r: &Rotation| r.waiting.is_empty() || r.deadline <= now;
+        let Some(rotation) = share.rotation.take_if(|r| ready(r)) else { return };
+        share.epoch = rotation.epoch;
+        let grant = share.grant(&share.epoch, None);
+        self.event(Event::Rekeyed { name, grant });
+    }
+
+    pub(crate) fn rotation_deadline(&self) -> Option<Instant> {
+        let of = |s: &Share| s.rotation.as_ref().map_or(s.rotate_at, |r| r.deadline);
+        self.shares.shares.values().map(of).min()
+    }
+
+    pub(crate) fn rotate_due(&mut self) {
+        let now = self.now.instant;
+        let ended = |s: &Share| s.rotation.as_ref().is_some_and(|r| r.deadline <= now);
+        let over = |s: &Share| s.rotation.is_none() && s.rotate_at <= now;
+        let shares = &self.shares.shares;
+        let ended: Vec<_> = shares.iter().filter(|(_, s)| ended(s)).map(|(n, _)| *n).collect();
+        let over: Vec<_> = shares.iter().filter(|(_, s)| over(s)).map(|(n, _)| *n).collect();
+        ended.into_iter().for_each(|name| self.finish_epoch(name));
+        over.into_iter().for_each(|name| self.begin_epoch(name));
+    }
+
+    /// Grants the newest epoch to every sink again: key or sources changed.
+    fn regrant(&mut self, name: Name) {
+        let Some(share) = self.shares.shares.get(&name) else { return };
+        for sink in share.sinks.keys().copied().collect::<Vec<_>>() {
+            self.grant_again(name, sink);
+        }
+        self.tell_own(name);
+    }
+
+    fn grant_again(&mut self, name: Name, sink: SinkId) {
+        let Some(share) = self.shares.shares.get_mut(&name) else { return };
+        let Some(granted) = share.sinks.get_mut(&sink) else { return };
+        granted.serial += 1;
+        let (serial, reply_key) = (granted.serial, granted.reply_key.clone());
+        let content = GrantContent::Topic(share.grant(share.newest(), share.sinks.get(&sink)));
+        if !self.grant(name, sink, serial, &reply_key, &content)
+            && let Some(share) = self.shares.shares.get_mut(&name)
+        {
+            share.sinks.remove(&sink);
+        }
+    }
+
+    /// Tells this node's own sink of a share on which others may publish.
+    fn tell_own(&mut self, name: Name) {
+        let Some(share) = self.shares.shares.get(&name) else { return };
+        if !share.spec.policy.publish.is_empty() {
+            let grant = share.grant(share.newest(), None);
+            self.event(Event::OwnGrant { name, grant });
+        }
+    }
+
+    pub(crate) fn handle_ack(&mut self, name: Name, sink: SinkId, serial: u64) {
+        let Some(share) = self.shares.shares.get_mut(&name) else {
+            return self.unexpected("acknowledgement");
+        };
+        if let Some(rotation) = &mut share.rotation
+            && rotation.waiting.get(&sink).is_some_and(|granted| *granted <= serial)
+        {
+            rotation.waiting.remove(&sink);
+            self.finish_epoch(name);
+        }
+    }
+
+    /// Sends each follower its catalogue if what it may see changed.
+    pub(crate) fn tell_followers(&mut self) {
+        if !std::mem::take(&mut self.catalogue_dirty) {
+            return;
+        }
+        self.shares.version += 1;
+        for (name, sink) in self.shares.followers.keys().copied().collect::<Vec<_>>() {
+            self.tell_follower(name, sink);
+        }
+    }
+
+    fn tell_follower(&mut self, name: Name, sink: SinkId) {
+        let Some(follower) = self.shares.followers.get(&(name, sink)) else { return };
+        let mut catalogue = self.shares.catalogue_for(&follower.peer);
+        let left_out = fit(&mut catalogue);
+        if follower.told.as_ref().is_some_and(|t| t.entries == catalogue.entries) {
+            return;
+        }
+        if left_out > 0 {
+            self.drop_frame(Dropped::CatalogueTooLarge { left_out });
+        }
+        let Some(follower) = self.shares.followers.get_mut(&(name, sink)) else { return };
+        follower.serial += 1;
+        let (reply_key, serial) = (follower.reply_key.clone(), follower.serial);
+        let content = GrantContent::Catalogue(catalogue.clone());
+        follower.told = Some(catalogue);
+        if !self.grant(name, sink, serial, &reply_key, &content) {
+            self.shares.followers.remove(&(name, sink));
+        }
+    }
+
+    /// Answers yes; false if the request's reply key is unusable, which is answered with no.
+    fn grant(
+        &mut self,
+        name: Name,
+        sink: SinkId,
+        serial: u64,
+        reply_key: &[u8],
+        content: &GrantContent,
+    ) -> bool {
+        match seal_grant(reply_key, &name, &sink, serial, content) {
+            Ok((enc, sealed)) => {
+                self.answer(AnswerBody { name, sink, serial, answer: Answer::Grant { enc, sealed } });
+                true
+            }
+            Err(why) => {
+                self.drop_frame(why.into());
+                self.refuse(name, sink, serial, RefuseReason::NotVerified);
+                false
+            }
+        }
+    }
+
+    fn refuse(&mut self, name: Name, sink: SinkId, serial: u64, reason: RefuseReason) {
+        self.answer(AnswerBody { name, sink, serial, answer: Answer::Refuse { reason } });
+    }
+
+    fn answer(&mut self, body: AnswerBody) {
+        let signed = self.config.identity.sign_answer(&body);
+        self.send(Control::Answer { signed });
+    }
+
+    fn is_catalogue(&self, name: &Name) -> bool {
+        self.catalogue_names.iter().any(|(n, _)| n == name)
+    }
+
+    fn is_renewal(&self, name: &Name) -> bool {
+        self.renewal_name.is_some_and(|(n, _)| n == *name)
+    }
+
+    pub(crate) fn handle_join(&mut self, signed: &Signed) {
+        let join = match verify_join(&self.anchors, signed, self.now.unix) {
+            Ok(join) => join,
+            Err(why) => {
+                // Answered as well as can be: the body may at least say whom to answer. Only for a name of ours, or
+                // anybody could have anything signed.
+                if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body)
+                    && (self.shares.shares.contains_key(&name)
+                        || self.is_catalogue(&name)
+                        || self.is_renewal(&name))
+                {
+                    self.refuse(name, sink, 1, why.refuse_reason());
+                }
+                self.drop_frame(Dropped::NotVerified { what: "join", why });
+                return;
+            }
+        };
+        let JoinBody { name, sink, request, reply_key, .. } = join.body;
+        // In a post-quantum fleet nothing is granted that a recording could be made to tell later.
+        let identity = &self.config.identity;
+        let own_fleet = join.peer.ca == identity.as_peer().ca;
+        if identity.post_quantum() && own_fleet && reply_key.len() != Kem::XWing.reply_key_bytes() {
+            return self.refuse(name, sink, 1, RefuseReason::NotVerified);
+        }
+        let asked = GrantedSink { peer: join.peer, request, reply_key, serial: 0, told: None };
+        if self.is_catalogue(&name) {
+            self.handle_follow(name, sink, asked);
+        } else if self.is_renewal(&name) {
+            self.handle_renew(name, sink, asked);
+        } else {
+            self.handle_subscribe_or_publish(name, sink, asked);
+        }
+    }
+
+    fn handle_subscribe_or_publish(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
+        let peer = asked.peer.node_id;
+        self.replace_publisher(&name, &sink, &asked);
+        if let Err(reason) = self.admit(&name, &sink, &asked) {
+            self.refuse(name, sink, 1, reason);
+            self.event(Event::SinkRefused { name, peer, reason });
+            return;
+        }
+        let Some(share) = self.shares.shares.get_mut(&name) else { return };
+        let reply_key = asked.reply_key.clone();
+        let role = asked.request.role();
+        let publishes = role == Role::Publish;
+        // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
+        let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
+        let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
+        let content = GrantContent::Topic(share.grant(&share.epoch, share.sinks.get(&sink)));
+        if !self.grant(name, sink, serial, &reply_key, &content) {
+            if let Some(share) = self.shares.shares.get_mut(&name) {
+                share.sinks.remove(&sink);
+            }
+            return;
+        }
+        // It came between two epochs: it needs both keys.
+        let between = self.shares.shares.get_mut(&name).and_then(|s| s.rotation.as_mut());
+        if let Some(rotation) = between {
+            rotation.waiting.insert(sink, serial + 1);
+            self.grant_again(name, sink);
+        }
+        if !known {
+            self.event(Event::SinkJoined { name, sink, peer, role });
+        }
+        if publishes && !known {
+            self.regrant(name);
+        }
+    }
+
+    /// A publisher that asks anew, because the way here changed, may come before its old place is given up.
+    fn replace_publisher(&mut self, name: &Name, sink: &SinkId, asked: &GrantedSink) {
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        let Request::Publish { offer } = &asked.request else { return };
+        let same = |s: &GrantedSink| {
+            let peer = s.peer.node_id == asked.peer.node_id;
+            peer && matches!(&s.request, Request::Publish { offer: o } if o.source == offer.source)
+        };
+        let old = share.sinks.iter().find(|(id, s)| *id != sink && same(s)).map(|(id, _)| *id);
+        if let Some(old) = old {
+            self.handle_leave(*name, old);
+        }
+    }
+
+    /// Whether a request for a share may be granted.
+    fn admit(&self, name: &Name, sink: &SinkId, asked: &GrantedSink) -> Result<(), RefuseReason> {
+        let share = self.shares.shares.get(name).ok_or(RefuseReason::NotShared)?;
+        share.spec.policy.permits(&asked.peer, asked.request.role()).map_err(refusal)?;
+        match &asked.request {
+            Request::Renew { .. } => return Err(RefuseReason::RoleNotOffered),
+            Request::Publish { offer } if offer.key.is_empty() == share.spec.suite.is_signed() => {
+                return Err(RefuseReason::NotVerified);
+            }
+            // Two sources under one id would use one nonce twice.
+            Request::Publish { offer } if share.has_source(&offer.source, sink) => {
+                return Err(RefuseReason::NotPermitted);
+            }
+            Request::Publish { .. } | Request::Subscribe { .. } => {}
+        }
+        if let Some(known) = share.sinks.get(sink) {
+            let same = known.peer.node_id == asked.peer.node_id && known.request == asked.request;
+            return if same { Ok(()) } else { Err(RefuseReason::NotPermitted) };
+        }
+        let limits = &self.config.limits;
+        let of_peer = share.sinks.values().filter(|s| s.peer.node_id == asked.peer.node_id).count();
+        if share.sinks.len() >= limits.sinks_per_name_max || of_peer >= limits.sinks_per_peer_max {
+            return Err(RefuseReason::Limit);
+        }
+        Ok(())
+    }
+
+    fn handle_follow(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
+        let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
+        let refused = if asked.request.role() != Role::Subscribe {
+            Some(RefuseReason::RoleNotOffered)
+        } else if !own_fleet {
+            Some(RefuseReason::NotPermitted)
+        } else if self.shares.followers.len() >= self.config.limits.sinks_per_name_max {
+            Some(RefuseReason::Limit)
+        } else {
+            None
+        };
+        match refused {
+            Some(reason) => self.refuse(name, sink, 1, reason),
+            None => {
+                let serial = self.shares.followers.get(&(name, sink)).map_or(0, |f| f.serial);
+                self.shares.followers.insert((name, sink), GrantedSink { serial, ..asked });
+                self.tell_follower(name, sink);
+            }
+        }
+    }
+
+    fn handle_renew(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
+        let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
+        let Request::Renew { csr } = asked.request.clone() else {
+            return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+        };
+        if !own_fleet {
+            return self.refuse(name, sink, 1, RefuseReason::NotPermitted);
+        }
+        let peer = asked.peer.clone();
+        // One place for a node: the newer request is of the newer run, or of a newer certificate.
+        let older = self.renewals.iter().find(|(id, s)| **id != sink && s.peer.node_id == peer.node_id);
+        if let Some((older, serial)) = older.map(|(id, s)| (*id, s.serial + 1)) {
+            self.renewals.remove(&older);
+            self.refuse(name, older, serial, RefuseReason::Limit);
+        }
+        if self.renewals.len() >= self.config.limits.sinks_per_name_max {
+            return self.refuse(name, sink, 1, RefuseReason::Limit);
+        }
+        let serial = self.renewals.get(&sink).map_or(0, |s| s.serial);
+        self.renewals.insert(sink, GrantedSink { serial, ..asked });
+        self.event(Event::RenewAsked { sink, peer, csr });
+    }
+
+    pub(crate) fn handle_leave(&mut self, name: Name, sink: SinkId) {
+        if self.is_catalogue(&name) {
+            self.shares.followers.remove(&(name, sink));
+        } else if self.is_renewal(&name) {
+            self.renewals.remove(&sink);
+        } else if let Some(share) = self.shares.shares.get_mut(&name)
+            && let Some(granted) = share.sinks.remove(&sink)
+        {
+            if let Some(rotation) = &mut share.rotation {
+                rotation.waiting.remove(&sink);
+            }
+            self.event(Event::SinkLeft { name, sink, peer: granted.peer.node_id });
+            self.finish_epoch(name);
+            if matches!(granted.request, Request::Publish { .. }) {
+                self.regrant(name);
+            }
+        }
+    }
+
+    pub(crate) fn handle_recover(&mut self, recover: Recover) {
+        let granted =
+            self.shares.shares.get(&recover.name).is_some_and(|s| s.sinks.contains_key(&recover.sink));
+        if granted {
+            self.event(Event::Recover(recover));
+        } else {
+            self.unexpected("recover");
+        }
+    }
+}
+
+fn refusal(denied: Denied) -> RefuseReason {
+    match denied {
+        Denied::NotListed => RefuseReason::NotPermitted,
+        Denied::Role => RefuseReason::RoleNotOffered,
+    }
+}
+
+/// Leaves out entries until the catalogue can be sent; returns how many.
+fn fit(catalogue: &mut Catalogue) -> usize {
+    let all = catalogue.entries.len();
+    let mut bytes = 0;
+    let room = SEALED_BYTES_MAX - 1024;
+    catalogue.entries.truncate(CATALOGUE_ENTRIES_MAX);
+    catalogue.entries.retain(|e| {
+        bytes += e.to_vec().len();
+        bytes <= room
+    });
+    all - catalogue.entries.len()
+}

@@ -1,0 +1,120 @@
+//! Whom to believe: revocation lists, certificates that end, and links that bring what does not verify.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sgc_trust::{CertError, CertId, CrlError, SignedError, TrustAnchors};
+use sgc_wire::{Control, Now, RejectReason};
+
+use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
+
+impl Router {
+    /// Takes a revocation list from this node's user; true if it is news, which is then told everywhere.
+    pub fn add_crl(&mut self, now: Now, der: &Bytes) -> Result<bool, CrlError> {
+        self.learn_crl(now, LinkId::LOCAL, der)
+    }
+
+    /// Believes these CAs, with their revocation lists, from here on. Everything that rests on a certificate which
+    /// is no longer good ends: links, routes, branches.
+    pub fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        self.config.anchors = anchors;
+        let links: Vec<_> = self
+            .links
+            .iter()
+            .filter(|(l, s)| **l != LinkId::LOCAL && self.is_untrusted(&s.certs))
+            .map(|(l, _)| *l)
+            .collect();
+        for link in links {
+            self.outputs.push_back(Output::Close { link, reason: LinkClose::Revoked });
+            self.forget_link(link);
+        }
+        let mut branches = Vec::new();
+        let mut routes = Vec::new();
+        for (name, state) in &self.names {
+            let cut = state.branches.iter().filter(|(_, b)| self.is_untrusted(&b.certs));
+            branches.extend(cut.map(|(sink, _)| (*name, *sink)));
+            let ended = state.routes().filter(|r| self.is_untrusted(&r.advert.owner.path));
+            routes.extend(ended.map(|r| (*name, r.link)));
+        }
+        for (name, sink) in branches {
+            if let Some(branch) = self.remove_branch(name, sink) {
+                let reason = RejectReason::Revoked;
+                self.send(branch.link, Control::Reject { name, sink, reason });
+                self.send_up(name, Control::Leave { name, sink });
+                self.tidy(name);
+            }
+        }
+        for (name, link) in routes {
+            self.lose_route(name, link);
+        }
+    }
+
+    pub(crate) fn handle_crl(&mut self, now: Now, link: LinkId, der: &Bytes) {
+        if let Err(why) = self.learn_crl(now, link, der) {
+            // A CA that is not trusted here may be trusted there.
+            if !matches!(why, CrlError::UnknownIssuer) {
+                self.count_forgery(now, link);
+            }
+            self.drop_frame(link, DropReason::Crl(why));
+        }
+    }
+
+    fn learn_crl(&mut self, now: Now, from: LinkId, der: &Bytes) -> Result<bool, CrlError> {
+        let Some(anchors) = self.config.anchors.with_crl(der, now.unix)? else { return Ok(false) };
+        let anchors = Arc::new(anchors);
+        self.outputs.push_back(Output::Trust(anchors.clone()));
+        self.set_anchors(anchors);
+        let others: Vec<_> =
+            self.links.keys().filter(|l| **l != from && **l != LinkId::LOCAL).copied().collect();
+        for link in others {
+            self.send(link, Control::Crl { der: der.clone() });
+        }
+        Ok(true)
+    }
+
+    pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
+        let anchors = &self.config.anchors;
+        certs.iter().any(|c| anchors.is_revoked(c) || anchors.ca_spki(&c.ca).is_none())
+    }
+
+    /// Closes the links of nodes whose certificates have ended.
+    pub(crate) fn close_expired(&mut self, now: Now) {
+        let over = |at: std::time::Instant| at <= now.instant;
+        let links: Vec<_> =
+            self.links.iter().filter(|(_, s)| s.expires.is_some_and(over)).map(|(l, _)| *l).collect();
+        for link in links {
+            self.outputs.push_back(Output::Close { link, reason: LinkClose::Expired });
+            self.forget_link(link);
+        }
+    }
+
+    /// Something signed over `link` is not believed. Who sends many such is cut off.
+    pub(crate) fn not_verified(&mut self, now: Now, link: LinkId, what: &'static str, why: SignedError) {
+        let from_router = self.links.get(&link).is_some_and(|l| l.is_transit());
+        let honest = match &why {
+            // Clocks differ, certificates end, and lists spread, without anybody lying.
+            SignedError::Clock { .. } => true,
+            SignedError::Cert(
+                CertError::Expired { .. }
+                | CertError::NotYetValid { .. }
+                | CertError::CaExpired { .. }
+                | CertError::Revoked { .. },
+            ) => true,
+            // Another router may trust another CA.
+            SignedError::Cert(CertError::UnknownIssuer) => from_router,
+            SignedError::Cert(_) | SignedError::Signature(_) | SignedError::Decode(_) => false,
+        };
+        self.drop_frame(link, DropReason::NotVerified { what, why });
+        if !honest {
+            self.count_forgery(now, link);
+        }
+    }
+
+    fn count_forgery(&mut self, now: Now, link: LinkId) {
+        let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return };
+        if !state.may_err(now.instant) {
+            self.outputs.push_back(Output::Close { link, reason: LinkClose::Forgeries });
+            self.forget_link(link);
+        }
+    }
+}

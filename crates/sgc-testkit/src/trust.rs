@@ -1,0 +1,65 @@
+//! What is done to the trust between nodes: rights and certificates taken back, clocks that are wrong.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_wire::{Now, UnixMillis};
+
+use crate::node::{Node, NodeKey, Sharing, policy};
+use crate::world::World;
+
+impl World {
+    /// Shares a topic with others from here on; its name and sources stay.
+    pub fn reshare(&mut self, node: NodeKey, topic: &str, sharing: Sharing) {
+        self.note(format!("reshare {node:?} {topic} {sharing:?}"));
+        let (now, name) = (self.now_at(node), self.name(node, topic));
+        let policy = policy(&self.nodes[node.0].identity, &sharing, &self.directory);
+        let Node { shares, running, .. } = &mut self.nodes[node.0];
+        shares.insert(topic.to_owned(), sharing);
+        if let Some(running) = running {
+            running.endpoint.update_policy(now, &name, policy);
+        }
+        self.settle(node);
+    }
+
+    /// Begins a new epoch of a topic.
+    pub fn rotate(&mut self, node: NodeKey, topic: &str) {
+        self.note(format!("rotate {node:?} {topic}"));
+        let (now, name) = (self.now_at(node), self.name(node, topic));
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.rotate(now, &name);
+        }
+        self.settle(node);
+    }
+
+    /// Gives a node a revocation list, as its user would; true if it is news to it.
+    pub fn hand_crl(&mut self, node: NodeKey, der: &Bytes) -> bool {
+        self.note(format!("hand a revocation list to {node:?}"));
+        let now = self.now_at(node);
+        let Some(running) = &mut self.nodes[node.0].running else { return false };
+        let news = running.router.add_crl(now, der).expect("a list of a trusted CA");
+        self.settle(node);
+        news
+    }
+
+    /// Makes a node forget what it remembers over restarts: a new disk.
+    pub fn forget_disk(&mut self, node: NodeKey) {
+        self.nodes[node.0].anchors = None;
+    }
+
+    /// Sets a node's wall clock ahead of the true time.
+    pub fn set_ahead(&mut self, node: NodeKey, by: Duration) {
+        self.nodes[node.0].skew_ms = by.as_millis() as i64;
+    }
+
+    /// Sets a node's wall clock behind the true time.
+    pub fn set_behind(&mut self, node: NodeKey, by: Duration) {
+        self.nodes[node.0].skew_ms = -(by.as_millis() as i64);
+    }
+
+    /// The present, as a node's clocks show it.
+    pub(crate) fn now_at(&self, node: NodeKey) -> Now {
+        let Now { instant, unix } = self.clock.now();
+        Now { instant, unix: UnixMillis(unix.0.saturating_add_signed(self.nodes[node.0].skew_ms)) }
+    }
+}

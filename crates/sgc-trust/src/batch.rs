@@ -1,0 +1,315 @@
+//! One signature for up to 64 packets of a source: a Merkle tree over them (RFC 6962, 2.1), whose root is signed.
+//!
+//! Each packet carries its audit path, its place and the signature behind its tag, so it verifies whatever became of
+//! the others. A receiver checks a signature once per batch and remembers what followed from it: of the later
+//! packets it hashes little more than themselves. Sealing is [`crate::SourceKey`]'s.
+
+use std::collections::VecDeque;
+
+use aws_lc_rs::digest;
+use sgc_wire::PacketHeader;
+
+use crate::message_key::VerifyKey;
+use crate::{MessageKey, OpenError, Suite, TAG_BYTES, opened_bytes};
+
+/// Most packets under one signature.
+pub const BATCH_PACKETS_MAX: usize = 64;
+
+/// Batches of one source that a receiver remembers: those that may arrive mingled.
+const BATCHES_KNOWN_MAX: usize = 4;
+
+/// Bytes of a hash.
+const HASH_BYTES: usize = 32;
+/// Bytes of a packet's place in its batch: `u16` index and `u16` count.
+const PLACE_BYTES: usize = 4;
+/// Nodes of a tree of 64 leaves; none of fewer has more, with those that stand on two levels counted twice.
+const NODES_MAX: usize = 127;
+/// A node and its sibling on each of 7 levels.
+const CLIMB_NODES_MAX: usize = 14;
+
+type Hash = [u8; HASH_BYTES];
+
+/// Gathers the packets of a batch at their source.
+#[derive(Debug, Default)]
+pub struct Batch {
+    leaves: Vec<Hash>,
+}
+
+/// A batch with its signature.
+#[derive(Debug)]
+pub struct SignedBatch {
+    count: usize,
+    /// All levels, leaves first.
+    nodes: Vec<Hash>,
+    signature: Vec<u8>,
+}
+
+impl Batch {
+    /// Adds a packet: its header, and what it was sealed to (ciphertext and tag).
+    pub fn push(&mut self, header: &PacketHeader, sealed: &[u8]) {
+        debug_assert!(!self.is_full());
+        self.leaves.push(leaf(header, sealed));
+    }
+
+    /// Signs what was gathered, and begins anew. There must be something.
+    pub fn sign(&mut self, key: &MessageKey) -> SignedBatch {
+        let mut nodes = Vec::with_capacity(2 * self.leaves.len() + 6);
+        let count = self.leaves.len();
+        nodes.append(&mut self.leaves);
+        let (mut start, mut width) = (0, count);
+        while width > 1 {
+            for i in (start..start + width).step_by(2) {
+                let parent = match nodes.get(i + 1).filter(|_| i + 1 < start + width) {
+                    Some(right) => node(&nodes[i], right),
+                    None => nodes[i],
+                };
+                nodes.push(parent);
+            }
+            (start, width) = (start + width, width.div_ceil(2));
+        }
+        let signature = key.sign(&signed_bytes(count as u16, &nodes[start]));
+        SignedBatch { count, nodes, signature }
+    }
+
+    /// Packets gathered.
+    pub fn len(&self) -> usize {
+        self.leaves.len()
+    }
+
+    /// True if there are none.
+    pub fn is_empty(&self) -> bool {
+        self.leaves.is_empty()
+    }
+
+    /// True if no more fit.
+    pub fn is_full(&self) -> bool {
+        self.len() >= BATCH_PACKETS_MAX
+    }
+}
+
+impl SignedBatch {
+    /// Appends the trailer of the packet that was added as number `index`.
+    pub fn put_trailer(&self, index: usize, out: &mut Vec<u8>) {
+        for (level, sibling) in siblings(index, self.count) {
+            out.extend_from_slice(&self.nodes[position(self.count, level, sibling)]);
+        }
+        out.extend_from_slice(&(index as u16).to_be_bytes());
+        out.extend_from_slice(&(self.count as u16).to_be_bytes());
+        out.extend_from_slice(&self.signature);
+    }
+}
+
+/// Longest trailer of a suite's packets, bytes.
+pub fn trailer_bytes_max(suite: Suite) -> usize {
+    match suite.scheme().signature_bytes() {
+        0 => 0,
+        signature => 6 * HASH_BYTES + PLACE_BYTES + signature,
+    }
+}
+
+/// Verifies one source's packets.
+pub struct BatchVerifier {
+    key: VerifyKey,
+    known: VecDeque<KnownBatch>,
+    checked: u64,
+}
+
+/// A batch whose signature verified, and the nodes of its tree that follow from it. Whatever node is known, its
+/// sibling, its ancestors and their siblings are.
+struct KnownBatch {
+    count: u16,
+    signature: Vec<u8>,
+    known: u128,
+    nodes: Vec<Hash>,
+}
+
+/// What was hashed on the way from a leaf to the first node that is known, or to the root.
+struct Climb {
+    found: [(usize, Hash); CLIMB_NODES_MAX],
+    len: usize,
+    /// The last that was computed: the root, unless a known node was met.
+    root: Hash,
+}
+
+impl BatchVerifier {
+    /// For sources with this announced key; `None` if it is not a key of that suite.
+    pub fn new(suite: Suite, key: &[u8]) -> Option<Self> {
+        Some(Self { key: VerifyKey::new(suite, key)?, known: VecDeque::new(), checked: 0 })
+    }
+
+    /// Verifies that the source signed this packet. At most one signature is checked, and only success is
+    /// remembered.
+    pub fn verify(&mut self, header: &PacketHeader, payload: &[u8]) -> Result<(), OpenError> {
+        let (sealed, trailer) = split(header, payload, self.key.signature_bytes())?;
+        let Trailer { path, index, count, signature } = trailer;
+        let leaf = leaf(header, sealed);
+        let known = self.known.iter_mut().find(|b| b.count == count && b.signature == signature);
+        if let Some(batch) = known {
+            let climb = batch.climb(leaf, index, path)?;
+            batch.learn(&climb);
+            return Ok(());
+        }
+        let mut batch = KnownBatch { count, signature: Vec::new(), known: 0, nodes: Vec::new() };
+        let climb = batch.climb(leaf, index, path)?;
+        self.checked += 1;
+        if !self.key.verify(&signed_bytes(count, &climb.root), signature) {
+            return Err(OpenError::Signature);
+        }
+        if count > 1 {
+            batch.nodes = vec![[0; HASH_BYTES]; position(count.into(), height(count.into()), 0) + 1];
+            batch.signature = signature.to_vec();
+            batch.learn(&climb);
+            if self.known.len() >= BATCHES_KNOWN_MAX {
+                self.known.pop_front();
+            }
+            self.known.push_back(batch);
+        }
+        Ok(())
+    }
+
+    /// Signatures that were checked, for good or ill.
+    pub fn signatures_checked(&self) -> u64 {
+        self.checked
+    }
+}
+
+impl KnownBatch {
+    /// Hashes upwards from a leaf to the first node that is known, or to the root; what lies above a known node must
+    /// be known too, and as the path says.
+    fn climb(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<Climb, OpenError> {
+        let (count, index) = (usize::from(self.count), usize::from(index));
+        let mut climb = Climb { found: [(0, leaf); CLIMB_NODES_MAX], len: 0, root: leaf };
+        let (mut current, mut trusted) = (leaf, false);
+        let mut siblings_left = siblings(index, count).zip(path.chunks_exact(HASH_BYTES)).peekable();
+        for level in 0..=height(count) {
+            let at = position(count, level, index >> level);
+            if !trusted {
+                match self.node(at) {
+                    Some(known) if *known != current => return Err(OpenError::Signature),
+                    Some(_) => trusted = true,
+                    None => climb.add(at, current),
+                }
+            }
+            if let Some(((_, place), sibling)) = siblings_left.next_if(|((l, _), _)| *l == level) {
+                let sibling: Hash = sibling.try_into().map_err(|_| OpenError::Trailer)?;
+                let at = position(count, level, place);
+                match self.node(at) {
+                    Some(known) if *known != sibling => return Err(OpenError::Signature),
+                    Some(_) => {}
+                    None => climb.add(at, sibling),
+                }
+                if !trusted {
+                    current =
+                        if place % 2 == 0 { node(&sibling, &current) } else { node(&current, &sibling) };
+                }
+            }
+        }
+        climb.root = current;
+        Ok(climb)
+    }
+
+    fn node(&self, at: usize) -> Option<&Hash> {
+        if self.known & (1 << at) != 0 { self.nodes.get(at) } else { None }
+    }
+
+    fn learn(&mut self, climb: &Climb) {
+        for (at, hash) in &climb.found[..climb.len] {
+            if let Some(node) = self.nodes.get_mut(*at) {
+                *node = *hash;
+                self.known |= 1 << at;
+            }
+        }
+    }
+}
+
+impl Climb {
+    fn add(&mut self, at: usize, hash: Hash) {
+        self.found[self.len] = (at, hash);
+        self.len += 1;
+    }
+}
+
+/// What stands behind a packet's tag.
+struct Trailer<'a> {
+    path: &'a [u8],
+    index: u16,
+    count: u16,
+    signature: &'a [u8],
+}
+
+/// Divides a payload into what was sealed and the trailer. Every length must be what header, index and count say.
+fn split<'a>(
+    header: &PacketHeader,
+    payload: &'a [u8],
+    signature_bytes: usize,
+) -> Result<(&'a [u8], Trailer<'a>), OpenError> {
+    let (sealed, trailer) =
+        payload.split_at_checked(opened_bytes(header) + TAG_BYTES).ok_or(OpenError::Length)?;
+    let path_bytes = trailer.len().checked_sub(PLACE_BYTES + signature_bytes).ok_or(OpenError::Length)?;
+    let (path, rest) = trailer.split_at(path_bytes);
+    let (place, signature) = rest.split_at(PLACE_BYTES);
+    let [i0, i1, c0, c1] = *place else { return Err(OpenError::Length) };
+    let (index, count) = (u16::from_be_bytes([i0, i1]), u16::from_be_bytes([c0, c1]));
+    let fits = index < count
+        && usize::from(count) <= BATCH_PACKETS_MAX
+        && path.len() == siblings(index.into(), count.into()).count() * HASH_BYTES;
+    if fits { Ok((sealed, Trailer { path, index, count, signature })) } else { Err(OpenError::Trailer) }
+}
+
+/// `SHA-256(0x00 ‖ header as authenticated ‖ ciphertext ‖ tag)`.
+fn leaf(header: &PacketHeader, sealed: &[u8]) -> Hash {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(&[0]);
+    context.update(header.associated_data().as_ref());
+    context.update(sealed);
+    hash(&context.finish())
+}
+
+/// `SHA-256(0x01 ‖ left ‖ right)`.
+fn node(left: &Hash, right: &Hash) -> Hash {
+    let mut text = [1; 1 + 2 * HASH_BYTES];
+    text[1..=HASH_BYTES].copy_from_slice(left);
+    text[1 + HASH_BYTES..].copy_from_slice(right);
+    hash(&digest::digest(&digest::SHA256, &text))
+}
+
+fn hash(digest: &digest::Digest) -> Hash {
+    let mut out = [0; HASH_BYTES];
+    out.copy_from_slice(digest.as_ref());
+    out
+}
+
+/// `"sgc batch v1" ‖ 0x00 ‖ u16 count ‖ root`.
+fn signed_bytes(count: u16, root: &Hash) -> [u8; 47] {
+    let mut out = [0; 47];
+    out[..12].copy_from_slice(b"sgc batch v1");
+    out[13..15].copy_from_slice(&count.to_be_bytes());
+    out[15..].copy_from_slice(root);
+    out
+}
+
+/// Levels above the leaves.
+fn height(count: usize) -> usize {
+    count.next_power_of_two().trailing_zeros() as usize
+}
+
+/// Where a node stands in a list of all levels, leaves first. Below [`NODES_MAX`].
+fn position(count: usize, level: usize, index: usize) -> usize {
+    let below: usize = (0..level).map(|l| width(count, l)).sum();
+    debug_assert!(below + index < NODES_MAX);
+    below + index
+}
+
+/// Nodes on a level. One without a sibling, the last of an odd number, stands on the next level too; which gives the
+/// trees of RFC 6962, where the left part is the largest power of two.
+fn width(count: usize, level: usize) -> usize {
+    count.div_ceil(1 << level)
+}
+
+/// The siblings on the way from a leaf to the root, as level and place on it: what the audit path lists.
+fn siblings(index: usize, count: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..height(count)).filter_map(move |level| {
+        let place = (index >> level) ^ 1;
+        (place < width(count, level)).then_some((level, place))
+    })
+}

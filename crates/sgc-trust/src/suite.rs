@@ -1,0 +1,156 @@
+//! The cipher suites: which AEAD seals, and who signs what is sealed (`docs/spec/trust.md`, suites).
+
+use std::fmt;
+use std::str::FromStr;
+
+use aws_lc_rs::aead::{AES_256_GCM, Algorithm, CHACHA20_POLY1305};
+
+/// How payloads of a topic are protected.
+///
+/// The `group` suites keep out whoever was not granted the topic; those who were trust each other not to forge one
+/// another. In all others each source signs, so that nobody but it can make its messages.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Suite {
+    /// AES-256-GCM.
+    Group,
+    /// ChaCha20-Poly1305, for CPUs without AES instructions.
+    GroupChacha,
+    /// AES-256-GCM and Ed25519.
+    #[default]
+    Standard,
+    /// ChaCha20-Poly1305 and Ed25519.
+    StandardChacha,
+    /// AES-256-GCM and RSASSA-PSS of 2048 bits with SHA-256, the choice of the paper.
+    Paper,
+    /// AES-256-GCM and RSASSA-PSS of 3072 bits with SHA-256.
+    Paper3072,
+    /// ChaCha20-Poly1305 and RSASSA-PSS of 2048 bits with SHA-256.
+    PaperChacha,
+    /// ChaCha20-Poly1305 and RSASSA-PSS of 3072 bits with SHA-256.
+    Paper3072Chacha,
+}
+
+/// What messages are signed with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Scheme {
+    /// Nothing.
+    Unsigned,
+    /// Ed25519 (RFC 8032).
+    Ed25519,
+    /// RSASSA-PSS, SHA-256, MGF1 with SHA-256, salt of 32 bytes (RFC 8017, 8.1), with a modulus of this many bytes.
+    RsaPss(usize),
+}
+
+impl Scheme {
+    /// Length of a signature, bytes.
+    pub(crate) fn signature_bytes(self) -> usize {
+        match self {
+            Self::Unsigned => 0,
+            Self::Ed25519 => 64,
+            Self::RsaPss(modulus) => modulus,
+        }
+    }
+}
+
+impl Suite {
+    /// What is used where nothing else is asked for.
+    pub const DEFAULT: Self = Self::Standard;
+
+    /// All, in the order of their ids.
+    pub const ALL: [Self; 8] = [
+        Self::Group,
+        Self::GroupChacha,
+        Self::Standard,
+        Self::StandardChacha,
+        Self::Paper,
+        Self::Paper3072,
+        Self::PaperChacha,
+        Self::Paper3072Chacha,
+    ];
+
+    /// Id on the wire, from 1.
+    pub fn id(self) -> u8 {
+        self as u8 + 1
+    }
+
+    /// The suite with that id, if this build has it.
+    pub fn from_id(id: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|s| s.id() == id)
+    }
+
+    /// What configuration files and logs call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Group => "group",
+            Self::GroupChacha => "group-chacha",
+            Self::Standard => "standard",
+            Self::StandardChacha => "standard-chacha",
+            Self::Paper => "paper",
+            Self::Paper3072 => "paper-3072",
+            Self::PaperChacha => "paper-chacha",
+            Self::Paper3072Chacha => "paper-3072-chacha",
+        }
+    }
+
+    /// True if each source signs its messages, and members cannot forge one another.
+    pub fn is_signed(self) -> bool {
+        self.scheme() != Scheme::Unsigned
+    }
+
+    pub(crate) fn scheme(self) -> Scheme {
+        match self {
+            Self::Group | Self::GroupChacha => Scheme::Unsigned,
+            Self::Standard | Self::StandardChacha => Scheme::Ed25519,
+            Self::Paper | Self::PaperChacha => Scheme::RsaPss(256),
+            Self::Paper3072 | Self::Paper3072Chacha => Scheme::RsaPss(384),
+        }
+    }
+
+    pub(crate) fn cipher(self) -> &'static Algorithm {
+        match self {
+            Self::Group | Self::Standard | Self::Paper | Self::Paper3072 => &AES_256_GCM,
+            Self::GroupChacha | Self::StandardChacha | Self::PaperChacha | Self::Paper3072Chacha => {
+                &CHACHA20_POLY1305
+            }
+        }
+    }
+}
+
+impl fmt::Display for Suite {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Text that names no suite.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{found:?} is no cipher suite; there are {}", Suite::ALL.map(Suite::name).join(", "))]
+pub struct ParseSuiteError {
+    found: String,
+}
+
+impl FromStr for Suite {
+    type Err = ParseSuiteError;
+
+    fn from_str(s: &str) -> Result<Self, Self::Err> {
+        let found = Self::ALL.into_iter().find(|suite| suite.name() == s);
+        found.ok_or_else(|| ParseSuiteError { found: s.chars().take(80).collect() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_and_names_round_trip() {
+        for (suite, id) in Suite::ALL.into_iter().zip(1..) {
+            assert_eq!((suite.id(), Suite::from_id(id)), (id, Some(suite)));
+            assert_eq!(suite.to_string().parse(), Ok(suite));
+        }
+        assert_eq!((Suite::from_id(0), Suite::from_id(9)), (None, None));
+        assert_eq!((Suite::DEFAULT, Suite::default()), (Suite::Standard, Suite::Standard));
+        let error = "Standard".parse::<Suite>().unwrap_err().to_string();
+        assert!(error.contains("standard-chacha"), "{error}");
+    }
+}
