@@ -472,6 +472,10 @@ impl<N: RosNetwork> Core<N> {
             RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
             RouterOutput::Close { link, reason } => {
                 let Some(entry) = self.links.get(&link) else { return };
+                if matches!(reason, LinkClose::Revoked) {
+                    let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
+                }
                 match &reason {
                     LinkClose::Superseded => {
                         let peer = entry.link.peer().node_id.to_string();
@@ -946,6 +950,7 @@ impl<N: RosNetwork> Core<N> {
         let mut drops = self.control_drops.snapshot();
         drops.extend(self.data.drops().snapshot());
         drops.extend(self.ros_failures.snapshot());
+        drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
         let router = self.router.stats();
         Status {
             node: self.identity.node_name().to_string(),

@@ -314,7 +314,8 @@ pub async fn run_on<N: RosNetwork>(
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        accepting.push((tokio::spawn(keep_accepting(listener, events.clone(), stopped)), stop));
+        accepting
+            .push((tokio::spawn(keep_accepting(listener, events.clone(), stopped, audit.clone())), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     let reloader = Arc::new(Reloader {
