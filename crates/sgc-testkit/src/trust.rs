@@ -64,6 +64,18 @@ impl World {
         news
     }
 
+    /// True unless a node has heard that the certificate of `other` is revoked.
+    pub fn believes(&self, node: NodeKey, other: NodeKey) -> bool {
+        let anchors = self.nodes[node.0].anchors.as_deref();
+        anchors.is_none_or(|anchors| !anchors.is_peer_revoked(self.identity(other).as_peer()))
+    }
+
+    /// The revocation lists that a node has.
+    pub fn revocations(&self, node: NodeKey) -> Vec<Bytes> {
+        let anchors = self.nodes[node.0].anchors.as_deref();
+        anchors.into_iter().flat_map(|anchors| anchors.crls().cloned()).collect()
+    }
+
     /// Makes a node forget what it remembers over restarts: a new disk.
     pub fn forget_disk(&mut self, node: NodeKey) {
         self.nodes[node.0].anchors = None;
