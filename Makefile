@@ -4,12 +4,12 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
-	@echo 'its parts:       lint (fmt, clippy), peers, peers-check, unit (ARGS goes to cargo test), docs, deny'
+	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
 
 demo: build
@@ -23,6 +23,7 @@ test: deps-test
 	$(MAKE) fmt
 	$(MAKE) deny
 	$(MAKE) peers
+	$(MAKE) vectors
 	$(MAKE) clippy
 	$(MAKE) peers-check
 	$(MAKE) unit
@@ -36,6 +37,10 @@ deps-test:
 
 peers:
 	@scripts/build-peers.sh
+
+# The golden vectors of sealing, against an implementation that is not ours.
+vectors: peers
+	.venv/bin/python -B scripts/trust-vectors.py
 
 lint: fmt clippy
 

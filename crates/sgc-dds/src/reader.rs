@@ -119,6 +119,9 @@ struct Service {
 impl Service {
     fn run(&mut self) {
         let mut batch = Vec::with_capacity(BATCH);
+        // Handed over when it is known whether another follows: after the look that finds the next one, or none. That
+        // the handler hears of the last one is a promise, so it is kept when this reader ends, too.
+        let mut held: Option<Sample> = None;
         while self.wait_set.wait() {
             loop {
                 match self.take(&mut batch) {
@@ -131,10 +134,25 @@ impl Service {
                 }
                 for (sample, info) in batch.drain(..) {
                     if self.stop.is_requested() {
-                        return;
+                        break;
                     }
-                    self.hand_over(sample, &info);
+                    let Some(next) = self.sample(sample, &info) else { continue };
+                    if self.batch == 1 {
+                        // Only the newest counts: none is held that a blocked handler would make old.
+                        (self.handler)(next);
+                    } else if let Some(sample) = held.replace(next) {
+                        (self.handler)(Sample { more: true, ..sample });
+                    }
                 }
+                if self.stop.is_requested() {
+                    break;
+                }
+            }
+            if let Some(last) = held.take() {
+                (self.handler)(last);
+            }
+            if self.stop.is_requested() {
+                return;
             }
         }
     }
@@ -161,28 +179,30 @@ impl Service {
         Ok(taken as usize)
     }
 
-    fn hand_over(&mut self, sample: Serdata, info: &dds_sample_info_t) {
+    /// What the handler gets of what was taken, if anything.
+    fn sample(&mut self, sample: Serdata, info: &dds_sample_info_t) -> Option<Sample> {
         // Changes of instance state: Cyclone makes them up without a payload (see the crate's header).
         if !info.valid_data {
-            return;
+            return None;
         }
         let writer = self.writer(info.publication_handle);
         // DDS matches readers with writers of other proxies on this network too. What those wrote came through
         // SGC already: sharing it again would send it round and round.
         if writer.is_some_and(|w| w.tagged) && self.participant.ignores_tagged() {
-            return;
+            return None;
         }
         let payload = sample.into_payload();
         if payload.len() < HEADER_BYTES {
             tracing::debug!(bytes = payload.len(), "a sample without encapsulation header is dropped");
-            return;
+            return None;
         }
-        (self.handler)(Sample {
+        Some(Sample {
             kind: SampleKind::Write,
             writer: writer.map(|w| w.guid),
             source_timestamp_ns: info.source_timestamp,
             payload,
-        });
+            more: false,
+        })
     }
 
     /// Who a writer is; `None` if it is gone already and was never asked for.

@@ -417,6 +417,31 @@ fn a_handler_that_blocks_delays_no_other_reader() {
 }
 
 #[test]
+fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
+    let (ros, sgc) = (open(97, None), open(97, Some("arm-1")));
+    let (release, gate) = channel::<()>();
+    let (seen_tx, seen) = channel();
+    let _reader = sgc
+        .create_reader(
+            &spec("burst"),
+            Box::new(move |sample| {
+                let _ = seen_tx.send(sample.more);
+                let _ = gate.recv();
+            }),
+        )
+        .unwrap();
+    let writer = writer(&ros, &spec("burst"), 1);
+    write(&writer, &string_cdr("first"));
+    assert!(!next(&seen), "nothing else was there");
+    for i in 0..5 {
+        write(&writer, &string_cdr(&format!("{i}")));
+    }
+    // What gathered behind the gate is at hand together.
+    drop(release);
+    assert_eq!([(); 5].map(|()| next(&seen)), [true, true, true, true, false]);
+}
+
+#[test]
 fn a_reader_may_be_dropped_by_its_own_handler() {
     let (ros, sgc) = (open(83, None), open(83, Some("arm-1")));
     let slot = std::sync::Arc::new(std::sync::Mutex::new(None));

@@ -12,11 +12,9 @@ use rand_core::RngCore;
 use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, renewal_blind};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, Control, Credentials, Metadata, Name, NodeId, Now,
-    Recover, RefuseReason, SinkId, SourceId, TopicGrant,
+    Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
 };
 
-#[allow(unused)]
-use crate::compat::*;
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
 
@@ -85,6 +83,8 @@ pub enum Event {
         sink: SinkId,
         /// Whose it is.
         peer: NodeId,
+        /// Whether it receives or publishes.
+        role: Role,
     },
     /// A sink of a share is gone.
     SinkLeft {

@@ -12,8 +12,6 @@ use sgc_wire::{
     RefuseReason, RejectReason, Signed, SinkId, SourceId,
 };
 
-#[allow(unused)]
-use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::joins::{Join, JoinState, LostReason, RefusedBy, Wish};
 

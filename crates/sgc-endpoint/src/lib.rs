@@ -9,7 +9,6 @@
 //! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
-mod compat;
 mod endpoint;
 mod joiner;
 mod joins;

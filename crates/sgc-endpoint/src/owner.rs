@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
+use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
@@ -13,8 +14,6 @@ use sgc_wire::{
 };
 
 use crate::SourceProgress;
-#[allow(unused)]
-use crate::compat::*;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 
@@ -156,9 +155,12 @@ impl Endpoint {
         }
     }
 
-    /// Who asked this authority and is still there: sink and node.
-    pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer)> {
-        self.renewals.iter().map(|(sink, asked)| (*sink, &asked.peer))
+    /// Who asked this authority and is still there: sink, node, and signing request.
+    pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
+        self.renewals.iter().filter_map(|(sink, asked)| match &asked.request {
+            Request::Renew { csr } => Some((*sink, &asked.peer, csr)),
+            Request::Subscribe { .. } | Request::Publish { .. } => None,
+        })
     }
 
     pub(crate) fn end_catalogue(&mut self, name: Name, blind: Blind) {
@@ -436,6 +438,7 @@ impl Endpoint {
 
     fn handle_subscribe_or_publish(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let peer = asked.peer.node_id;
+        self.replace_publisher(&name, &sink, &asked);
         if let Err(reason) = self.admit(&name, &sink, &asked) {
             self.refuse(name, sink, 1, reason);
             self.event(Event::SinkRefused { name, peer, reason });
@@ -443,7 +446,8 @@ impl Endpoint {
         }
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         let reply_key = asked.reply_key.clone();
-        let publishes = matches!(asked.request, Request::Publish { .. });
+        let role = asked.request.role();
+        let publishes = role == Role::Publish;
         // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
         let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
@@ -462,10 +466,24 @@ impl Endpoint {
             self.grant_again(name, sink);
         }
         if !known {
-            self.event(Event::SinkJoined { name, sink, peer });
+            self.event(Event::SinkJoined { name, sink, peer, role });
         }
         if publishes && !known {
             self.regrant(name);
+        }
+    }
+
+    /// A publisher that asks anew, because the way here changed, may come before its old place is given up.
+    fn replace_publisher(&mut self, name: &Name, sink: &SinkId, asked: &GrantedSink) {
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        let Request::Publish { offer } = &asked.request else { return };
+        let same = |s: &GrantedSink| {
+            let peer = s.peer.node_id == asked.peer.node_id;
+            peer && matches!(&s.request, Request::Publish { offer: o } if o.source == offer.source)
+        };
+        let old = share.sinks.iter().find(|(id, s)| *id != sink && same(s)).map(|(id, _)| *id);
+        if let Some(old) = old {
+            self.handle_leave(*name, old);
         }
     }
 

@@ -50,6 +50,8 @@ pub struct Message {
     pub seq: u64,
     /// What it is and when it was published.
     pub head: MessageHead,
+    /// True if its publisher waits for who cannot take it; otherwise newer ones replace it.
+    pub reliable: bool,
     /// The payload, as it was published.
     pub payload: Bytes,
 }
@@ -486,7 +488,8 @@ impl Sink {
             // A reliable flow is in order: what is older and incomplete will never be complete.
             self.incomplete += source.partials.give_up(header.seq);
         }
-        Ok(Delivery::Message(Message { source: header.source, seq: header.seq, head, payload }))
+        let PacketHeader { source, seq, reliable, .. } = *header;
+        Ok(Delivery::Message(Message { source, seq, head, reliable, payload }))
     }
 }
 

@@ -60,6 +60,8 @@ pub struct SourceProgress {
     key: Bytes,
     next: AtomicU64,
     oldest: AtomicU64,
+    /// Messages published before the present epoch.
+    epoch_start: AtomicU64,
 }
 
 impl SourceProgress {
@@ -83,7 +85,13 @@ impl SourceProgress {
 
     /// Messages published.
     pub fn published(&self) -> u64 {
-        self.next.load(Acquire) - 1
+        self.next.load(Acquire).saturating_sub(1)
+    }
+
+    /// Messages published since the present epoch began; many ask for a new one.
+    pub fn published_in_epoch(&self) -> u64 {
+        let start = self.epoch_start.load(Acquire);
+        self.published().saturating_sub(start)
     }
 }
 
@@ -109,8 +117,6 @@ pub struct Source {
     key: SourceKey,
     message_key: MessageKey,
     seq: u64,
-    /// `seq` when the epoch began.
-    epoch_start: u64,
     batch: Batch,
     /// The packets of `batch`, sealed and not signed.
     unsigned: Vec<(PacketHeader, Vec<u8>)>,
@@ -135,6 +141,7 @@ impl Source {
             key: message_key.public().clone(),
             next: AtomicU64::new(1),
             oldest: AtomicU64::new(1),
+            epoch_start: AtomicU64::new(0),
         };
         Some(Self {
             config,
@@ -143,7 +150,6 @@ impl Source {
             key,
             message_key,
             seq: 0,
-            epoch_start: 0,
             batch: Batch::default(),
             unsigned: Vec::new(),
             history: VecDeque::new(),
@@ -163,7 +169,7 @@ impl Source {
         self.flush(emit);
         self.key = key;
         self.grant = without_lists(grant);
-        self.epoch_start = self.seq;
+        self.progress.epoch_start.store(self.seq, Release);
         true
     }
 
@@ -237,7 +243,7 @@ impl Source {
 
     /// Messages published since the present epoch began; many ask for a new one.
     pub fn published_in_epoch(&self) -> u64 {
-        self.seq - self.epoch_start
+        self.progress.published_in_epoch()
     }
 
     /// The source with its present floors, for the owner to vouch for.

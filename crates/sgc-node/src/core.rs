@@ -3,20 +3,32 @@
 //! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
 //! happens in tasks and threads of its own.
 
+mod publish;
+mod trust;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::{Arc, Mutex};
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
-use sgc_ros::{Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler};
+use sgc_ros::{
+    Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
+    UseRule,
+};
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
-use sgc_trust::{Identity, MessageKey, Suite, TrustAnchors};
-use sgc_wire::{Class, Control, History, Name, Now, Qos, SourceId, UnixMillis};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use sgc_trust::{CrlError, Identity, MessageKey, Suite};
+use sgc_wire::{
+    Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, Role, SinkId, SourceId, UnixMillis,
+};
+use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
+use crate::core::publish::Publishing;
+use crate::credentials::Keeper;
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
 use crate::outflow::OutFlow;
@@ -92,6 +104,29 @@ pub(crate) enum CoreEvent {
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
     },
+    /// The authority's answer to a member is ready.
+    RenewalReady {
+        /// Whom to answer.
+        sink: SinkId,
+        /// What.
+        answer: Result<Credentials, RefuseReason>,
+    },
+    /// The user wants something else from now on; answered when it is under way.
+    Reload {
+        /// What is shared.
+        shares: Vec<ShareRule>,
+        /// What is brought here.
+        uses: Vec<UseRule>,
+        /// Told when it is done.
+        reply: oneshot::Sender<()>,
+    },
+    /// The user brings a revocation list; answered with whether it is news.
+    Crl {
+        /// The list, DER.
+        der: bytes::Bytes,
+        /// Where to answer.
+        reply: oneshot::Sender<Result<bool, CrlError>>,
+    },
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
     /// Take nothing in any more; answered with what still leaves.
@@ -127,7 +162,16 @@ pub(crate) struct Core<N: RosNetwork> {
     retire_due: BTreeMap<Name, Instant>,
     /// What the messages of this node are signed with, by suite.
     message_keys: BTreeMap<Suite, MessageKey>,
+    publishing: BTreeMap<Name, Publishing>,
+    /// Messages of one source under one key.
+    epoch_messages_max: u64,
     credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    authority: Option<PathBuf>,
+    keeper: Keeper,
+    /// When to ask for another certificate.
+    renew_due: Option<Instant>,
+    redial: watch::Sender<()>,
     replays: Arc<Semaphore>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
@@ -137,6 +181,7 @@ pub(crate) struct Core<N: RosNetwork> {
     superseded: BTreeSet<String>,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
+    audit: Audit,
 }
 
 /// What a [`Core`] is made of.
@@ -145,6 +190,14 @@ pub(crate) struct CoreParts<N> {
     pub identity: Arc<Identity>,
     /// What links are made with.
     pub credentials: CredentialStore,
+    /// The fleet's file, if this node is the authority of its fleet.
+    pub authority: Option<PathBuf>,
+    /// Messages of one source under one key.
+    pub epoch_messages_max: u64,
+    /// Writes what outlives the process.
+    pub(crate) keeper: Keeper,
+    /// Tells the dialling tasks that there is another certificate.
+    pub redial: watch::Sender<()>,
     /// The routing machine.
     pub router: Router,
     /// The endpoint machine.
@@ -159,6 +212,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) alive: mpsc::Sender<()>,
     /// Transport counters.
     pub transport: Arc<sgc_transport::TransportMetrics>,
+    /// Where is kept who was granted what.
+    pub audit: Audit,
 }
 
 /// The present, by both clocks.
@@ -188,7 +243,13 @@ impl<N: RosNetwork> Core<N> {
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
             message_keys: BTreeMap::new(),
+            publishing: BTreeMap::new(),
+            epoch_messages_max: parts.epoch_messages_max,
             credentials: parts.credentials,
+            authority: parts.authority,
+            keeper: parts.keeper,
+            renew_due: None,
+            redial: parts.redial,
             replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
             requests,
             control_drops: Drops::default(),
@@ -198,6 +259,7 @@ impl<N: RosNetwork> Core<N> {
             superseded: BTreeSet::new(),
             transport: parts.transport,
             alive: parts.alive,
+            audit: parts.audit,
         };
         (core, requested)
     }
@@ -209,6 +271,7 @@ impl<N: RosNetwork> Core<N> {
         mut requested: mpsc::Receiver<SinkRequest>,
     ) {
         let mut batch = Vec::with_capacity(BATCH_MAX);
+        self.ask_renewal();
         let mut deadline = self.drain();
         loop {
             let timer = async {
@@ -246,6 +309,8 @@ impl<N: RosNetwork> Core<N> {
                 self.next_link += 1;
                 let neighbour = Neighbour::from(link.peer());
                 let remote = link.remote();
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&neighbour.node).remote(remote);
+                self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
@@ -255,6 +320,8 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
+                    let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()));
                     entry.flows.values().for_each(|f| f.close());
                 }
             }
@@ -281,6 +348,20 @@ impl<N: RosNetwork> Core<N> {
                     (_, Some(writer)) => writer.close(),
                     (_, None) => {}
                 }
+            }
+            CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
+            CoreEvent::Crl { der, reply } => {
+                let _ = reply.send(self.router.add_crl(now(), &der));
+                // Whoever brings a list may have changed the fleet's file.
+                self.answer_renewals();
+            }
+            CoreEvent::Reload { shares, uses, reply } => {
+                if let Some(routes) = &mut self.routes {
+                    routes.reconfigure(Instant::now(), shares, uses);
+                }
+                self.answer_renewals();
+                self.drain();
+                let _ = reply.send(());
             }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
@@ -320,6 +401,14 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
         }
+        if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
+            self.ask_renewal();
+        }
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
+        self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
         for name in over {
@@ -357,7 +446,9 @@ impl<N: RosNetwork> Core<N> {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
-                return [router, endpoint, routes, history, retire].into_iter().flatten().min();
+                let rekey = self.rekey_deadline();
+                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due];
+                return all.into_iter().flatten().min();
             }
         }
     }
@@ -437,12 +528,55 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn endpoint_event(&mut self, now: Now, event: Event) {
+        self.audit_event(&event);
+        match event {
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name) {
+                    share.replay(recover, &self.replays);
+                }
+            }
+            Event::Granted { name, sink, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
+                if self.publishing_granted(now, name, &grant) {
+                    debug!(name = %name.short(), "publishing under it");
+                } else if let Some(local) = self.sinks.get(&name) {
+                    local.grant(sink, grant, &self.data);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                }
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_granted(&name, entry);
+                }
+                self.ask_histories(name);
+            }
+            event => self.route_event(now, event),
+        }
+    }
+
+    /// What concerns the routes alone.
+    fn route_event(&mut self, now: Now, event: Event) {
         let Some(routes) = &mut self.routes else { return };
         match event {
-            Event::SinkJoined { name, sink, peer } => {
+            Event::SinkJoined { name, sink, peer, role } => {
                 info!(peer = %peer.short(), "granted a subscriber");
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
-                routes.handle_sink_joined(&name, sink);
+                if role == Role::Subscribe {
+                    routes.handle_sink_joined(&name, sink);
+                }
             }
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
@@ -453,33 +587,11 @@ impl<N: RosNetwork> Core<N> {
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 routes.handle_sink_left(now.instant, &name, &sink);
             }
-            Event::Rekeyed { name, grant } => {
-                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
-                if let Some(share) = self.shares.get(&name) {
-                    share.rekey(grant);
-                }
-            }
-            Event::OwnGrant { .. } => {}
-            Event::RenewAsked { .. } | Event::Renewed { .. } | Event::RenewRefused { .. } => {}
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 if self.control_drops.count_from("join_refused", peer.short()) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
-            }
-            Event::Recover(recover) => {
-                if let Some(share) = self.shares.get(&recover.name) {
-                    share.replay(recover, &self.replays);
-                }
-            }
-            Event::Granted { name, sink: id, grant } => {
-                debug!(name = %name.short(), epoch = grant.epoch, "granted");
-                if let Some(sink) = self.sinks.get(&name) {
-                    sink.grant(id, grant);
-                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
-                }
-                routes.handle_granted(&name);
-                self.ask_histories(name);
             }
             Event::Refused { name, by } => {
                 warn!(reason = %by, "a topic is refused to this node; asking again later");
@@ -502,6 +614,40 @@ impl<N: RosNetwork> Core<N> {
                 warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
                 routes.handle_owner_refused(owner, by);
             }
+            Event::RenewAsked { .. }
+            | Event::Renewed { .. }
+            | Event::RenewRefused { .. }
+            | Event::Rekeyed { .. }
+            | Event::OwnGrant { .. }
+            | Event::Recover(_)
+            | Event::Granted { .. } => {}
+        }
+    }
+
+    /// Keeps what concerns who gets what of this node.
+    fn audit_event(&self, event: &Event) {
+        let about = |event, name| {
+            let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));
+            AuditRecord::new(event).topic(topic).name(name)
+        };
+        match event {
+            Event::SinkJoined { name, peer, .. } => {
+                let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
+                self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
+            }
+            Event::SinkLeft { name, peer, .. } => self.audit.write(about(AuditEvent::Left, name).peer(peer)),
+            Event::SinkCut { name, peer, reason, .. } => {
+                let revoked = *reason == RefuseReason::Revoked;
+                let event = if revoked { AuditEvent::Revoked } else { AuditEvent::Cut };
+                self.audit.write(about(event, name).peer(peer).reason(reason));
+            }
+            Event::Rekeyed { name, grant } => {
+                self.audit.write(about(AuditEvent::Epoch, name).epoch(grant.epoch));
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
+            }
+            _ => {}
         }
     }
 
@@ -513,7 +659,12 @@ impl<N: RosNetwork> Core<N> {
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
                         debug!(%topic, %name, "shared");
-                        let share = LocalShare::new(name, self.data.clone(), self.alive.clone());
+                        let share = LocalShare::new(
+                            name,
+                            self.data.clone(),
+                            self.alive.clone(),
+                            self.epoch_messages_max,
+                        );
                         self.shares.insert(name, Arc::new(share));
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
@@ -527,6 +678,9 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();
                 }
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
+                }
             }
             Command::MapSources { name, qos, class, own } => self.map_sources(name, &qos, class, own),
             Command::OpenReader { name, spec } => self.open_reader(name, spec),
@@ -535,13 +689,22 @@ impl<N: RosNetwork> Core<N> {
                     drop_elsewhere(reader);
                 }
             }
-            Command::Join { name, owner, transient_local } => {
+            Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
+            Command::Follow { owner_name } => {
+                self.endpoint.follow(now, &owner_name);
+            }
+            Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
+            Command::Join { name, owner, transient_local, describe } => {
                 let sink = LocalSink::new(name, transient_local, self.requests.clone());
                 self.sinks.insert(name, Arc::new(sink));
-                self.endpoint.join(now, name, owner, Wish::Subscribe { describe: false });
+                self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
+            }
+            Command::Publish { name, owner, suite, class, reliable } => {
+                self.publish_under(name, owner, suite, class, reliable);
             }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
+                self.stop_publishing(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
                     sink.close();
                 }
@@ -583,8 +746,8 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
             };
-            let source = Arc::new(Mutex::new(Source::new(config, &grant, message_key.clone())?));
-            Some(SourceSlot { id, source, keeps_history, reliable: qos.is_reliable() })
+            let source = Source::new(config, &grant, message_key.clone())?;
+            Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
         let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
@@ -604,12 +767,6 @@ impl<N: RosNetwork> Core<N> {
     fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
         let suite = Suite::from_id(suite)?;
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
-    }
-
-    /// Believes others from here on, everywhere.
-    fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
-        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
-        self.endpoint.set_anchors(now(), anchors);
     }
 
     fn open_reader(&mut self, name: Name, spec: EndpointSpec) {

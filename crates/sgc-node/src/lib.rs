@@ -5,19 +5,33 @@
 //! beside it, on the tasks and threads that receive.
 #![forbid(unsafe_code)]
 
+pub mod admin;
+pub mod audit;
+mod authority;
 pub mod config;
 mod core;
+mod credentials;
 mod dataplane;
+mod fleet_file;
 mod links;
 mod node;
 mod outflow;
+pub mod partners;
+pub mod policy;
 mod queue;
+mod reload;
+mod rules;
 mod sinks;
 mod sources;
+mod state;
 mod stats;
 mod status;
 
+pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };
+pub use reload::{ConfigSource, ReloadReport};
+pub use rules::{RulesError, read_token};
+pub use state::{StateError, create_state_dir, state_dir};
 pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};

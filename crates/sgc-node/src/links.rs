@@ -10,7 +10,7 @@ use sgc_router::LinkId;
 use sgc_transport::{AnyLink, CloseReason, Dialer, FlowError, Link, LinkError, LinkUrl, Listener};
 use sgc_wire::{Control, Decode, Encode};
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
 use crate::core::CoreEvent;
@@ -21,8 +21,11 @@ use crate::stats::DataDrop;
 const CONTROL_FRAMES_MAX: usize = 8192;
 const BACKOFF_MIN: Duration = Duration::from_millis(250);
 const BACKOFF_MAX: Duration = Duration::from_secs(10);
-/// How long a peer may take to greet on a link that replaces another.
-const SUCCESSOR_MAX: Duration = Duration::from_secs(5);
+/// How long a link that replaces another may take until the other goes.
+const SETTLE_MAX: Duration = Duration::from_secs(5);
+/// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
+const QUIET_MIN: Duration = Duration::from_millis(100);
+const QUIET_RTTS: u32 = 4;
 /// How long it may take to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
@@ -41,7 +44,7 @@ impl ControlTx {
 /// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
 ///
 /// Each change of `redial` says that the credentials changed: a second link is made with what they are by then, and
-/// the first one taken down only when the peer has been heard on the second. As long as that fails, the first stays.
+/// the first one taken down only when both sides have told each other what they know on the second. As long as that fails, the first stays.
 pub(crate) async fn keep_dialled(
     url: LinkUrl,
     dialer: Arc<Dialer>,
@@ -109,11 +112,22 @@ async fn keep_renewed(
             end = current.end(core) => return end,
             dialled = next => match dialled {
                 Ok(link) => {
-                    failures = None;
-                    let mut next = Served::start(link, Some(url.to_string()), core).await;
-                    let heard = next.heard.take();
-                    let old = std::mem::replace(&mut current, next);
-                    tokio::spawn(old.retire(heard, core.clone()));
+                    let next = Served::start(link, Some(url.to_string()), core).await;
+                    tokio::select! {
+                        () = next.settled() => {
+                            failures = None;
+                            let old = std::mem::replace(&mut current, next);
+                            tokio::spawn(old.retire(core.clone()));
+                        }
+                        end = next.end(core) => {
+                            warn!("the link with the new credentials ended: {end}; the old one stays and it is tried again");
+                            failures = Some(failures.unwrap_or(0).saturating_add(1));
+                        }
+                        end = current.end(core) => {
+                            info!(%url, "link ended: {end}");
+                            (current, failures) = (next, None);
+                        }
+                    }
                 }
                 Err(error) => {
                     if failures.is_none() {
@@ -157,8 +171,8 @@ struct Served {
     link: AnyLink,
     /// Nothing if the node is stopping.
     id: Option<LinkId>,
-    /// Ready with the first control frame.
-    heard: Option<oneshot::Receiver<()>>,
+    /// How many control frames came.
+    heard: watch::Receiver<u64>,
 }
 
 impl Served {
@@ -166,12 +180,12 @@ impl Served {
     async fn start(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> Self {
         let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
         let (reply, id) = oneshot::channel();
-        let (first, heard) = oneshot::channel();
+        let (count, heard) = watch::channel(0);
         let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
         let id = match (core.send(up).await, id.await) {
             (Ok(()), Ok(Some((id, data)))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
-                spawn_tasks(&link, id, data, outgoing, first, core);
+                spawn_tasks(&link, id, data, outgoing, count, core);
                 Some(id)
             }
             _ => {
@@ -179,7 +193,7 @@ impl Served {
                 None
             }
         };
-        Self { link, id, heard: Some(heard) }
+        Self { link, id, heard }
     }
 
     /// Waits for its end and reports that. Dropping the future loses nothing: it is to be called again.
@@ -191,12 +205,27 @@ impl Served {
         end
     }
 
-    /// Takes it down once its successor has been heard. The goodbye makes the peer close it, and so tells that it has
-    /// got everything before.
-    async fn retire(self, successor: Option<oneshot::Receiver<()>>, core: mpsc::Sender<CoreEvent>) {
-        if let Some(heard) = successor {
-            let _ = timeout(SUCCESSOR_MAX, heard).await;
+    /// Waits until both sides have told each other what they know. No frame says so: routes follow the greetings and
+    /// what they call for follows the routes, each within a round trip, so a few of those in silence have to do.
+    /// Never ready on a link that has ended; one on which nothing is said is ended here.
+    async fn settled(&self) {
+        let mut heard = self.heard.clone();
+        let deadline = Instant::now() + SETTLE_MAX;
+        if timeout_at(deadline, heard.wait_for(|frames| *frames > 0)).await.is_err() {
+            self.link.close(CloseReason::Protocol("no control frame came".into()));
         }
+        while heard.has_changed().is_ok() {
+            let quiet = QUIET_MIN.max(QUIET_RTTS * self.link.stats().rtt);
+            heard.mark_unchanged();
+            if timeout_at(deadline.min(Instant::now() + quiet), heard.changed()).await.is_err() {
+                return;
+            }
+        }
+        std::future::pending().await
+    }
+
+    /// Takes it down. The goodbye makes the peer close it, and so tells that it has got everything before.
+    async fn retire(self, core: mpsc::Sender<CoreEvent>) {
         let goodbye = async {
             let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
             self.link.closed().await
@@ -213,11 +242,11 @@ fn spawn_tasks(
     id: LinkId,
     data: Arc<DataPlane>,
     outgoing: mpsc::Receiver<Control>,
-    first: oneshot::Sender<()>,
+    count: watch::Sender<u64>,
     core: &mpsc::Sender<CoreEvent>,
 ) {
     tokio::spawn(send_control(link.clone(), outgoing));
-    tokio::spawn(receive_control(link.clone(), id, first, core.clone()));
+    tokio::spawn(receive_control(link.clone(), id, count, core.clone()));
     tokio::spawn(receive_flows(link.clone(), id, data.clone()));
     tokio::spawn(receive_datagrams(link.clone(), id, data));
 }
@@ -234,19 +263,16 @@ async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
 async fn receive_control(
     link: AnyLink,
     id: LinkId,
-    first: oneshot::Sender<()>,
+    count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
 ) {
-    let mut first = Some(first);
     while let Ok(bytes) = link.recv_control().await {
         match Control::from_slice(&bytes) {
             Ok(frame) => {
                 if core.send(CoreEvent::Frame { link: id, frame }).await.is_err() {
                     return;
                 }
-                if let Some(first) = first.take() {
-                    let _ = first.send(());
-                }
+                count.send_modify(|n| *n += 1);
             }
             Err(error) => {
                 warn!(link = id.0, remote = %link.remote(), %error, "malformed control frame; the link is closed");
@@ -300,6 +326,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
 
     use std::future::Future;
+    use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
     use rand_core::OsRng;
     use sgc_transport::{CredentialStore, LinkOptions, RefusalKind, TransportMetrics};
@@ -317,25 +344,41 @@ mod tests {
     }
 
     /// Greets on each link and closes those whose peers say goodbye, as the machines do.
-    fn control_task() -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<Told>) {
+    fn control_task(
+        closes: Arc<AtomicBool>,
+        mute: Arc<AtomicBool>,
+        mut close: mpsc::Receiver<LinkId>,
+    ) -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<Told>) {
         let (events, mut inbox) = mpsc::channel(64);
         let (tell, told) = mpsc::channel(64);
         tokio::spawn(async move {
-            let mut links = Vec::new();
-            while let Some(event) = inbox.recv().await {
+            let mut links: Vec<(AnyLink, ControlTx)> = Vec::new();
+            loop {
+                let event = tokio::select! {
+                    Some(id) = close.recv() => {
+                        links[id.0 as usize - 1].0.close(CloseReason::Goodbye);
+                        continue;
+                    }
+                    event = inbox.recv() => event,
+                };
+                let Some(event) = event else { return };
                 match event {
                     CoreEvent::LinkUp { link, control, reply, .. } => {
                         let id = LinkId(links.len() as u32 + 1);
                         tell.send(Told::Up(id, link.peer().cert.clone())).await.unwrap();
-                        assert!(control.send(Control::Hello(Hello {
-                            minor: 0,
-                            incarnation: 1,
-                            transit: true
-                        })));
+                        if !mute.load(Relaxed) {
+                            let hello = Hello { minor: 0, incarnation: 1, transit: true };
+                            assert!(control.send(Control::Hello(hello)));
+                        }
                         links.push((link, control));
                         assert!(reply.send(Some((id, Arc::default()))).is_ok());
                     }
                     CoreEvent::LinkDown { id } => tell.send(Told::Down(id)).await.unwrap(),
+                    CoreEvent::Frame { link, frame: Control::Hello(_) }
+                        if link.0 > 1 && closes.load(Relaxed) =>
+                    {
+                        links[link.0 as usize - 1].0.close(CloseReason::Overloaded);
+                    }
                     CoreEvent::Frame { link, frame: Control::Goodbye } => {
                         links[link.0 as usize - 1].0.close(CloseReason::Goodbye);
                     }
@@ -359,12 +402,17 @@ mod tests {
         near: mpsc::Receiver<Told>,
         far: mpsc::Receiver<Told>,
         doors: Arc<TransportMetrics>,
+        /// Whether the router closes links but the first as soon as it is greeted on them.
+        far_closes: Arc<AtomicBool>,
+        /// Whether nobody greets.
+        mute: Arc<AtomicBool>,
+        close_far: mpsc::Sender<LinkId>,
         _stop: oneshot::Sender<()>,
     }
 
     fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
         let request = EnrollRequest::new(node.parse().unwrap(), now().unix);
-        Arc::new(fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+        Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
     impl Bench {
@@ -377,13 +425,16 @@ mod tests {
             let doors = Arc::<TransportMetrics>::default();
             let listener = Listener::bind(&addr, router.clone(), options.clone(), doors.clone()).unwrap();
             let url = listener.local().to_string().parse().unwrap();
-            let ((far_core, far), (near_core, near)) = (control_task(), control_task());
+            let (far_closes, mute) = (Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
+            let (close_far, closing) = mpsc::channel(1);
+            let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
+            let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
             tokio::spawn(keep_accepting(listener, far_core, stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));
-            Self { fleet, arm, router, redial, near, far, doors, _stop: stop }
+            Self { fleet, arm, router, redial, near, far, doors, far_closes, mute, close_far, _stop: stop }
         }
 
         fn cert(store: &CredentialStore) -> CertId {
@@ -412,6 +463,44 @@ mod tests {
             bench.expect_up(id + 1).await;
             bench.expect(Told::Down(LinkId(id)), Told::Down(LinkId(id))).await;
         }
+    }
+
+    #[tokio::test]
+    async fn the_old_link_stays_if_the_new_one_does_not_last() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        bench.far_closes.store(true, Relaxed);
+        bench.redial.send_replace(());
+        bench.expect_up(2).await;
+        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.far_closes.store(false, Relaxed);
+        // Each attempt that fails is followed by another.
+        loop {
+            let up = soon(bench.near.recv()).await.unwrap();
+            let Told::Up(id, _) = up else { panic!("{up:?}") };
+            assert!(matches!(soon(bench.far.recv()).await.unwrap(), Told::Up(..)));
+            let down = soon(bench.near.recv()).await.unwrap();
+            soon(bench.far.recv()).await.unwrap();
+            if down != Told::Down(id) {
+                assert_eq!(down, Told::Down(LinkId(1)));
+                return;
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_link_takes_over_at_once_where_the_old_one_ends_meanwhile() {
+        let mut bench = Bench::new();
+        bench.expect_up(1).await;
+        bench.mute.store(true, Relaxed);
+        bench.redial.send_replace(());
+        bench.expect_up(2).await;
+        // The second has not settled, since nobody greets on it.
+        bench.close_far.send(LinkId(1)).await.unwrap();
+        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        bench.close_far.send(LinkId(2)).await.unwrap();
+        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.expect_up(3).await;
     }
 
     #[tokio::test]

@@ -3,7 +3,7 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,22 +12,25 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
-use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
+use sgc_ros::{RosError, RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
 };
-use sgc_trust::{Identity, IdentityError, Policy};
-use sgc_wire::Metadata;
-use tokio::io::AsyncWriteExt;
-use tokio::net::UnixListener;
-use tokio::sync::{mpsc, oneshot, watch};
+use sgc_trust::{AnchorError, Identity, IdentityError};
+use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::config::{Config, DiscoveryRange, Recipient, RosConfig, ShareConfig, UseConfig};
+use crate::admin;
+use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
+use crate::config::{Config, DiscoveryRange, RosConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
+use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
+use crate::reload::{ConfigSource, Reloader, Running};
+use crate::rules::{Rules, RulesError};
+use crate::state::{self, StateError};
 
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
@@ -92,6 +95,23 @@ pub enum NodeError {
         /// The node.
         node: String,
     },
+    /// The state directory will not do.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// Partners or tokens will not do.
+    #[error(transparent)]
+    Rules(#[from] RulesError),
+    /// The CAs of the identity, of partners and of tokens are not CAs, or too many.
+    #[error("trusted CAs: {0}")]
+    Anchors(#[from] AnchorError),
+    /// The audit log cannot be written.
+    #[error("audit log {}: {source}; name another with `file` in [audit], or set `off`", path.display())]
+    Audit {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
     /// An address could not be bound.
     #[error("cannot listen on {addr}: {source}")]
     Listen {
@@ -116,6 +136,10 @@ pub enum NodeError {
 pub struct RunOptions {
     /// Told the addresses that are listened on, once the node is up.
     pub ready: Option<oneshot::Sender<Vec<ListenAddr>>>,
+    /// Reads the configuration again, for `sgc reload`.
+    pub source: Option<ConfigSource>,
+    /// Each message has the configuration read again, as SIGHUP does.
+    pub reload: Option<mpsc::Receiver<()>>,
 }
 
 /// Reads an identity file, which must be its owner's alone.
@@ -143,7 +167,8 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
         .anchors()
         .verify(identity.chain(), now().unix)
         .map_err(|source| NodeError::Certificate { path: config.identity.clone(), source })?;
-    if identity.fleet_secret().is_none() && !(config.shares.is_empty() && config.uses.is_empty()) {
+    let touches_topics = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
+    if identity.fleet_secret().is_none() && touches_topics {
         return Err(NodeError::RouterIdentity);
     }
     if let Some(own) = config.uses.iter().find(|u| u.from.as_str() == certified) {
@@ -196,49 +221,67 @@ pub async fn run_on<N: RosNetwork>(
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
+    let state = state_dir(&config, identity.node_name().as_str())?;
+    let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
+    rules.warnings.iter().for_each(|warning| warn!("{warning}"));
+    let own_anchors = identity.anchors().clone();
+    let identity = Arc::new(identity.with_anchors(rules.partners.extend(&identity)?));
+    let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
     let transport = Arc::new(TransportMetrics::default());
+    let anchors = with_kept_crls(state.as_deref(), identity.anchors().clone(), now());
     let credentials = CredentialStore::new(identity.clone());
+    credentials.set_anchors(anchors.clone());
+    let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
     let listeners = config
         .listen
         .iter()
         .map(|addr| {
-            Listener::bind(addr, credentials.clone(), LinkOptions::default(), transport.clone())
+            Listener::bind(addr, credentials.clone(), link_options.clone(), transport.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(credentials.clone(), LinkOptions::default(), transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
 
     let mut rng = system_rng()?;
     let router = Router::new(RouterConfig {
         node: identity.node_id(),
         transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
-        anchors: Arc::new(identity.anchors().clone()),
+        anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
     });
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
-        authority: false,
-        limits: sgc_endpoint::Limits::default(),
+        authority: config.authority.is_some(),
+        limits: sgc_endpoint::Limits {
+            rotate_every: config.rotation.every,
+            ..sgc_endpoint::Limits::default()
+        },
     };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
+    endpoint.set_anchors(now(), Arc::new(anchors));
     let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
-        let shares = config.shares.iter().map(|s| share_rule(s, &identity)).collect();
-        let uses: Vec<_> = config.uses.iter().filter_map(|u| use_rule(u, &identity)).collect();
+        let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let mut followed = std::collections::BTreeSet::new();
-        for rule in &uses {
+        for rule in uses.iter().filter(|rule| rule.token.is_none()) {
             if followed.insert(rule.owner) {
                 endpoint.follow(now(), &rule.owner_name);
             }
         }
+        let secret = identity.naming_secrets().first().map_or(secret, |newest| &newest.secret);
         Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
     });
 
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
+    let (redial, on_redial) = watch::channel(());
     let (core, requested) = Core::new(CoreParts {
+        authority: config.authority.clone(),
+        epoch_messages_max: config.rotation.messages,
+        keeper: Keeper::spawn(state.clone(), config.identity.clone(), own_anchors, alive.clone()),
+        redial,
         alive,
         identity: identity.clone(),
         credentials,
@@ -248,6 +291,7 @@ pub async fn run_on<N: RosNetwork>(
         network: network.clone(),
         events: events.downgrade(),
         transport,
+        audit: audit.clone(),
     });
     let core = tokio::spawn(core.run(inbox, requested));
     if let Some(network) = network.clone() {
@@ -260,8 +304,7 @@ pub async fn run_on<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
-    let (_redial, on_redial) = watch::channel(());
-    for url in &config.routers {
+    for url in config.routers.iter().chain(&rules.routers) {
         tasks.push(tokio::spawn(keep_dialled(
             url.clone(),
             dialer.clone(),
@@ -276,10 +319,32 @@ pub async fn run_on<N: RosNetwork>(
         accepting.push((tokio::spawn(keep_accepting(listener, events.clone(), stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
-    match bind_socket(&socket) {
-        Ok(listener) => tasks.push(tokio::spawn(serve_status(listener, events.clone()))),
+    let reloader = Arc::new(Reloader {
+        source: options.source,
+        identity: identity.clone(),
+        state,
+        audit: audit.clone(),
+        events: events.clone(),
+        has_ros: network.is_some(),
+        running: Mutex::new(Running { config, rules }),
+        changed: Notify::new(),
+    });
+    let watch = reloader.clone();
+    tasks.push(tokio::spawn(async move { watch.watch_expiry().await }));
+    if let Some(mut asked) = options.reload {
+        let reloader = reloader.clone();
+        tasks.push(tokio::spawn(async move {
+            while asked.recv().await.is_some() {
+                // What is wrong is in the log; nobody waits for an answer.
+                let _ = reloader.reload("SIGHUP").await;
+            }
+        }));
+    }
+    match admin::bind_socket(&socket) {
+        Ok(listener) => tasks.push(tokio::spawn(admin::serve(listener, events.clone(), reloader.clone()))),
         Err(error) => warn!(path = %socket.display(), %error, "no status socket"),
     }
+    audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
     if let Some(ready) = options.ready {
         let _ = ready.send(listening);
     }
@@ -319,15 +384,48 @@ pub async fn run_on<N: RosNetwork>(
     }
     dialer.close(CloseReason::Goodbye).await;
     let _ = core.await;
+    drop(reloader);
     if tokio::time::timeout(DRAIN_MAX, all_ended.recv()).await.is_err() {
         warn!("the local network did not take everything in time");
     }
     let _ = fs::remove_file(&socket);
+    audit.write(AuditRecord::new(AuditEvent::Stopped));
+    if let Some(writer) = audit_writer {
+        let _ = tokio::task::spawn_blocking(move || writer.finish()).await;
+    }
     // Ends discovery, and waits for its threads; the runtime waits for the rest.
     if let Some(network) = network {
         let _ = tokio::task::spawn_blocking(move || drop(network)).await;
     }
     Ok(())
+}
+
+/// The state directory, made if need be. A node whose user has no place for one runs without.
+fn state_dir(config: &Config, node: &str) -> Result<Option<PathBuf>, NodeError> {
+    let Some(dir) = state::state_dir(config, node) else {
+        warn!("{}; until then nothing is kept, and there is no audit log", StateError::Nowhere);
+        return Ok(None);
+    };
+    match state::create_state_dir(&dir) {
+        Ok(()) => Ok(Some(dir)),
+        Err(error @ StateError::Directory { .. }) if config.state.is_none() => {
+            warn!("{error}; nothing is kept, and there is no audit log: set `state` in [node]");
+            Ok(None)
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn open_audit(
+    config: &Config,
+    state: Option<&Path>,
+    rules: &Rules,
+) -> Result<(Audit, Option<AuditWriter>), NodeError> {
+    let path = audit::audit_path(config.audit.file.as_deref(), state);
+    let Some(path) = path.filter(|_| !config.audit.off) else { return Ok((Audit::default(), None)) };
+    let (audit, writer) = Audit::open(&path, config.audit.max_bytes, rules.names.clone())
+        .map_err(|source| NodeError::Audit { path, source })?;
+    Ok((audit, Some(writer)))
 }
 
 fn system_rng() -> Result<ChaCha20Rng, NodeError> {
@@ -348,82 +446,5 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
         static_peers: ros.static_peers.clone(),
         tag: Some(identity.node_name().to_string()),
         cyclonedds_uri: ros.cyclonedds_uri.clone(),
-    }
-}
-
-fn share_rule(share: &ShareConfig, identity: &Identity) -> ShareRule {
-    let mut policy = Policy::default();
-    for recipient in &share.to {
-        match recipient {
-            Recipient::Everyone => {
-                policy.subscribe.fleets.insert(identity.as_peer().ca);
-            }
-            Recipient::Node(node) => policy.subscribe.nodes.extend(identity.node_id_of(node.as_str())),
-            Recipient::Group(group) => {
-                let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
-                policy.subscribe.groups.extend(tag.map(|tag| (identity.as_peer().ca, tag)));
-            }
-        }
-    }
-    let extra = share.metadata.clone();
-    let type_name = share.type_name.clone().unwrap_or_default();
-    ShareRule {
-        metadata: Metadata {
-            node: extra.node,
-            author: extra.author,
-            maintainer: extra.maintainer,
-            interface: extra.interface,
-            description: extra.description,
-            unique: extra.unique,
-            ..Metadata::topic(identity.node_name().as_str(), &share.topic, &type_name)
-        },
-        policy,
-        suite: share.suite,
-        class: share.priority,
-    }
-}
-
-fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
-    Some(UseRule {
-        owner: identity.node_id_of(rule.from.as_str())?,
-        owner_name: rule.from.to_string(),
-        topic: rule.topic.clone(),
-        type_name: rule.type_name.clone(),
-    })
-}
-
-/// Binds the status socket for this user alone. One that a dead node left is replaced, a live one is not.
-fn bind_socket(path: &Path) -> io::Result<UnixListener> {
-    if let Some(directory) = path.parent() {
-        fs::DirBuilder::new().recursive(true).mode(0o700).create(directory)?;
-    }
-    if std::os::unix::net::UnixStream::connect(path).is_ok() {
-        return Err(io::Error::new(io::ErrorKind::AddrInUse, "another node answers there"));
-    }
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    let listener = UnixListener::bind(path)?;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
-    Ok(listener)
-}
-
-async fn serve_status(listener: UnixListener, events: mpsc::Sender<CoreEvent>) {
-    while let Ok((mut stream, _)) = listener.accept().await {
-        let (reply, status) = oneshot::channel();
-        if events.send(CoreEvent::Status(reply)).await.is_err() {
-            return;
-        }
-        if let Ok(status) = status.await
-            && let Ok(text) = serde_json::to_vec(&status)
-        {
-            // One at a time and bounded: a reader that stalls delays the next status, nothing else.
-            let write = async {
-                stream.write_all(&text).await?;
-                stream.shutdown().await
-            };
-            let _ = tokio::time::timeout(Duration::from_secs(2), write).await;
-        }
     }
 }

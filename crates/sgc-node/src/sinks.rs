@@ -10,12 +10,14 @@ use std::thread;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{Delivery, Message, Sink, SinkLimits};
+use sgc_endpoint::{Delivery, Message, Sink, SinkDrop, SinkLimits};
 use sgc_ros::{RosError, RosWriter, SampleKind};
-use sgc_wire::{MessageKind, Name, Packet, SourceId, TopicGrant};
+use sgc_router::LinkId;
+use sgc_wire::{MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
 use tokio::sync::mpsc;
 use tracing::{debug, warn};
 
+use crate::dataplane::DataPlane;
 use crate::queue::Queue;
 use crate::stats::{DataDrop, Drops};
 
@@ -35,11 +37,20 @@ pub(crate) enum SinkRequest {
     Synced(Name, SourceId),
 }
 
+#[derive(Default)]
+struct State {
+    sink: Option<Sink>,
+    /// Releases that are not written yet.
+    releases: u32,
+}
+
 /// A joined name's end at this node.
 pub(crate) struct LocalSink {
     name: Name,
     transient_local: bool,
-    state: Mutex<Option<Sink>>,
+    state: Mutex<State>,
+    /// Held while messages are written that waited for a grant: what comes after them is written after them.
+    releasing: Arc<tokio::sync::Mutex<()>>,
     writers: ArcSwap<BTreeMap<Option<SourceId>, Arc<WriterQueue>>>,
     requests: mpsc::Sender<SinkRequest>,
     delivered: AtomicU64,
@@ -51,19 +62,52 @@ impl LocalSink {
         Self {
             name,
             transient_local,
-            state: Mutex::new(None),
+            state: Mutex::default(),
+            releasing: Arc::default(),
             writers: ArcSwap::default(),
             requests,
             delivered: AtomicU64::new(0),
         }
     }
 
-    /// Takes a grant.
-    pub(crate) fn grant(&self, grant: TopicGrant) {
-        let mut state = self.lock();
-        match &mut *state {
-            Some(sink) => sink.regrant(grant),
-            None => *state = Some(Sink::new(self.name, grant, self.transient_local, SinkLimits::default())),
+    /// Takes a grant. Packets that waited for it are written by a task of their own, since that may take a while.
+    pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<DataPlane>) {
+        let mut released = Vec::new();
+        let turn = {
+            let mut state = self.lock();
+            match &mut state.sink {
+                Some(sink) => sink.regrant(id, grant, |result| released.push(result)),
+                sink => {
+                    let limits = SinkLimits::default();
+                    *sink = Some(Sink::new(self.name, id, grant, self.transient_local, limits));
+                }
+            }
+            if released.is_empty() {
+                return;
+            }
+            state.releases += 1;
+            self.releasing.clone().try_lock_owned().ok()
+        };
+        let (this, data) = (self.clone(), data.clone());
+        tokio::spawn(async move {
+            let turn = match turn {
+                Some(turn) => turn,
+                None => this.releasing.clone().lock_owned().await,
+            };
+            for result in released {
+                if let Some((reason, _)) = this.finish(result, data.drops()).await {
+                    data.count(LinkId::LOCAL, &this.name, reason);
+                }
+            }
+            this.lock().releases -= 1;
+            drop(turn);
+        });
+    }
+
+    /// Drops the keys of all epochs but the present one.
+    pub(crate) fn retire_epochs(&self) {
+        if let Some(sink) = &mut self.lock().sink {
+            sink.retire_epochs();
         }
     }
 
@@ -71,7 +115,7 @@ impl LocalSink {
     pub(crate) fn unsynced(&self) -> Vec<SourceId> {
         let writers = self.writers.load();
         let mut state = self.lock();
-        let Some(sink) = &mut *state else { return Vec::new() };
+        let Some(sink) = &mut state.sink else { return Vec::new() };
         writers.keys().flatten().copied().filter(|source| sink.expect(*source)).collect()
     }
 
@@ -81,7 +125,7 @@ impl LocalSink {
         let old = match writer {
             Some(writer) => writers.insert(source, writer),
             None => {
-                if let (Some(source), Some(sink)) = (source, &mut *self.lock()) {
+                if let (Some(source), Some(sink)) = (source, &mut self.lock().sink) {
                     sink.forget(&source);
                 }
                 writers.remove(&source)
@@ -105,13 +149,22 @@ impl LocalSink {
 
     /// Takes a packet; says what was dropped. Waits while a reliable topic's local writer is full.
     pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Option<(DataDrop, u64)> {
-        let delivery = match &mut *self.lock() {
-            Some(sink) => sink.handle_packet(&packet),
-            None => return Some((DataDrop::NotGranted, 1)),
+        let (result, behind) = {
+            let mut state = self.lock();
+            let Some(sink) = &mut state.sink else { return Some((DataDrop::NotGranted, 1)) };
+            (sink.handle_packet(&packet), state.releases > 0)
         };
-        match delivery {
-            Ok(Delivery::Incomplete) => None,
-            Ok(Delivery::Message(message)) => self.write(message, packet.header.reliable).await,
+        if behind {
+            drop(self.releasing.lock().await);
+        }
+        self.finish(result, drops).await
+    }
+
+    /// Does what a packet came to.
+    async fn finish(&self, result: Result<Delivery, SinkDrop>, drops: &Drops) -> Option<(DataDrop, u64)> {
+        match result {
+            Ok(Delivery::Incomplete | Delivery::Parked) => None,
+            Ok(Delivery::Message(message)) => self.write(message).await,
             Ok(Delivery::NeedsHistory(source)) => {
                 // If the control task is busy, the next packet or the retry timer asks again.
                 let _ = self.requests.try_send(SinkRequest::History(self.name, source));
@@ -129,7 +182,7 @@ impl LocalSink {
         }
     }
 
-    async fn write(&self, message: Message, reliable: bool) -> Option<(DataDrop, u64)> {
+    async fn write(&self, message: Message) -> Option<(DataDrop, u64)> {
         let writer = {
             let writers = self.writers.load();
             writers.get(&Some(message.source)).or_else(|| writers.get(&None)).cloned()
@@ -137,7 +190,7 @@ impl LocalSink {
         let Some(writer) = writer else { return Some((DataDrop::NoWriter, 1)) };
         self.delivered.fetch_add(1, Relaxed);
         let bytes = message.payload.len();
-        if reliable {
+        if message.reliable {
             match writer.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await {
                 Ok(()) => None,
                 Err(_) => Some((DataDrop::Stalled, 1)),
@@ -149,7 +202,7 @@ impl LocalSink {
         }
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Sink>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,7 +1,8 @@
 //! This node's own publishers: samples of the local network in, packets out.
 //!
 //! Samples are sealed on the thread of the local reader that took them and pushed straight into the queues of
-//! the links: while a reliable one is full, that thread waits, and with it that topic alone.
+//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are at hand
+//! together share a signature; none waits for one that is not.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
@@ -9,10 +10,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{PublishError, Source};
+use sgc_endpoint::{PublishError, Source, SourceProgress};
 use sgc_ros::{Guid, Sample, SampleKind};
 use sgc_router::LinkId;
-use sgc_wire::{MessageHead, MessageKind, Name, Recover, SourceId};
+use sgc_wire::{MessageHead, MessageKind, Name, Packet, Recover, SourceId, TopicGrant};
 use tokio::runtime::Handle;
 use tokio::sync::{Semaphore, mpsc};
 
@@ -32,10 +33,20 @@ pub(crate) struct SourceSlot {
     pub id: SourceId,
     /// The source; locked by the reader's thread for each message.
     pub source: Arc<Mutex<Source>>,
+    /// How far it is, to be seen without the lock.
+    pub progress: Arc<SourceProgress>,
     /// True if late joiners may ask for its history.
     pub keeps_history: bool,
     /// True if its packets are reliable.
     pub reliable: bool,
+}
+
+impl SourceSlot {
+    /// A source for a share.
+    pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
+        let (id, progress) = (source.id(), source.progress());
+        Self { id, source: Arc::new(Mutex::new(source)), progress, keeps_history, reliable }
+    }
 }
 
 /// Which source publishes for which writer.
@@ -52,8 +63,28 @@ pub(crate) struct SourceMap {
 impl SourceMap {
     /// The slot of a source, if it is of this map.
     pub(crate) fn slot(&self, id: &SourceId) -> Option<SourceSlot> {
-        self.own.values().chain(&self.shared).find(|slot| slot.id == *id).cloned()
+        self.slots().find(|slot| slot.id == *id).cloned()
     }
+
+    /// Their ids.
+    pub(crate) fn ids(&self) -> Vec<SourceId> {
+        self.slots().map(|slot| slot.id).collect()
+    }
+
+    /// All.
+    pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
+        self.own.values().chain(&self.shared)
+    }
+}
+
+/// What is between the local reader and the sources.
+#[derive(Default)]
+struct Inbox {
+    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before it
+    /// tells who wrote it.
+    early: VecDeque<Sample>,
+    /// Sources that were told that more follows, and wait for it with what they have.
+    open: Vec<SourceSlot>,
 }
 
 /// A shared topic's end at this node.
@@ -63,12 +94,14 @@ pub(crate) struct LocalShare {
     runtime: Handle,
     alive: mpsc::Sender<()>,
     pub map: ArcSwap<SourceMap>,
-    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before it
-    /// tells who wrote it.
-    early: Mutex<VecDeque<Sample>>,
+    inbox: Mutex<Inbox>,
     /// How many those are, to be seen without the lock, which a publisher holds while it is pushed back.
     waiting: AtomicUsize,
     closed: AtomicBool,
+    /// Messages of one source under one key, after which a new epoch begins.
+    epoch_messages_max: u64,
+    /// True while the epoch that is over by its number of messages has no successor yet.
+    rotating: AtomicBool,
     published: AtomicU64,
 }
 
@@ -79,25 +112,34 @@ impl LocalShare {
     }
 
     /// A share without sources.
-    pub(crate) fn new(name: Name, data: Arc<DataPlane>, alive: mpsc::Sender<()>) -> Self {
+    pub(crate) fn new(
+        name: Name,
+        data: Arc<DataPlane>,
+        alive: mpsc::Sender<()>,
+        epoch_messages_max: u64,
+    ) -> Self {
         Self {
             name,
             data,
             runtime: Handle::current(),
             alive,
             map: ArcSwap::default(),
-            early: Mutex::default(),
+            inbox: Mutex::default(),
             waiting: AtomicUsize::new(0),
             closed: AtomicBool::new(false),
+            epoch_messages_max,
+            rotating: AtomicBool::new(false),
             published: AtomicU64::new(0),
         }
     }
 
     /// Publishes a sample; called on the reader's thread.
     pub(crate) fn publish(&self, sample: Sample) {
-        let mut early = self.early.lock().unwrap_or_else(PoisonError::into_inner);
-        self.publish_early(&mut early);
-        if let Err(sample) = self.try_publish(sample) {
+        let more = sample.more;
+        let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+        self.publish_early(&mut inbox);
+        if let Err(sample) = self.try_publish(sample, more, &mut inbox.open) {
+            let early = &mut inbox.early;
             if early.len() >= EARLY_SAMPLES_MAX {
                 early.pop_front();
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::Stale);
@@ -106,7 +148,10 @@ impl LocalShare {
             self.waiting.store(early.len(), SeqCst);
             // Its source may have come between the two looks; whoever puts a map in place after this one sees that
             // something waits.
-            self.publish_early(&mut early);
+            self.publish_early(&mut inbox);
+        }
+        if !more {
+            self.flush(&mut inbox);
         }
     }
 
@@ -120,25 +165,28 @@ impl LocalShare {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
-            let mut early = share.early.lock().unwrap_or_else(PoisonError::into_inner);
-            share.publish_early(&mut early);
+            let mut inbox = share.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+            share.publish_early(&mut inbox);
+            share.flush(&mut inbox);
         });
     }
 
-    /// Publishes, in their order, the samples whose writers have a source by now.
-    fn publish_early(&self, early: &mut VecDeque<Sample>) {
-        if early.is_empty() {
+    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or publishes what
+    /// follows.
+    fn publish_early(&self, inbox: &mut Inbox) {
+        if inbox.early.is_empty() {
             return;
         }
         fence(SeqCst);
-        for sample in std::mem::take(early) {
-            early.extend(self.try_publish(sample).err());
+        for sample in std::mem::take(&mut inbox.early) {
+            inbox.early.extend(self.try_publish(sample, true, &mut inbox.open).err());
         }
-        self.waiting.store(early.len(), SeqCst);
+        self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Publishes a sample, or gives it back if its writer's source is not known yet.
-    fn try_publish(&self, sample: Sample) -> Result<(), Sample> {
+    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source may be left
+    /// with packets that wait for others; then it is in `open`.
+    fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
         if self.closed.load(Relaxed) {
             return Ok(());
         }
@@ -155,12 +203,17 @@ impl LocalShare {
             Some(slot) if !slot.keeps_history && !self.data.is_wanted(&self.name) => {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
             }
-            Some(slot) => self.seal_and_send(&slot, &sample),
+            Some(slot) => {
+                self.seal_and_send(&slot, sample, more);
+                if more && open.iter().all(|o| o.id != slot.id) {
+                    open.push(slot);
+                }
+            }
         }
         Ok(())
     }
 
-    fn seal_and_send(&self, slot: &SourceSlot, sample: &Sample) {
+    fn seal_and_send(&self, slot: &SourceSlot, sample: Sample, more: bool) {
         let head = MessageHead {
             kind: match sample.kind {
                 SampleKind::Write => MessageKind::Write,
@@ -169,15 +222,8 @@ impl LocalShare {
             },
             source_timestamp_ns: sample.source_timestamp_ns,
         };
-        let mut source = lock(&slot.source);
-        // Fragments leave as they are sealed: a large message is under way before its end is read. A history
-        // without anyone to get it stays here.
-        let wanted = self.data.is_wanted(&self.name);
-        let result = source.publish(&head, &sample.payload, |packet| {
-            if wanted && !self.closed.load(Relaxed) {
-                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
-            }
-        });
+        // Fragments leave as they are sealed: a large message is under way before its end is read.
+        let result = lock(&slot.source).publish(&head, sample.payload, more, self.emit());
         match result {
             Ok(()) => {
                 self.published.fetch_add(1, Relaxed);
@@ -185,7 +231,47 @@ impl LocalShare {
             Err(PublishError::TooLarge { .. }) => {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
             }
+            Err(PublishError::Exhausted) => {
+                self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
+            }
         }
+    }
+
+    /// Lets go what waits for more, which does not come.
+    fn flush(&self, inbox: &mut Inbox) {
+        for slot in inbox.open.drain(..) {
+            lock(&slot.source).flush(self.emit());
+        }
+    }
+
+    /// Sends packets on their ways, if there are any: a history without anyone to get it stays here.
+    fn emit(&self) -> impl FnMut(Packet) {
+        let wanted = self.data.is_wanted(&self.name);
+        move |packet| {
+            if wanted && !self.closed.load(Relaxed) {
+                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
+            }
+        }
+    }
+
+    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after its
+    /// message.
+    pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
+        let (share, alive) = (self.clone(), self.alive.clone());
+        self.runtime.spawn_blocking(move || {
+            let _alive = alive;
+            share.rotating.store(false, Relaxed);
+            for slot in share.map.load().slots() {
+                // A source that was made meanwhile has the key already, or that of a later epoch.
+                let _ = lock(&slot.source).rekey(&grant, share.emit());
+            }
+        });
+    }
+
+    /// True, once per epoch, when a source has published so many messages that a new one shall begin.
+    pub(crate) fn is_epoch_over(&self) -> bool {
+        let over = |slot: &SourceSlot| slot.progress.published_in_epoch() >= self.epoch_messages_max;
+        self.map.load().slots().any(over) && !self.rotating.swap(true, Relaxed)
     }
 
     /// Sends a sink what it asks for, in order with what is published meanwhile.
@@ -195,7 +281,7 @@ impl LocalShare {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
-            let source = lock(&slot.source);
+            let mut source = lock(&slot.source);
             source.replay(recover.sink, recover.from, recover.to, |packet| {
                 if !share.closed.load(Relaxed) {
                     share.runtime.block_on(share.data.forward(LinkId::LOCAL, packet));

@@ -6,8 +6,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use sgc_node::config::{
-    ArgsConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Origin, Recipient, SHARES_MAX, Table, load,
-    load_args, parse,
+    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Origin, Recipient,
+    RotationConfig, SHARES_MAX, SUITES, Table, TokenSource, load, load_args, parse, suite_default,
 };
 use sgc_trust::Suite;
 use sgc_wire::Class;
@@ -81,7 +81,7 @@ fn the_example_of_the_design_is_valid() {
         share.to,
         [Recipient::Node("desk".parse().unwrap()), Recipient::Group("operators".parse().unwrap())]
     );
-    assert_eq!((share.priority, share.suite), (Class::Default, Suite::Group));
+    assert_eq!((share.priority, share.suite), (Class::Default, suite_default()));
     assert_eq!(config.uses.len(), 1);
     let one = &config.uses[0];
     assert_eq!((one.from.as_str(), one.topic.as_str()), ("desk", "/cmd_vel"));
@@ -181,7 +181,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ("[ros]\ndomain = 3", &["node.toml:4: [ros] has no key `domain`; did you mean `domain_id`?"]),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
-            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`"],
+            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `token`"],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
         ("[[user]]", &["node.toml:3: the top level has no key `user`; did you mean `use`?"]),
@@ -245,12 +245,6 @@ fn planned_values_are_called_planned() {
             ],
         ),
         (
-            "[[share]]\ntopic = '/a'\nto = ['b']\nsuite = 'standard'",
-            &[
-                "node.toml:6: `suite` is \"standard\"; this suite is planned but not in this version: use \"group\"",
-            ],
-        ),
-        (
             "[[share]]\ntopic = '/a'\nto = ['b']\ntype = 'std_srvs/srv/Empty'",
             &[
                 "node.toml:6: `type` is \"std_srvs/srv/Empty\"; services are planned but not in this version: name a \
@@ -279,7 +273,7 @@ fn tables_and_values_of_the_wrong_type_are_told() {
         (
             "use = ['a']",
             &[
-                "node.toml:3: `use` is a string ('a'); it takes tables: [[share]] or [[use]], and the keys below",
+                "node.toml:3: `use` is a string ('a'); it takes tables: [[share]], [[use]] or [[partner]], and the keys below",
             ],
         ),
         (
@@ -427,10 +421,10 @@ fn recipients_and_nodes_are_checked() {
         (
             "[[share]]\ntopic = '/a'\nto = ['grp:ops', 'group:']",
             &[
-                "node.toml:5: `to` names \"grp:ops\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
-               to 64 of a-z, 0-9, '-', '_' and '.'",
-                "node.toml:5: `to` names \"group:\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
-               to 64 of a-z, 0-9, '-', '_' and '.'",
+                "node.toml:5: `to` names \"grp:ops\"; name nodes (\"desk\"), groups (\"group:operators\"), partners \
+               (\"partner:acme\") or \"*\", names of 1 to 64 of a-z, 0-9, '-', '_' and '.'",
+                "node.toml:5: `to` names \"group:\"; name nodes (\"desk\"), groups (\"group:operators\"), partners \
+               (\"partner:acme\") or \"*\", names of 1 to 64 of a-z, 0-9, '-', '_' and '.'",
             ],
         ),
         (
@@ -479,7 +473,8 @@ fn words_are_checked() {
             &[
                 "node.toml:6: `priority` is \"realtme\"; did you mean \"realtime\"? It takes \"realtime\", \"default\", \
                \"bulk\"",
-                "node.toml:7: `suite` is \"none\"; it takes \"group\"",
+                "node.toml:7: `suite` is \"none\"; it takes \"group\", \"group-chacha\", \"standard\", \"standard-chacha\", \
+               \"paper\", \"paper-3072\", \"paper-chacha\", \"paper-3072-chacha\"",
             ],
         ),
         (
@@ -490,6 +485,218 @@ fn words_are_checked() {
             ],
         ),
     ]);
+}
+
+#[test]
+fn suites_are_called_by_name() {
+    assert_eq!(suite_default(), Suite::from_id(3).unwrap_or(Suite::Group));
+    for (name, id) in SUITES.iter().zip(1..) {
+        let text = format!("[[share]]\ntopic = '/a'\nto = ['b']\nsuite = '{name}'");
+        match Suite::from_id(id) {
+            Some(suite) => assert_eq!(good(&format!("{NODE}{text}")).shares[0].suite, suite, "{name}"),
+            None => assert!(said_about(&text)[0].contains("planned but not in this version"), "{name}"),
+        }
+    }
+}
+
+#[test]
+fn who_may_publish_is_said_as_who_may_subscribe() {
+    let config = good(&format!(
+        "{NODE}[[share]]\ntopic = '/a'\nto = ['*', 'partner:acme']\npublish = ['desk', 'group:ops', 'partner:acme']\n\
+         [[partner]]\nname = 'acme'\nca = 'acme.pem'"
+    ));
+    assert_eq!(texts(&config.shares[0].publish), ["desk", "group:ops", "partner:acme"]);
+    assert_eq!(texts(&config.shares[0].to), ["*", "partner:acme"]);
+    assert!(
+        good(&format!("{NODE}[[share]]\ntopic = '/a'\nto = ['b']\npublish = []")).shares[0]
+            .publish
+            .is_empty()
+    );
+    check_all(&[(
+        "[[share]]\ntopic = '/a'\nto = ['b']\npublish = ['b', 'b', 7]",
+        &[
+            "node.toml:6: `publish` is an integer (7); it takes an array of strings, such as [\"desk\", \
+             \"group:operators\"]",
+            "node.toml:6: `publish` names \"b\" twice; once is enough",
+        ],
+    )]);
+}
+
+#[test]
+fn partners_are_described_once_and_completely() {
+    let id = "ab".repeat(32);
+    let config = good(&format!(
+        "{NODE}[[partner]]\nname = 'acme'\nca = 'acme.pem'\nnode = '{id}'\n\
+         [[partner]]\nname = 'bolt'\nca = '/ca/bolt.pem'\nnode = ['{id}', '{}']",
+        "cd".repeat(32)
+    ));
+    assert_eq!(config.partners[0].ca, Path::new("/etc/sgc/acme.pem"));
+    assert_eq!(texts(&config.partners[0].nodes), [id.as_str()]);
+    assert_eq!(config.partners[1].nodes.len(), 2);
+    check_all(&[
+        (
+            "[[partner]]",
+            &[
+                "node.toml:3: [[partner]] has no `name`; add one, such as name = \"acme\"",
+                "node.toml:3: [[partner]] has no `ca`; add one, such as ca = \"acme-ca.pem\"",
+            ],
+        ),
+        (
+            "[[partner]]\nname = 'Acme'\nca = ''\nnode = 'arm-7'",
+            &[
+                "node.toml:4: `name` is \"Acme\"; a partner's name is 1 to 64 of a-z, 0-9, '-', '_' and '.', the first a \
+                 letter or digit: \"acme\"",
+                "node.toml:5: `ca` is empty; give it a value, such as \"acme-ca.pem\"",
+                "node.toml:6: `node` names \"arm-7\"; a node id is 64 hexadecimal digits: `sgc status` there shows it",
+            ],
+        ),
+        (
+            "[[partner]]\nname = 'a'\nca = 'a'\n[[partner]]\nname = 'a'\nca = 'b'",
+            &[
+                "node.toml:7: `name` is \"a\", which line 4 describes already: make it one [[partner]] and join the nodes",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['partner:acme']",
+            &[
+                "node.toml:5: `to` names partner \"acme\", which no [[partner]] describes: add [[partner]] with name = \
+                 \"acme\" and ca = \"FILE\"",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['partner:acme/arm-7']",
+            &[
+                "node.toml:5: `to` names \"partner:acme/arm-7\"; name nodes (\"desk\"), groups (\"group:operators\"), \
+                 partners (\"partner:acme\") or \"*\", names of 1 to 64 of a-z, 0-9, '-', '_' and '.'",
+            ],
+        ),
+        (
+            "[[share]]\ntopic = '/a'\nto = ['partner:acne']\n[[partner]]\nname = 'acme'\nca = 'a'",
+            &[
+                "node.toml:5: `to` names partner \"acne\", which no [[partner]] describes (did you mean \"acme\"?): add \
+                 [[partner]] with name = \"acne\" and ca = \"FILE\"",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn trust_authority_rotation_and_audit_are_taken_over() {
+    let config = good(
+        r#"
+        identity = "x"
+        [node]
+        routers = ["quic://r:7447"]
+        state = "state"
+        trust = ["old-ca.pem", "/ca/other.pem"]
+        [authority]
+        fleet = "lab.fleet"
+        [rotation]
+        every = "15min"
+        messages = 4096
+        [audit]
+        file = "/var/log/sgc.jsonl"
+        max_bytes = 1048576
+        "#,
+    );
+    assert_eq!(config.state.as_deref(), Some(Path::new("/etc/sgc/state")));
+    assert_eq!(config.trust, [Path::new("/etc/sgc/old-ca.pem"), Path::new("/ca/other.pem")]);
+    assert_eq!(config.authority.as_deref(), Some(Path::new("/etc/sgc/lab.fleet")));
+    let every = std::time::Duration::from_secs(900);
+    assert_eq!(config.rotation, RotationConfig { every, messages: 4096 });
+    let file = Some(PathBuf::from("/var/log/sgc.jsonl"));
+    assert_eq!(config.audit, AuditConfig { file, max_bytes: 1 << 20, off: false });
+    let plain = good(NODE);
+    assert_eq!(plain.rotation.every, std::time::Duration::from_secs(3600));
+    assert_eq!((plain.rotation.messages, plain.audit.max_bytes), (1 << 24, 16 << 20));
+    assert!(good(&format!("{NODE}[audit]\noff = true")).audit.off);
+    let duration = "it takes a number with s, min, h or d, from \"10s\" to \"30d\"";
+    for (every, said) in
+        [("9s", duration), ("31d", duration), ("1", duration), ("1w", duration), ("-1h", duration)]
+    {
+        let text = format!("[rotation]\nevery = '{every}'");
+        assert_eq!(said_about(&text), [format!("node.toml:4: `every` is \"{every}\"; {said}")]);
+    }
+    check_all(&[
+        (
+            "[rotation]\nmessages = 5",
+            &["node.toml:4: `messages` is 5; it takes a number of messages from 1024 to 4294967296"],
+        ),
+        (
+            "[audit]\nmax_bytes = -1",
+            &["node.toml:4: `max_bytes` is -1; it takes a number of bytes from 65536 to 1099511627776"],
+        ),
+        (
+            "[audit]\noff = true\nfile = 'x'",
+            &["node.toml:5: `off` is true, but `file` is given: take one of them out"],
+        ),
+        ("[authority]", &["node.toml:3: [authority] has no `fleet`; add one, such as fleet = \"lab.fleet\""]),
+        ("node.trust = ['a', 'a']", &["node.toml:3: `trust` names \"a\" twice; once is enough"]),
+        (
+            "node.state = ''",
+            &["node.toml:3: `state` is empty; give it a value, such as \"/var/lib/sgc/arm-1\""],
+        ),
+    ]);
+}
+
+#[test]
+fn a_token_says_owner_and_topic_itself() {
+    let config = good(&format!("{NODE}[[use]]\ntoken = 'tokens/pose.token'"));
+    assert_eq!(config.tokens, [TokenSource::File("/etc/sgc/tokens/pose.token".into())]);
+    assert!(config.uses.is_empty() && !config.is_pure_router());
+    check_all(&[
+        (
+            "[[use]]\ntoken = 'a'\nfrom = 'b'\ntopic = '/c'",
+            &[
+                "node.toml:5: `from` stands beside `token`, which says it already: take `from` out",
+                "node.toml:6: `topic` stands beside `token`, which says it already: take `topic` out",
+            ],
+        ),
+        (
+            "[[use]]\ntoken = 'a'\n[[use]]\ntoken = 'a'",
+            &["node.toml:6: `token` is the one that line 4 has already: take one of them out"],
+        ),
+        (
+            "[[use]]\ntoken = 'sgc-token-1:c2VjcmV0'",
+            &[
+                "node.toml:4: `token` is no token: it was cut or mistyped: its checksum is wrong; ask the topic's owner for a \
+                 new one, or name the file that holds it",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn files_with_certificates_and_tokens_are_read_before_anything_is_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    fs::write(path("x"), "").unwrap();
+    fs::set_permissions(path("x"), fs::Permissions::from_mode(0o600)).unwrap();
+    fs::write(path("bad.pem"), "no certificate").unwrap();
+    fs::write(path("t.token"), "sgc-token-1:AAAAAAAA").unwrap();
+    let text = "identity = 'x'\nnode.routers = ['quic://r']\nnode.trust = ['none.pem', 'bad.pem']\n\
+                [[use]]\ntoken = 't.token'\n[authority]\nfleet = 'lab.fleet'";
+    fs::write(path("node.toml"), text).unwrap();
+    let said = |dir: &Path| {
+        let errors = load(&dir.join("node.toml"), &no_env).unwrap_err().to_string();
+        errors.replace(&format!("{}/", dir.display()), "")
+    };
+    let ca = "it must be a file of CA certificates in PEM, such as `sgc fleet show --ca` prints";
+    assert_eq!(
+        said(dir.path()).lines().collect::<Vec<_>>(),
+        [
+            &format!(
+                "node.toml:3: `trust` is none.pem: it cannot be read: No such file or directory (os error 2); {ca}"
+            ),
+            &format!(
+                "node.toml:3: `trust` is bad.pem: no CA certificate is given: at least one is needed; {ca}"
+            ),
+            "node.toml:5: `token` is t.token: its mode 0644 lets others at the topic's secret; `chmod 600 t.token`",
+            "node.toml:7: `fleet` is lab.fleet: no such file; it must be a file that this user may read",
+        ]
+    );
+    fs::set_permissions(path("t.token"), fs::Permissions::from_mode(0o600)).unwrap();
+    assert!(said(dir.path()).contains("its checksum is wrong"), "{}", said(dir.path()));
 }
 
 #[test]

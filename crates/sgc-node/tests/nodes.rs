@@ -37,7 +37,7 @@ fn unix_now() -> UnixMillis {
 fn identity(name: &str, router: bool) -> Arc<Identity> {
     let mut request = EnrollRequest::new(name.parse::<NodeName>().unwrap(), unix_now());
     request.router = router;
-    Arc::new(fleet().enroll(&request, &mut OsRng.unwrap_err()).unwrap())
+    Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
 }
 
 /// A node in a runtime of its own.
@@ -59,7 +59,7 @@ impl Node {
         let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
         runtime.spawn(async move {
-            let options = RunOptions { ready: Some(ready) };
+            let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };
@@ -135,6 +135,8 @@ impl Trio {
             shares: vec![],
             uses: vec![],
             admin_socket: Some(self.dir.path().join(format!("{}.sock", self.starts.get()))),
+            state: Some(self.dir.path().join(format!("{}.state", self.starts.get()))),
+            ..Config::default()
         }
     }
 
@@ -147,14 +149,19 @@ impl Trio {
     }
 
     fn robot(&self, topics: &[&str], to: &str) -> Node {
+        self.robot_in(Suite::Group, topics, to)
+    }
+
+    fn robot_in(&self, suite: Suite, topics: &[&str], to: &str) -> Node {
         let shares = topics
             .iter()
             .map(|topic| ShareConfig {
                 topic: (*topic).into(),
                 type_name: None,
                 to: vec![Recipient::Node(to.parse().unwrap())],
+                publish: vec![],
                 priority: Class::Default,
-                suite: Suite::Group,
+                suite,
                 metadata: ShareMetadata::default(),
             })
             .collect();
@@ -464,4 +471,48 @@ fn status_names_links_and_routes() {
     wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 2);
     // The document is what `Status` says.
     let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
+}
+
+/// Not a test: how many messages of 1 KB pass from a local network over a robot, a cloud router and a desk to another
+/// local network, in one process, as fast as they go. `docs/performance.md` says how to run it.
+#[test]
+#[ignore = "measures"]
+fn throughput_of_the_suites() {
+    const MESSAGES: usize = 300_000;
+    let rate = |suite, burst: usize| {
+        let trio = Trio::new();
+        let (_cloud, _robot) = (trio.cloud(), trio.robot_in(suite, &["/load"], "desk"));
+        let _desk = trio.desk(&["/load"]);
+        let qos = Qos { history: History::KeepAll, ..Qos::default() };
+        let talker = Talker::new(&trio.robot_net, "/load", qos.clone());
+        let listener = Listener::new(&trio.desk_net, "/load", qos);
+        talker.wait_for_readers(1);
+        let payload = Bytes::from(vec![7; 1000]);
+        listener.hears_at_last(|_| talker.say(payload.clone()));
+        while listener.samples.recv_timeout(Duration::from_millis(500)).is_ok() {}
+        let start = Instant::now();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for _ in 0..MESSAGES / burst {
+                    talker.writer.write_burst((0..burst).map(|_| payload.clone()));
+                }
+            });
+            for _ in 0..MESSAGES / burst * burst {
+                listener.samples.recv_timeout(PATIENCE).expect("reliable");
+            }
+        });
+        MESSAGES as f64 / start.elapsed().as_secs_f64()
+    };
+    for burst in [1, 8, 32, 64] {
+        let mut rates = [Suite::Group, Suite::Standard].map(|suite| (suite, Vec::new()));
+        for _ in 0..5 {
+            rates.iter_mut().for_each(|(suite, all)| all.push(rate(*suite, burst)));
+        }
+        let medians = rates.map(|(_, mut all)| {
+            all.sort_unstable_by(f64::total_cmp);
+            all[all.len() / 2]
+        });
+        let [group, standard] = medians;
+        eprintln!("{burst} at a time: group {group:.0}/s, standard {standard:.0}/s, {:.2}", standard / group);
+    }
 }

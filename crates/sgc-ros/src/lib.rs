@@ -16,6 +16,6 @@ pub use network::{
 };
 pub use qos::{RELIABLE_READER_DEPTH_MIN, reader_for, weakest};
 pub use routes::{
-    Command, Problem, RouteStatus, Routes, SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule,
+    Command, Direction, Problem, RouteStatus, Routes, SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule,
     WRITERLESS_HOLD,
 };

@@ -111,6 +111,9 @@ pub struct Sample {
     pub source_timestamp_ns: i64,
     /// Encapsulation header and body.
     pub payload: Bytes,
+    /// True if the handler gets another sample at once: it may then put off what is cheaper for several. After the last
+    /// one that is at hand it is false.
+    pub more: bool,
 }
 
 /// Receives the samples of one reader, on a thread of that reader alone: it may block, and while it

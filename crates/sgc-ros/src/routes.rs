@@ -6,7 +6,12 @@
 //!
 //! A *share route* is one shared topic with one type: it exists from the first local writer of that type
 //! until the last one has been gone for a while. A *use route* is one entry of a followed owner's catalogue
-//! that a rule asks for: it exists from the catalogue that lists it until one that does not.
+//! that a rule asks for: it exists from the catalogue that lists it until one that does not. A *token route* is a use
+//! route whose one entry comes with the grant, from an owner of another fleet whose catalogue this node cannot read.
+
+mod publish;
+mod reconfigure;
+mod tokens;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -50,9 +55,21 @@ pub struct ShareRule {
     pub class: Class,
 }
 
-/// What the user brings here.
+/// Which way messages go.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Direction {
+    /// From the owner's network to this one.
+    #[default]
+    Bring,
+    /// From this network to the owner's.
+    Publish,
+}
+
+/// What the user brings here, or publishes on elsewhere.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UseRule {
+    /// Which way.
+    pub direction: Direction,
     /// Whose it is.
     pub owner: NodeId,
     /// The owner's name, for people.
@@ -61,6 +78,23 @@ pub struct UseRule {
     pub topic: String,
     /// ROS type; `None` for whatever the owner shares.
     pub type_name: Option<String>,
+    /// The name that a token leads to, and what it says of it; the catalogue is not looked at then.
+    pub token: Option<(Name, Metadata)>,
+}
+
+impl UseRule {
+    fn is_of_catalogue(&self, owner: &NodeId) -> bool {
+        self.owner == *owner && self.token.is_none()
+    }
+
+    /// Whether it asks for the same as another, whatever the type.
+    fn is_same_place(&self, other: &Self) -> bool {
+        let name = |rule: &Self| rule.token.as_ref().map(|(name, _)| *name);
+        self.direction == other.direction
+            && self.owner == other.owner
+            && self.topic == other.topic
+            && name(self) == name(other)
+    }
 }
 
 /// What the driver has to do.
@@ -76,6 +110,13 @@ pub enum Command {
         qos: Qos,
         /// Its transient-local writers.
         sources: Vec<CatalogueSource>,
+    },
+    /// Tell the endpoint who may join the share now; who may no longer is to be cut off.
+    UpdatePolicy {
+        /// The share.
+        name: Name,
+        /// Who may join.
+        policy: Policy,
     },
     /// End the share.
     Unshare {
@@ -105,6 +146,16 @@ pub enum Command {
         /// The share.
         name: Name,
     },
+    /// Follow an owner's catalogue.
+    Follow {
+        /// Its name in the fleet.
+        owner_name: String,
+    },
+    /// Follow it no longer.
+    Unfollow {
+        /// Whose.
+        owner: NodeId,
+    },
     /// Join a name.
     Join {
         /// Which.
@@ -113,6 +164,21 @@ pub enum Command {
         owner: NodeId,
         /// True if histories are to be asked for.
         transient_local: bool,
+        /// True if the grant has to say what the name stands for.
+        describe: bool,
+    },
+    /// Join a name to publish under it what is read locally.
+    Publish {
+        /// Which.
+        name: Name,
+        /// Whose it must be.
+        owner: NodeId,
+        /// Cipher suite id.
+        suite: u8,
+        /// Class of its packets.
+        class: Class,
+        /// Whether they push back.
+        reliable: bool,
     },
     /// Leave a name.
     Leave {
@@ -214,6 +280,16 @@ pub enum Problem {
         /// Owner.
         owner: String,
     },
+    /// What came for a token is not what the token says.
+    #[error(
+        "{topic}: {owner} gives something else for the token than it says; it is not brought here. Ask for a new token"
+    )]
+    TokenEntry {
+        /// Topic.
+        topic: String,
+        /// Owner.
+        owner: String,
+    },
     /// More local endpoints than are looked at.
     #[error(
         "the local network has more than {LOCAL_ENDPOINTS_MAX} endpoints; those beyond are not looked at"
@@ -230,7 +306,7 @@ pub enum Problem {
 /// Where a route stands, for status.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RouteStatus {
-    /// `"share"` or `"use"`.
+    /// `"share"`, `"use"` or `"publish"`.
     pub direction: &'static str,
     /// ROS topic.
     pub topic: String,
@@ -254,6 +330,8 @@ struct ShareRoute {
     own: BTreeMap<Guid, SourceId>,
     sinks: BTreeSet<SinkId>,
     reader: Option<EndpointSpec>,
+    /// For what others publish on it.
+    writer: Option<EndpointSpec>,
     writerless_until: Option<Instant>,
     sinkless_until: Option<Instant>,
 }
@@ -266,7 +344,70 @@ struct UseRoute {
     refused: Option<RefusedBy>,
     /// Open writers, and what they offer.
     writers: BTreeMap<Option<SourceId>, EndpointSpec>,
+    /// If it publishes: the local writers, and the reader of what they write.
+    local: BTreeMap<Guid, DiscoveredEndpoint>,
+    reader: Option<EndpointSpec>,
     unreachable_until: Option<Instant>,
+}
+
+impl ShareRoute {
+    /// A share with this first writer, or with none.
+    fn begin(
+        name: Name,
+        rule: usize,
+        share: &ShareRule,
+        type_name: &str,
+        keyless: bool,
+        writer: Option<DiscoveredEndpoint>,
+    ) -> (ShareSpec, Self) {
+        let spec = ShareSpec {
+            metadata: Metadata { type_name: ros_type(type_name), ..share.metadata.clone() },
+            policy: share.policy.clone(),
+            suite: share.suite,
+            class: share.class,
+            keyless,
+            type_hash: writer.as_ref().and_then(|w| w.type_hash.clone()),
+            qos: writer.as_ref().map(|w| w.qos.clone()).unwrap_or_default(),
+            sources: Vec::new(),
+        };
+        let route = Self {
+            name,
+            rule,
+            type_name: type_name.to_owned(),
+            keyless,
+            own: BTreeMap::new(),
+            writers: writer.into_iter().map(|w| (w.guid, w)).collect(),
+            sinks: BTreeSet::new(),
+            reader: None,
+            writer: None,
+            writerless_until: None,
+            sinkless_until: None,
+        };
+        (spec, route)
+    }
+}
+
+impl UseRoute {
+    fn new(rule: usize, entry: CatalogueEntry) -> Self {
+        Self {
+            rule,
+            entry,
+            granted: false,
+            refused: None,
+            writers: BTreeMap::new(),
+            local: BTreeMap::new(),
+            reader: None,
+            unreachable_until: None,
+        }
+    }
+}
+
+/// A name that a token leads to, joined.
+#[derive(Debug)]
+struct TokenJoin {
+    rule: usize,
+    transient_local: bool,
+    refused: Option<RefusedBy>,
 }
 
 /// The machine.
@@ -279,6 +420,10 @@ pub struct Routes<R> {
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,
     shares: BTreeMap<Name, ShareRoute>,
     uses: BTreeMap<Name, UseRoute>,
+    /// Names of tokens; there is a route besides from the first grant on.
+    tokens: BTreeMap<Name, TokenJoin>,
+    /// What followed owners said last, for rules that come later.
+    catalogues: BTreeMap<NodeId, Catalogue>,
     /// Owners that are out of reach or refuse, for status.
     owners: BTreeMap<NodeId, String>,
     told: BTreeSet<Problem>,
@@ -294,7 +439,7 @@ impl<R: RngCore> Routes<R> {
         use_rules: Vec<UseRule>,
         rng: R,
     ) -> Self {
-        Self {
+        let mut routes = Self {
             secret,
             node,
             rng,
@@ -303,10 +448,20 @@ impl<R: RngCore> Routes<R> {
             endpoints: BTreeMap::new(),
             shares: BTreeMap::new(),
             uses: BTreeMap::new(),
+            tokens: BTreeMap::new(),
+            catalogues: BTreeMap::new(),
             owners: BTreeMap::new(),
             told: BTreeSet::new(),
             commands: VecDeque::new(),
-        }
+        };
+        routes.join_tokens();
+        routes.begin_inbound();
+        routes
+    }
+
+    /// Names of shares that begin later come from this secret; running ones keep theirs.
+    pub fn set_secret(&mut self, secret: FleetSecret) {
+        self.secret = secret;
     }
 
     /// The local graph changed.
@@ -343,11 +498,11 @@ impl<R: RngCore> Routes<R> {
 
     /// A sink of one of our shares is gone.
     pub fn handle_sink_left(&mut self, now: Instant, name: &Name, sink: &SinkId) {
-        if let Some(share) = self.shares.get_mut(name) {
-            share.sinks.remove(sink);
-            if share.sinks.is_empty() {
-                share.sinkless_until = Some(now + SINKLESS_HOLD);
-            }
+        if let Some(share) = self.shares.get_mut(name)
+            && share.sinks.remove(sink)
+            && share.sinks.is_empty()
+        {
+            share.sinkless_until = Some(now + SINKLESS_HOLD);
         }
     }
 
@@ -355,6 +510,7 @@ impl<R: RngCore> Routes<R> {
     pub fn handle_catalogue(&mut self, owner: NodeId, catalogue: Catalogue) {
         self.owners.remove(&owner);
         let mut listed = BTreeSet::new();
+        self.catalogues.insert(owner, catalogue.clone());
         for entry in catalogue.entries {
             let Some(rule) = self.rule_for(owner, &entry) else { continue };
             let name = name_of(&owner, &entry.blind);
@@ -371,7 +527,7 @@ impl<R: RngCore> Routes<R> {
         let gone: Vec<_> = self
             .uses
             .iter()
-            .filter(|(n, u)| self.use_rules[u.rule].owner == owner && !listed.contains(n))
+            .filter(|(n, u)| self.use_rules[u.rule].is_of_catalogue(&owner) && !listed.contains(n))
             .map(|(n, _)| *n)
             .collect();
         for name in gone {
@@ -384,10 +540,13 @@ impl<R: RngCore> Routes<R> {
         let names: Vec<_> = self
             .uses
             .iter()
-            .filter(|(_, u)| self.use_rules[u.rule].owner == owner)
+            .filter(|(_, u)| self.use_rules[u.rule].is_of_catalogue(&owner))
             .map(|(n, _)| *n)
             .collect();
         let gone = matches!(reason, LostReason::Withdrawn | LostReason::Refused(_));
+        if gone {
+            self.catalogues.remove(&owner);
+        }
         self.owners.insert(owner, if gone { "has gone".into() } else { "is out of reach".into() });
         for name in names {
             if gone {
@@ -403,13 +562,21 @@ impl<R: RngCore> Routes<R> {
         self.owners.insert(owner, format!("refuses its catalogue: {by}"));
     }
 
-    /// A join was granted.
-    pub fn handle_granted(&mut self, name: &Name) {
+    /// A join was granted. `entry` is what the name stands for, where that was asked for.
+    pub fn handle_granted(&mut self, name: &Name, entry: Option<CatalogueEntry>) {
+        if let (Some(entry), true) = (entry, self.tokens.contains_key(name)) {
+            self.handle_described(*name, entry);
+        }
         if let Some(route) = self.uses.get_mut(name) {
             route.granted = true;
             route.refused = None;
             route.unreachable_until = None;
-            self.refresh_use(*name);
+            let rule = route.rule;
+            if self.publishes(rule) {
+                self.refresh_publisher(*name);
+            } else {
+                self.refresh_use(*name);
+            }
         }
     }
 
@@ -417,6 +584,9 @@ impl<R: RngCore> Routes<R> {
     pub fn handle_refused(&mut self, name: &Name, by: RefusedBy) {
         if let Some(route) = self.uses.get_mut(name) {
             route.refused = Some(by);
+        }
+        if let Some(token) = self.tokens.get_mut(name) {
+            token.refused = Some(by);
         }
     }
 
@@ -443,6 +613,9 @@ impl<R: RngCore> Routes<R> {
                 for source in std::mem::take(&mut route.writers).into_keys() {
                     self.commands.push_back(Command::CloseWriter { name: *name, source });
                 }
+                if route.reader.take().is_some() {
+                    self.commands.push_back(Command::CloseReader { name: *name });
+                }
             }
         }
     }
@@ -457,6 +630,12 @@ impl<R: RngCore> Routes<R> {
         let shares = self.shares.values().flat_map(|s| [s.writerless_until, s.sinkless_until]);
         let uses = self.uses.values().map(|u| u.unreachable_until);
         shares.chain(uses).flatten().min()
+    }
+
+    /// The ROS topic behind a name that is shared or used here.
+    pub fn topic_of(&self, name: &Name) -> Option<&str> {
+        let share = self.shares.get(name).map(|s| self.share_rules[s.rule].metadata.ros_name.as_str());
+        share.or_else(|| Some(self.use_rules[self.uses.get(name)?.rule].topic.as_str()))
     }
 
     /// Where every rule stands.
@@ -489,14 +668,21 @@ impl<R: RngCore> Routes<R> {
         for (index, rule) in self.use_rules.iter().enumerate() {
             let routes: Vec<_> = self.uses.iter().filter(|(_, u)| u.rule == index).collect();
             let status = |type_name, name, state| RouteStatus {
-                direction: "use",
+                direction: if rule.direction == Direction::Publish { "publish" } else { "use" },
                 topic: rule.topic.clone(),
                 type_name,
                 name,
                 owner: rule.owner_name.clone(),
                 state,
             };
-            if routes.is_empty() {
+            if let Some((name, metadata)) = rule.token.as_ref().filter(|_| routes.is_empty()) {
+                let refused = self.tokens.get(name).and_then(|token| token.refused);
+                let state = match refused {
+                    Some(by) => format!("refused: {by}"),
+                    None => "waits for the owner's grant".into(),
+                };
+                all.push(status(Some(metadata.type_name.clone()), Some(*name), state));
+            } else if routes.is_empty() {
                 let state = match self.owners.get(&rule.owner) {
                     Some(state) => format!("{} {state}", rule.owner_name),
                     None => format!("{} does not share it with this node (yet)", rule.owner_name),
@@ -505,6 +691,9 @@ impl<R: RngCore> Routes<R> {
             }
             for (name, route) in routes {
                 let state = match (route.granted, route.refused) {
+                    (true, _) if rule.direction == Direction::Publish => {
+                        format!("granted, {} local publishers", route.local.len())
+                    }
                     (true, _) => format!("granted, {} local writers", route.writers.len()),
                     (false, Some(by)) => format!("refused: {by}"),
                     (false, None) => "waits for the owner's grant".into(),
@@ -517,6 +706,7 @@ impl<R: RngCore> Routes<R> {
 
     fn writer_there(&mut self, writer: DiscoveredEndpoint) {
         self.check_local(&writer);
+        self.publisher_there(&writer);
         let Some(topic) = ros_topic(&writer.topic) else { return };
         let found = ros_type(&writer.type_name);
         let Some((rule, share)) =
@@ -529,35 +719,19 @@ impl<R: RngCore> Routes<R> {
             let problem = Problem::ShareType { topic: topic.to_owned(), expected: expected.clone(), found };
             return self.report(problem);
         }
-        let metadata = Metadata { type_name: found, ..share.metadata.clone() };
-        let name = derive_name(&self.secret, &self.node, &metadata);
-        if let Some(route) = self.shares.get_mut(&name) {
+        // One that runs keeps its name, also after the secret that names come from was replaced.
+        if let Some(route) =
+            self.shares.values_mut().find(|s| s.rule == rule && s.type_name == writer.type_name)
+        {
             route.writers.insert(writer.guid, writer);
             route.writerless_until = None;
+            let name = route.name;
             return self.refresh_share(name);
         }
-        let spec = ShareSpec {
-            metadata,
-            policy: share.policy.clone(),
-            suite: share.suite,
-            class: share.class,
-            keyless: writer.keyless,
-            type_hash: writer.type_hash.clone(),
-            qos: writer.qos.clone(),
-            sources: Vec::new(),
-        };
-        let route = ShareRoute {
-            name,
-            rule,
-            type_name: writer.type_name.clone(),
-            keyless: writer.keyless,
-            own: BTreeMap::new(),
-            writers: BTreeMap::from([(writer.guid, writer)]),
-            sinks: BTreeSet::new(),
-            reader: None,
-            writerless_until: None,
-            sinkless_until: None,
-        };
+        let metadata = Metadata { type_name: found, ..share.metadata.clone() };
+        let name = derive_name(&self.secret, &self.node, &metadata);
+        let (type_name, keyless) = (writer.type_name.clone(), writer.keyless);
+        let (spec, route) = ShareRoute::begin(name, rule, share, &type_name, keyless, Some(writer));
         self.shares.insert(name, route);
         self.commands.push_back(Command::Share(spec));
         self.refresh_share(name);
@@ -567,6 +741,7 @@ impl<R: RngCore> Routes<R> {
         if endpoint.kind != EndpointKind::Writer {
             return;
         }
+        self.publisher_gone(endpoint);
         let names: Vec<_> =
             self.shares.values().filter(|s| s.writers.contains_key(&endpoint.guid)).map(|s| s.name).collect();
         for name in names {
@@ -575,17 +750,25 @@ impl<R: RngCore> Routes<R> {
             if share.writers.is_empty() {
                 // What was offered stands until the hold ends: a restarted program finds it as it was.
                 share.own.clear();
-                share.writerless_until = Some(now + WRITERLESS_HOLD);
-            } else {
-                self.refresh_share(name);
+                // One that others publish on is there without.
+                if self.share_rules[share.rule].policy.publish.is_empty() {
+                    share.writerless_until = Some(now + WRITERLESS_HOLD);
+                    continue;
+                }
             }
+            self.refresh_share(name);
         }
     }
 
     /// Brings catalogue, sources and reader of a share in line with its writers and sinks.
     fn refresh_share(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
-        let Some(offer) = weakest(share.writers.values().map(|w| &w.qos)) else { return };
+        let offer = match weakest(share.writers.values().map(|w| &w.qos)) {
+            Some(offer) => offer,
+            None if self.share_rules[share.rule].policy.publish.is_empty() => return,
+            // What the publishers elsewhere offer is not known here; ROS 2's default serves commands well.
+            None => Qos::default(),
+        };
         share.own.retain(|guid, _| share.writers.contains_key(guid));
         let mut problem = None;
         if offer.is_transient_local() {
@@ -624,6 +807,7 @@ impl<R: RngCore> Routes<R> {
         self.commands.push_back(Command::MapSources { name, qos: offer.clone(), class, own });
         // A transient-local topic is read from the start: late joiners are promised its history.
         let wanted = offer.is_transient_local() || !share.sinks.is_empty() || share.sinkless_until.is_some();
+        let wanted = wanted && !share.writers.is_empty();
         if !share.sinks.is_empty() {
             share.sinkless_until = None;
         }
@@ -653,6 +837,9 @@ impl<R: RngCore> Routes<R> {
             if share.reader.is_some() {
                 self.commands.push_back(Command::CloseReader { name });
             }
+            if share.writer.is_some() {
+                self.commands.push_back(Command::CloseWriter { name, source: None });
+            }
             self.commands.push_back(Command::Unshare { name });
         }
     }
@@ -661,7 +848,11 @@ impl<R: RngCore> Routes<R> {
     fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<usize> {
         let metadata = &entry.metadata;
         let (index, rule) = self.use_rules.iter().enumerate().find(|(_, r)| {
-            r.owner == owner && r.topic == metadata.ros_name && metadata.kind == Kind::Topic
+            let may = match r.direction {
+                Direction::Bring => entry.subscribe,
+                Direction::Publish => entry.publish,
+            };
+            may && r.is_of_catalogue(&owner) && r.topic == metadata.ros_name && metadata.kind == Kind::Topic
         })?;
         match &rule.type_name {
             Some(expected) if *expected != metadata.type_name => {
@@ -681,6 +872,7 @@ impl<R: RngCore> Routes<R> {
     fn entry_there(&mut self, name: Name, rule: usize, entry: CatalogueEntry) {
         let transient_local = entry.qos.is_transient_local();
         match self.uses.get_mut(&name) {
+            Some(route) if self.use_rules[route.rule].direction == Direction::Publish => route.entry = entry,
             Some(route) if route.entry.qos.is_transient_local() == transient_local => {
                 route.entry = entry;
                 self.refresh_use(name);
@@ -692,16 +884,13 @@ impl<R: RngCore> Routes<R> {
             }
             None => {
                 let owner = self.use_rules[rule].owner;
-                let route = UseRoute {
-                    rule,
-                    entry,
-                    granted: false,
-                    refused: None,
-                    writers: BTreeMap::new(),
-                    unreachable_until: None,
-                };
-                self.uses.insert(name, route);
-                self.commands.push_back(Command::Join { name, owner, transient_local });
+                let (suite, class, reliable) = (entry.suite, entry.class, entry.qos.is_reliable());
+                self.uses.insert(name, UseRoute::new(rule, entry));
+                if self.publishes(rule) {
+                    self.commands.push_back(Command::Publish { name, owner, suite, class, reliable });
+                    return self.find_publishers();
+                }
+                self.commands.push_back(Command::Join { name, owner, transient_local, describe: false });
                 for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
                     self.check_local(&endpoint);
                 }
@@ -712,18 +901,30 @@ impl<R: RngCore> Routes<R> {
     fn hold_use(&mut self, now: Instant, name: Name) {
         if let Some(route) = self.uses.get_mut(&name) {
             route.granted = false;
-            if !route.writers.is_empty() {
+            if !route.writers.is_empty() || route.reader.is_some() {
                 route.unreachable_until.get_or_insert(now + UNREACHABLE_HOLD);
             }
         }
     }
 
     fn drop_use(&mut self, name: Name) {
+        let is_token = self.tokens.remove(&name).is_some();
+        let joined = is_token || self.uses.contains_key(&name);
+        self.close_use(name);
+        if joined {
+            self.commands.push_back(Command::Leave { name });
+        }
+    }
+
+    /// Ends what a use has on the local network; its name stays joined.
+    fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
             }
-            self.commands.push_back(Command::Leave { name });
+            if route.reader.is_some() {
+                self.commands.push_back(Command::CloseReader { name });
+            }
         }
     }
 
@@ -762,7 +963,8 @@ impl<R: RngCore> Routes<R> {
     fn check_local(&mut self, endpoint: &DiscoveredEndpoint) {
         let Some(topic) = ros_topic(&endpoint.topic) else { return };
         let mut problems = Vec::new();
-        for route in self.uses.values().filter(|u| u.entry.metadata.ros_name == topic) {
+        let brought = |u: &&UseRoute| !self.publishes(u.rule) && u.entry.metadata.ros_name == topic;
+        for route in self.uses.values().filter(brought) {
             let (topic, owner) = (topic.to_owned(), self.use_rules[route.rule].owner_name.clone());
             let (remote, local) = (route.entry.metadata.type_name.clone(), ros_type(&endpoint.type_name));
             let reader = endpoint.kind == EndpointKind::Reader;

@@ -8,8 +8,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    Command, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes, SINKLESS_HOLD,
-    ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes,
+    SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -31,20 +31,46 @@ fn secret() -> FleetSecret {
 }
 
 fn bench(shares: &[(&str, &str)], uses: &[(&str, Option<&str>)]) -> Bench {
-    let shares = shares.iter().map(|(topic, type_name)| ShareRule {
+    let shares = shares.iter().map(|(topic, type_name)| share(topic, type_name));
+    let uses = uses.iter().map(|(topic, type_name)| use_of(OWNER, topic, *type_name));
+    bench_of(shares.collect(), uses.collect())
+}
+
+fn bench_of(shares: Vec<ShareRule>, uses: Vec<UseRule>) -> Bench {
+    let rng = ChaCha8Rng::seed_from_u64(1);
+    Bench { routes: Routes::new(secret(), ME, shares, uses, rng), now: Instant::now() }
+}
+
+fn share(topic: &str, type_name: &str) -> ShareRule {
+    ShareRule {
         metadata: Metadata::topic("me", topic, type_name),
         policy: Policy::default(),
         suite: Suite::Group,
         class: Class::Default,
-    });
-    let uses = uses.iter().map(|(topic, type_name)| UseRule {
-        owner: OWNER,
+    }
+}
+
+fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
+    UseRule {
+        direction: Direction::Bring,
+        owner,
         owner_name: "owner".into(),
-        topic: (*topic).into(),
+        topic: topic.into(),
         type_name: type_name.map(Into::into),
-    });
-    let rng = ChaCha8Rng::seed_from_u64(1);
-    Bench { routes: Routes::new(secret(), ME, shares.collect(), uses.collect(), rng), now: Instant::now() }
+        token: None,
+    }
+}
+
+/// A rule for the token of a topic of `OWNER`.
+fn token(topic: &str) -> UseRule {
+    let token = Some((theirs(topic, STRING), Metadata::topic("owner", topic, STRING)));
+    UseRule { token, ..use_of(OWNER, topic, Some(STRING)) }
+}
+
+fn admits(node: u8) -> Policy {
+    let mut policy = Policy::default();
+    policy.subscribe.nodes.insert(NodeId([node; 32]));
+    policy
 }
 
 fn endpoint(n: u8, kind: EndpointKind, topic: &str, type_name: &str, qos: Qos) -> DiscoveredEndpoint {
@@ -104,6 +130,16 @@ impl Bench {
 
     fn catalogue(&mut self, entries: Vec<CatalogueEntry>) -> Vec<Command> {
         self.routes.handle_catalogue(OWNER, Catalogue { version: 1, entries });
+        self.commands()
+    }
+
+    fn reconfigured(&mut self, shares: Vec<ShareRule>, uses: Vec<UseRule>) -> Vec<Command> {
+        self.routes.reconfigure(self.now, shares, uses);
+        self.commands()
+    }
+
+    fn granted(&mut self, name: Name, entry: Option<CatalogueEntry>) -> Vec<Command> {
+        self.routes.handle_granted(&name, entry);
         self.commands()
     }
 
@@ -244,19 +280,19 @@ fn a_used_topic_is_joined_written_held_and_dropped() {
     let name = theirs("/a", STRING);
     let joined =
         b.catalogue(vec![entry("/a", STRING, Qos::default(), &[]), entry("/b", STRING, Qos::default(), &[])]);
-    assert_eq!(joined, [Command::Join { name, owner: OWNER, transient_local: false }]);
-    b.routes.handle_granted(&name);
+    assert_eq!(joined, [Command::Join { name, owner: OWNER, transient_local: false, describe: false }]);
+    b.routes.handle_granted(&name, None);
     assert!(matches!(&b.commands()[..], [Command::OpenWriter { source: None, spec, .. }]
         if spec.topic == "rt/a" && spec.type_name == dds_type(STRING)));
     // The way breaks and comes back in time: the local network notices nothing.
     b.routes.handle_lost(b.now, &name);
     assert_eq!(b.passes(UNREACHABLE_HOLD / 2), []);
-    b.routes.handle_granted(&name);
+    b.routes.handle_granted(&name, None);
     assert_eq!([b.commands(), b.passes(UNREACHABLE_HOLD)].concat(), []);
     // It breaks for longer: the writer goes, and comes back with the grant.
     b.routes.handle_owner_lost(b.now, OWNER, LostReason::Unreachable);
     assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source: None }]);
-    b.routes.handle_granted(&name);
+    b.routes.handle_granted(&name, None);
     assert!(has(&b.commands(), |c| matches!(c, Command::OpenWriter { .. })));
     // The owner no longer shares it: gone at once.
     let gone = b.catalogue(vec![]);
@@ -268,7 +304,7 @@ fn each_far_latched_publisher_gets_a_writer_of_its_own() {
     let mut b = bench(&[], &[("/tf_static", None)]);
     let name = theirs("/tf_static", STRING);
     b.catalogue(vec![entry("/tf_static", STRING, latched(), &[1, 2, 3])]);
-    b.routes.handle_granted(&name);
+    b.routes.handle_granted(&name, None);
     let opened = b.commands();
     assert_eq!(opened.iter().filter(|c| matches!(c, Command::OpenWriter { source: Some(_), .. })).count(), 3);
     assert_eq!(opened.len(), 3);
@@ -281,7 +317,7 @@ fn an_owner_that_stops_takes_its_topics_along() {
     let mut b = bench(&[], &[("/a", None)]);
     let name = theirs("/a", STRING);
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
-    b.routes.handle_granted(&name);
+    b.routes.handle_granted(&name, None);
     b.commands();
     b.routes.handle_owner_lost(b.now, OWNER, LostReason::Withdrawn);
     assert_eq!(b.commands(), [Command::CloseWriter { name, source: None }, Command::Leave { name }]);
@@ -299,4 +335,237 @@ fn status_says_what_each_rule_waits_for() {
     b.routes.handle_refused(&theirs("/b", STRING), RefusedBy::Owner(RefuseReason::NotPermitted));
     assert_eq!(states(&b)[1], "refused: the owner does not share it with this node");
     assert!(states(&b)[0].contains("1 local publishers, 0 remote subscribers"), "{:?}", states(&b));
+}
+
+#[test]
+fn what_is_configured_as_before_is_not_touched() {
+    let rules = || (vec![share("/a", ""), share("/b", STRING)], vec![use_of(OWNER, "/c", None), token("/d")]);
+    let mut b = bench_of(rules().0, rules().1);
+    b.appears(writer(1, "/a", latched()));
+    b.appears(writer(2, "/other", Qos::default()));
+    b.routes.handle_sink_joined(&mine("/a"), SinkId([7; 16]));
+    b.catalogue(vec![entry("/c", STRING, Qos::default(), &[]), entry("/e", STRING, Qos::default(), &[])]);
+    b.granted(theirs("/c", STRING), None);
+    b.granted(theirs("/d", STRING), Some(entry("/d", STRING, Qos::default(), &[])));
+    let before = b.routes.status();
+    assert_eq!(b.reconfigured(rules().0, rules().1), []);
+    // Neither does their order matter.
+    let (mut shares, mut uses) = rules();
+    shares.reverse();
+    uses.reverse();
+    assert_eq!(b.reconfigured(shares, uses), []);
+    let mut after = b.routes.status();
+    after.sort_by_key(|s| (s.direction, s.topic.clone()));
+    assert_eq!(after, before);
+    // Each still belongs to its rule: what leaves, leaves alone.
+    let gone = b.reconfigured(vec![share("/b", STRING)], vec![token("/d")]);
+    let ends = |c: &Command, name| matches!(c, Command::Unshare { name: n } | Command::Leave { name: n } if *n == name);
+    assert!(has(&gone, |c| ends(c, mine("/a"))) && has(&gone, |c| ends(c, theirs("/c", STRING))), "{gone:?}");
+    assert!(!has(&gone, |c| ends(c, theirs("/d", STRING))), "{gone:?}");
+}
+
+#[test]
+fn a_changed_policy_changes_the_policy_and_nothing_else() {
+    let mut b = bench(&[("/a", ""), ("/b", "")], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    b.appears(writer(2, "/b", Qos::default()));
+    let changed = ShareRule { policy: admits(5), ..share("/a", "") };
+    let policy = admits(5);
+    let commands = b.reconfigured(vec![changed.clone(), share("/b", "")], vec![]);
+    assert_eq!(commands, [Command::UpdatePolicy { name: mine("/a"), policy }]);
+    // A share that begins later begins with it.
+    b.vanishes(1);
+    b.passes(WRITERLESS_HOLD);
+    let begun = b.appears(writer(1, "/a", Qos::default()));
+    assert!(has(&begun, |c| matches!(c, Command::Share(s) if s.policy == changed.policy)), "{begun:?}");
+}
+
+#[test]
+fn shares_begin_and_end_with_their_rules() {
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(1, "/a", latched()));
+    b.appears(writer(2, "/b", Qos::default()));
+    let swapped = b.reconfigured(vec![share("/b", "")], vec![]);
+    assert_eq!(
+        swapped[..2],
+        [Command::CloseReader { name: mine("/a") }, Command::Unshare { name: mine("/a") }]
+    );
+    assert!(has(&swapped, |c| matches!(c, Command::Share(s) if s.metadata.ros_name == "/b")), "{swapped:?}");
+    assert_eq!(b.routes.status().len(), 1);
+    assert_eq!(b.reconfigured(vec![], vec![]), [Command::Unshare { name: mine("/b") }]);
+    assert_eq!(b.passes(WRITERLESS_HOLD), []);
+}
+
+#[test]
+fn what_cannot_change_in_a_running_share_ends_it_and_begins_it_anew() {
+    let other_metadata = |topic: &str| {
+        let mut rule = share(topic, "");
+        rule.metadata.unique = "left".into();
+        rule
+    };
+    for (what, rule) in
+        [("class", ShareRule { class: Class::Bulk, ..share("/a", "") }), ("metadata", other_metadata("/a"))]
+    {
+        let mut b = bench(&[("/a", "")], &[]);
+        b.appears(writer(1, "/a", Qos::default()));
+        let commands = b.reconfigured(vec![rule.clone()], vec![]);
+        assert_eq!(commands[0], Command::Unshare { name: mine("/a") }, "{what}");
+        let expected = Metadata { type_name: STRING.into(), ..rule.metadata.clone() };
+        let begins =
+            |c: &Command| matches!(c, Command::Share(s) if s.metadata == expected && s.class == rule.class);
+        assert!(begins(&commands[1]), "{what}: {commands:?}");
+    }
+    // A type that says what is there already changes nothing; another one ends the share.
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    assert_eq!(b.reconfigured(vec![share("/a", STRING)], vec![]), []);
+    let other = b.reconfigured(vec![share("/a", "x_msgs/msg/Other")], vec![]);
+    assert_eq!(other[0], Command::Unshare { name: mine("/a") });
+    assert!(matches!(problems(&other)[..], [Problem::ShareType { .. }]), "{other:?}");
+}
+
+#[test]
+fn uses_begin_and_end_with_their_rules() {
+    const OTHER: NodeId = NodeId([3; 32]);
+    let mut b = bench(&[], &[("/a", None)]);
+    b.catalogue(vec![entry("/a", STRING, Qos::default(), &[]), entry("/b", STRING, Qos::default(), &[])]);
+    b.granted(theirs("/a", STRING), None);
+    // The owner is followed already, so that the new topic is known at once.
+    let name = theirs("/b", STRING);
+    let added = b.reconfigured(vec![], vec![use_of(OWNER, "/a", None), use_of(OWNER, "/b", None)]);
+    assert_eq!(added, [Command::Join { name, owner: OWNER, transient_local: false, describe: false }]);
+    let gone = theirs("/a", STRING);
+    let swapped = b.reconfigured(vec![], vec![use_of(OTHER, "/a", None), use_of(OWNER, "/b", None)]);
+    let follow = Command::Follow { owner_name: "owner".into() };
+    let ended = [Command::CloseWriter { name: gone, source: None }, Command::Leave { name: gone }];
+    assert_eq!(swapped, [&ended[..], &[follow]].concat());
+    let left = b.reconfigured(vec![], vec![use_of(OTHER, "/a", None)]);
+    assert_eq!(left, [Command::Leave { name }, Command::Unfollow { owner: OWNER }]);
+}
+
+#[test]
+fn a_token_is_joined_without_a_catalogue_and_written_once_it_is_described() {
+    let name = theirs("/a", STRING);
+    let mut b = bench_of(vec![], vec![token("/a")]);
+    assert_eq!(b.commands(), [Command::Join { name, owner: OWNER, transient_local: false, describe: true }]);
+    assert_eq!(b.routes.status()[0].state, "waits for the owner's grant");
+    b.routes.handle_refused(&name, RefusedBy::Owner(RefuseReason::NotPermitted));
+    assert!(b.routes.status()[0].state.starts_with("refused"), "{:?}", b.routes.status());
+    // A catalogue of the same owner has no say in it.
+    assert_eq!(b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]), []);
+    let granted = b.granted(name, Some(entry("/a", STRING, Qos::default(), &[])));
+    assert!(matches!(&granted[..], [Command::OpenWriter { source: None, .. }]), "{granted:?}");
+    assert_eq!(b.catalogue(vec![]), []);
+    b.routes.handle_owner_lost(b.now, OWNER, LostReason::Withdrawn);
+    assert_eq!(b.passes(UNREACHABLE_HOLD), []);
+    // Granted again, as after a new epoch: nothing changes.
+    assert_eq!(b.granted(name, Some(entry("/a", STRING, Qos::default(), &[]))), []);
+    assert_eq!(b.granted(name, None), []);
+    b.routes.handle_lost(b.now, &name);
+    assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source: None }]);
+    assert_eq!(b.reconfigured(vec![], vec![]), [Command::Leave { name }]);
+    assert_eq!(b.granted(name, Some(entry("/a", STRING, Qos::default(), &[]))), []);
+}
+
+#[test]
+fn a_latched_topic_of_a_token_is_joined_anew_with_its_history() {
+    let name = theirs("/a", STRING);
+    let mut b = bench_of(vec![], vec![token("/a")]);
+    b.commands();
+    let again = b.granted(name, Some(entry("/a", STRING, latched(), &[1])));
+    let join = Command::Join { name, owner: OWNER, transient_local: true, describe: true };
+    assert_eq!(again, [Command::Leave { name }, join]);
+    let opened = b.granted(name, Some(entry("/a", STRING, latched(), &[1])));
+    assert!(matches!(&opened[..], [Command::OpenWriter { source: Some(_), .. }]), "{opened:?}");
+}
+
+#[test]
+fn what_is_not_as_the_token_says_is_not_brought_here() {
+    let name = theirs("/a", STRING);
+    let other_blind = entry("/b", STRING, Qos::default(), &[]).blind;
+    let right = || entry("/a", STRING, Qos::default(), &[]);
+    for wrong in [
+        CatalogueEntry { metadata: Metadata::topic("owner", "/cmd_vel", STRING), ..right() },
+        CatalogueEntry { metadata: Metadata::topic("owner", "/a", "x_msgs/msg/Other"), ..right() },
+        CatalogueEntry { blind: other_blind, ..right() },
+    ] {
+        let mut b = bench_of(vec![], vec![token("/a")]);
+        b.commands();
+        let said = b.granted(name, Some(wrong));
+        assert!(matches!(said[..], [Command::Report(Problem::TokenEntry { .. })]), "{said:?}");
+        assert!(matches!(b.granted(name, Some(right()))[..], [Command::OpenWriter { .. }]));
+    }
+}
+
+fn publish_rule(topic: &str) -> UseRule {
+    UseRule { direction: Direction::Publish, ..use_of(OWNER, topic, None) }
+}
+
+#[test]
+fn a_topic_that_its_owner_lets_us_publish_on_is_read_while_someone_here_writes_it() {
+    let mut b = bench_of(Vec::new(), vec![publish_rule("/cmd")]);
+    let name = theirs("/cmd", STRING);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    let commands = b.catalogue(vec![listed.clone()]);
+    assert!(
+        matches!(commands[..], [Command::Publish { name: n, owner: OWNER, reliable: true, .. }] if n == name)
+    );
+    assert_eq!(b.granted(name, None), [], "nobody here publishes yet");
+    assert!(opens_reader(&b.appears(writer(1, "/cmd", Qos::default()))));
+    assert_eq!(b.appears(writer(2, "/cmd", Qos::default())), []);
+    assert_eq!(b.appears(endpoint(3, EndpointKind::Writer, "/cmd", "p/msg/Other", Qos::default())), []);
+    b.vanishes(1);
+    assert!(matches!(b.vanishes(2)[..], [Command::CloseReader { .. }]));
+    b.appears(writer(4, "/cmd", Qos::default()));
+    // Allowed no longer.
+    let commands = b.catalogue(vec![CatalogueEntry { subscribe: true, publish: false, ..listed }]);
+    assert!(matches!(commands[..], [Command::CloseReader { .. }, Command::Leave { .. }]), "{commands:?}");
+}
+
+#[test]
+fn a_topic_that_may_only_be_published_on_is_not_brought_here() {
+    let mut b = bench(&[], &[("/cmd", None)]);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    assert_eq!(b.catalogue(vec![listed]), []);
+}
+
+#[test]
+fn a_share_that_others_publish_on_is_there_without_a_local_publisher() {
+    let mut publish = Policy::default();
+    publish.publish.nodes.insert(OWNER);
+    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let name = mine("/cmd");
+    let commands = b.commands();
+    assert!(
+        matches!(&commands[0], Command::Share(spec) if spec.metadata.type_name == STRING),
+        "{commands:?}"
+    );
+    assert!(!opens_reader(&commands));
+    b.routes.handle_publishers(&name, true);
+    let commands = b.commands();
+    assert!(matches!(&commands[..], [Command::OpenWriter { source: None, .. }]), "{commands:?}");
+    b.routes.handle_publishers(&name, true);
+    assert_eq!(b.commands(), []);
+    // A publisher here comes and goes; the share stays.
+    b.appears(writer(1, "/cmd", Qos::default()));
+    b.vanishes(1);
+    assert!(!has(&b.passes(WRITERLESS_HOLD * 2), |c| matches!(c, Command::Unshare { .. })));
+    b.routes.handle_publishers(&name, false);
+    assert!(matches!(&b.commands()[..], [Command::CloseWriter { .. }]));
+    // Nobody may any more, and nobody here does.
+    let commands = b.reconfigured(vec![share("/cmd", STRING)], Vec::new());
+    assert!(has(&commands, |c| matches!(c, Command::Unshare { .. })), "{commands:?}");
+}
+
+#[test]
+fn a_running_share_keeps_its_name_when_the_secret_of_names_is_replaced() {
+    let mut b = bench(&[("/a", STRING), ("/b", STRING)], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    b.routes.set_secret(FleetSecret::from_bytes([8; 32]));
+    assert!(!has(&b.appears(writer(2, "/a", Qos::default())), |c| matches!(c, Command::Share(_))));
+    assert!(has(&b.appears(writer(3, "/b", Qos::default())), |c| matches!(c, Command::Share(_))));
+    assert!(b.routes.status().iter().any(|s| s.name == Some(mine("/a"))));
+    assert!(b.routes.status().iter().all(|s| s.name != Some(mine("/b"))));
 }

@@ -96,8 +96,8 @@ pub fn identity(member: &Member) -> Arc<Identity> {
         0 => format!("{}/{}", member.fleet, member.name),
         n => format!("{}/{}/{n}", member.fleet, member.name),
     };
-    let identity =
-        Arc::new(cast.fleet(&member.fleet).enroll(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
+    let fleet = cast.fleet(&member.fleet);
+    let identity = Arc::new(fleet.issue(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
     cast.identities.insert(member.clone(), identity.clone());
     identity
 }

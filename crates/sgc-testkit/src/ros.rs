@@ -130,7 +130,10 @@ impl FakeDomain {
         }
         if let Some(reader) = reader {
             let mut handler = reader.lock().unwrap_or_else(PoisonError::into_inner);
-            missed.into_iter().for_each(&mut *handler);
+            let last = missed.len().saturating_sub(1);
+            for (n, sample) in missed.into_iter().enumerate() {
+                handler(Sample { more: n < last, ..sample });
+            }
         }
         guid
     }
@@ -203,12 +206,20 @@ impl Drop for FakeWriter {
     }
 }
 
-impl RosWriter for FakeWriter {
-    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
-        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, payload };
+impl FakeWriter {
+    /// Writes several at once: readers find them at hand together, as those of a real network do under load.
+    pub fn write_burst(&self, payloads: impl IntoIterator<Item = Bytes>) {
+        let mut payloads = payloads.into_iter().peekable();
+        while let Some(payload) = payloads.next() {
+            self.give(SampleKind::Write, 1, payload, payloads.peek().is_some());
+        }
+    }
+
+    fn give(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes, more: bool) {
+        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, payload, more };
         let readers: Vec<_> = {
             let mut state = self.domain.lock();
-            let Some(writer) = state.endpoints.get_mut(&self.guid) else { return Ok(()) };
+            let Some(writer) = state.endpoints.get_mut(&self.guid) else { return };
             if writer.discovered.qos.is_transient_local() {
                 writer.history.push_back(sample.clone());
                 if let History::KeepLast(depth) = writer.discovered.qos.history
@@ -228,6 +239,12 @@ impl RosWriter for FakeWriter {
         for reader in readers {
             (reader.lock().unwrap_or_else(PoisonError::into_inner))(sample.clone());
         }
+    }
+}
+
+impl RosWriter for FakeWriter {
+    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        self.give(kind, source_timestamp_ns, payload, false);
         Ok(())
     }
 

@@ -36,7 +36,7 @@ pub struct LinkOptions {
     pub handshakes_unvalidated_max: usize,
     /// Key exchange that also stands against quantum computers (X25519MLKEM768). True: nothing else is offered or
     /// accepted, so no one can talk the two ends out of it. False: X25519 is preferred, and a peer that requires the
-    /// other gets it.
+    /// other gets it. An identity of a fleet that requires it requires it here too.
     pub post_quantum: bool,
     /// Makes the congestion controllers; `None` is quinn's default.
     pub congestion: Option<Arc<dyn ControllerFactory + Send + Sync + 'static>>,

@@ -21,7 +21,7 @@ use tokio::net::UdpSocket;
 /// The node's next certificate.
 fn renew(fleet: &Fleet, node: &str) -> Arc<Identity> {
     let request = EnrollRequest::new(node.parse().unwrap(), now());
-    Arc::new(fleet.enroll(&request, &mut ChaCha20Rng::seed_from_u64(99)).unwrap())
+    Arc::new(fleet.issue(&request, &mut ChaCha20Rng::seed_from_u64(99)).unwrap())
 }
 
 /// Revokes a certificate for all who share this store.
@@ -193,6 +193,30 @@ async fn post_quantum_keys_are_agreed_on_where_either_end_requires_them() {
             assert_eq!(link.stats().key_exchange.label(), expected, "{dials} {listens}");
         }
     }
+}
+
+#[tokio::test]
+async fn a_fleet_is_switched_to_post_quantum_keys_while_its_nodes_run() {
+    let mut fleet = fleet(1);
+    let (router, arm) =
+        (CredentialStore::new(enroll(&fleet, "router")), CredentialStore::new(enroll(&fleet, "arm-1")));
+    let mut server = Server::start(router.clone(), LinkOptions::default());
+    let dialer = dialer(arm.clone());
+    let mut agreed = async || {
+        let near = dial_with(&dialer, &server.url).await.unwrap();
+        (near.stats().key_exchange.label(), server.link().await.stats().key_exchange.label())
+    };
+    assert_eq!(agreed().await, ("X25519", "X25519"));
+    fleet.set_post_quantum(true, now()).unwrap();
+    // One after the other, and nobody is locked out between.
+    router.set_identity(renew(&fleet, "router"));
+    assert_eq!(agreed().await, ("X25519MLKEM768", "X25519MLKEM768"));
+    arm.set_identity(renew(&fleet, "arm-1"));
+    assert_eq!(agreed().await, ("X25519MLKEM768", "X25519MLKEM768"));
+    let classical = bare_tls(Some(&arm.identity()), "sgc/1", Some(vec![kx_group::X25519]));
+    bare_with(server.addr, classical).await.unwrap_err();
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::KeyExchange { post_quantum: true }), "{refused}");
 }
 
 #[tokio::test]

@@ -46,6 +46,11 @@ impl TrustAnchors {
         self.lists.values().map(|list| &list.der)
     }
 
+    /// The same, each with its CA.
+    pub fn crls_by_ca(&self) -> impl Iterator<Item = (&CaFingerprint, &Bytes)> {
+        self.lists.iter().map(|(ca, list)| (ca, &list.der))
+    }
+
     /// True if this very certificate is revoked. A certificate below an intermediate CA is over also when the
     /// intermediate's is: see [`TrustAnchors::is_peer_revoked`].
     pub fn is_revoked(&self, cert: &CertId) -> bool {
@@ -55,6 +60,15 @@ impl TrustAnchors {
     /// True if a certificate on the path to this peer is revoked.
     pub fn is_peer_revoked(&self, peer: &VerifiedPeer) -> bool {
         peer.path.iter().any(|cert| self.is_revoked(cert))
+    }
+
+    /// True if the key of the first CA made this signature, with any algorithm that it has.
+    pub(crate) fn signed_by_first(&self, message: &[u8], signature: &[u8]) -> bool {
+        let Some((key_algorithm, key)) = self.anchors.first().and_then(|a| split_spki(&a.spki)) else {
+            return false;
+        };
+        let mut fitting = CHAIN_ALGORITHMS.iter().filter(|a| a.public_key_alg_id().as_ref() == key_algorithm);
+        fitting.any(|a| a.verify_signature(key, message, signature).is_ok())
     }
 
     pub(crate) fn revoked_at(&self, cert: &CertId) -> Option<UnixMillis> {

@@ -1,29 +1,32 @@
-//! A fleet: the CA that says who belongs to it, and the secret from which its names are derived.
+//! A fleet: the CA that says who belongs to it, the secrets from which its names are derived, and the roster of
+//! its nodes.
 //!
-//! It makes identities and nothing else: it keeps no list of them and writes no file. Certificates name nodes
-//! and groups by keyed hashes, so that whoever sees one (a router, the network) learns no name.
+//! It makes identities, renews and revokes them, and writes no file. Certificates name nodes and groups by keyed
+//! hashes, so that whoever sees one (a router, the network) learns no name.
 
 use std::fmt;
-use std::sync::Arc;
 use std::time::Duration;
 
-use aws_lc_rs::{digest, hmac};
+use aws_lc_rs::digest;
+use bytes::Bytes;
 use rand_core::CryptoRng;
-use rcgen::{
-    BasicConstraints, CertificateParams, CertificateRevocationListParams, DistinguishedName, DnType,
-    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyUsagePurpose, PublicKeyData as _,
-    RevokedCertParams, SanType, SerialNumber,
-};
+use rcgen::{PublicKeyData as _, SigningKey as _};
 use rustls_pki_types::CertificateDer;
-use sgc_wire::{DecodeError, GroupTag, Pseudonym, Reader, UnixMillis, Writer};
-use zeroize::{Zeroize, ZeroizeOnDrop, Zeroizing};
+use sgc_wire::{
+    Credentials, DecodeError, NodeId, Pseudonym, Reader, SECRET_GENERATIONS_MAX, SecretBytes,
+    SecretGeneration, UnixMillis, Writer,
+};
+use zeroize::Zeroizing;
 
-use crate::identity::{Identity, IdentityParts};
-use crate::key::P256Key;
-use crate::label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
-use crate::pem::{self, Block, PemError};
-use crate::verify::{AnchorError, GROUP_URI, GROUPS_MAX, NODE_URI, TrustAnchors};
-use crate::x509::Validity;
+use crate::fleet_error::FleetError;
+use crate::issue::{self, Serial, hex};
+use crate::key::Key;
+use crate::label::{FleetName, LABEL_BYTES_MAX, NodeName};
+use crate::pem::{self, Block, FLEET_FILE_BYTES_MAX};
+use crate::roster::{Generation, Roster, RosterNode};
+use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret, SECRET_BLOCK};
+use crate::verify::{TrustAnchors, node_id, signature_input};
+use crate::x509::{CaFields, Validity, may_sign_lists};
 
 /// How long a node's certificate holds unless the request says otherwise.
 pub const LEAF_VALIDITY_DEFAULT: Duration = Duration::from_secs(90 * 86_400);
@@ -33,105 +36,94 @@ pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
 pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
 /// How long before its making a certificate begins to hold: clocks of machines differ by minutes.
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
+/// Longest roster that is kept, bytes.
+pub const ROSTER_BYTES_MAX: usize = 8 * 1024 * 1024;
 
-const PSEUDONYM_DOMAIN: &str = "sgc pseudonym v1";
-const GROUP_DOMAIN: &str = "sgc group v1";
-const FILE_VERSION: u8 = 1;
-const FLEET_BLOCK: &str = "SGC FLEET";
-const CERTIFICATE_BLOCK: &str = "CERTIFICATE";
-const KEY_BLOCK: &str = "PRIVATE KEY";
-pub(crate) const SECRET_BLOCK: &str = "SGC FLEET SECRET";
-const SECRET_BYTES: usize = 32;
-/// The year 9000: what certificates can say ends a little later.
-const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
+const FILE_VERSION: u8 = 2;
+/// The version before there was a roster.
+const FILE_VERSION_1: u8 = 1;
+pub(crate) const FLEET_BLOCK: &str = "SGC FLEET";
+pub(crate) const CERTIFICATE_BLOCK: &str = "CERTIFICATE";
+pub(crate) const KEY_BLOCK: &str = "PRIVATE KEY";
+pub(crate) const ROSTER_BLOCK: &str = "SGC ROSTER";
+const ROSTER_CONTEXT: &str = "sgc roster v1";
+const SIGNATURE_BYTES_MAX: usize = 1024;
 
-/// In whole seconds, as certificates count. A macro since the type of the result belongs to a crate (`time`) that
-/// is not a dependency of this one.
-macro_rules! date_time {
-    ($millis:expr) => {
-        rcgen::date_time_ymd(1970, 1, 1) + Duration::from_secs($millis.secs())
-    };
-}
-
-/// What the members of a fleet share, and routers do not: the root of all its names. Never printed.
-#[derive(Clone, Zeroize, ZeroizeOnDrop)]
-pub struct FleetSecret([u8; SECRET_BYTES]);
-
-impl FleetSecret {
-    /// Takes the bytes of a secret.
-    pub fn from_bytes(bytes: [u8; SECRET_BYTES]) -> Self {
-        Self(bytes)
-    }
-
-    /// The bytes, for deriving from them. They belong in no log and in no packet.
-    pub fn expose(&self) -> &[u8; SECRET_BYTES] {
-        &self.0
-    }
-
-    /// What certificates call the node of this name.
-    pub fn pseudonym(&self, node_name: &str) -> Pseudonym {
-        Pseudonym(self.tag(PSEUDONYM_DOMAIN, node_name))
-    }
-
-    /// What certificates call the group of this name.
-    pub fn group_tag(&self, group: &str) -> GroupTag {
-        GroupTag(self.tag(GROUP_DOMAIN, group))
-    }
-
-    fn tag(&self, domain: &str, name: &str) -> [u8; 32] {
-        let mut mac = hmac::Context::with_key(&hmac::Key::new(hmac::HMAC_SHA256, &self.0));
-        mac.update(domain.as_bytes());
-        mac.update(&[0]);
-        mac.update(name.as_bytes());
-        let mut out = [0; 32];
-        out.copy_from_slice(mac.sign().as_ref());
-        out
-    }
-}
-
-impl fmt::Debug for FleetSecret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("FleetSecret(..)")
-    }
-}
-
-/// A certificate authority, a fleet secret and a name.
+/// A certificate authority, the secrets of a fleet, its roster and a name.
 pub struct Fleet {
-    name: FleetName,
-    secret: FleetSecret,
-    key: P256Key,
-    certificate: CertificateDer<'static>,
-    anchors: TrustAnchors,
-    validity: Validity,
+    pub(crate) name: FleetName,
+    pub(crate) secret: FleetSecret,
+    /// In use, newest first.
+    pub(crate) naming: Vec<NamingSecret>,
+    pub(crate) key: Key,
+    pub(crate) certificate: CertificateDer<'static>,
+    pub(crate) anchors: TrustAnchors,
+    pub(crate) validity: Validity,
+    pub(crate) roster: Roster,
+    /// The roster with its signature; none while the file is from before rosters.
+    signed_roster: Option<Vec<u8>>,
 }
 
 impl Fleet {
     /// A new fleet. Its CA holds for [`CA_VALIDITY`]; its certificate does not tell the fleet's name.
     pub fn create(name: FleetName, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
-        let key = P256Key::generate(rng);
-        let mut secret = FleetSecret([0; SECRET_BYTES]);
-        rng.fill_bytes(&mut secret.0);
-        let mut params = ca_params(&key);
-        let not_after = after(now, CA_VALIDITY)?;
-        params.not_before = date_time!(before(now, CLOCK_SKEW));
-        params.not_after = date_time!(not_after);
-        params.serial_number = Some(serial(rng));
-        let certificate = params.self_signed(&key).map_err(FleetError::making)?;
-        Self::assemble(name, secret, key, certificate.into())
+        let key = Key::generate(rng);
+        let secret = FleetSecret::generate(rng);
+        let certificate = issue::self_signed_ca(&key, now, rng)?;
+        let mut fleet = Self::assemble(name, secret, key, certificate)?;
+        fleet.begin_roster(now)?;
+        Ok(fleet)
     }
 
-    /// Reads what [`Fleet::to_text`] wrote.
+    /// A fleet around a CA that exists: its certificate, DER, and its private key, PKCS #8. The CA goes on to be what
+    /// it was; the fleet's nodes are those that `sgc fleet` makes with it.
+    pub fn import(
+        name: FleetName,
+        certificate: CertificateDer<'static>,
+        key: &[u8],
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Self, FleetError> {
+        let key = Key::from_pkcs8(key).ok_or(FleetError::Key)?;
+        let fields = CaFields::of(&certificate).ok_or(FleetError::NotACa("it cannot be read"))?;
+        if !fields.is_ca {
+            return Err(FleetError::NotACa("its basic constraints do not say CA"));
+        }
+        if !fields.may_sign_certificates {
+            return Err(FleetError::NotACa("its key usage lacks keyCertSign"));
+        }
+        if may_sign_lists(&certificate) != Some(true) {
+            return Err(FleetError::NotACa("its key usage lacks cRLSign"));
+        }
+        let mut fleet = Self::assemble(name, FleetSecret::generate(rng), key, certificate)?;
+        fleet.check_ca_holds(now)?;
+        // Whether the CA's name comes out as it went in shows in what is signed in its name.
+        let list = fleet.revocation_list(now)?;
+        fleet.anchors.with_crl(&list, now).map_err(|_| FleetError::CaName)?;
+        fleet.begin_roster(now)?;
+        Ok(fleet)
+    }
+
+    /// Reads what [`Fleet::to_text`] wrote, and what versions before rosters wrote.
     pub fn parse(text: &str) -> Result<Self, FleetError> {
         let mut about: Option<Block> = None;
         let mut certificate: Option<Block> = None;
         let mut key: Option<Block> = None;
         let mut secret: Option<Block> = None;
-        for block in pem::parse(text).map_err(FleetError::File)? {
+        let mut roster: Option<Block> = None;
+        let mut naming = Vec::new();
+        for block in pem::parse(text, FLEET_FILE_BYTES_MAX).map_err(FleetError::File)? {
             let (name, slot) = match block.label.as_str() {
                 FLEET_BLOCK => (FLEET_BLOCK, &mut about),
                 CERTIFICATE_BLOCK => (CERTIFICATE_BLOCK, &mut certificate),
                 KEY_BLOCK => (KEY_BLOCK, &mut key),
                 SECRET_BLOCK => (SECRET_BLOCK, &mut secret),
+                ROSTER_BLOCK => (ROSTER_BLOCK, &mut roster),
+                NAMING_BLOCK => {
+                    let secret = NamingSecret::from_block(&block.content);
+                    naming.push(secret.ok_or(FleetError::NamingSecret)?);
+                    continue;
+                }
                 _ => return Err(FleetError::UnknownBlock(block.label)),
             };
             if slot.replace(block).is_some() {
@@ -139,112 +131,130 @@ impl Fleet {
             }
         }
         let need = |slot: Option<Block>, name| slot.map(|b| b.content).ok_or(FleetError::Missing(name));
-        let about = need(about, FLEET_BLOCK)?;
+        let (version, name) = read_about(&need(about, FLEET_BLOCK)?)?;
         let certificate = need(certificate, CERTIFICATE_BLOCK)?;
-        let key = P256Key::from_pkcs8(&need(key, KEY_BLOCK)?).ok_or(FleetError::Key)?;
-        let secret = read_secret(&need(secret, SECRET_BLOCK)?).ok_or(FleetError::Secret)?;
-        Self::assemble(read_name(&about)?, secret, key, CertificateDer::from(certificate.to_vec()))
+        let key = Key::from_pkcs8(&need(key, KEY_BLOCK)?).ok_or(FleetError::Key)?;
+        let secret = FleetSecret::read(&need(secret, SECRET_BLOCK)?).ok_or(FleetError::Secret)?;
+        let mut fleet = Self::assemble(name, secret, key, CertificateDer::from(certificate.to_vec()))?;
+        match roster {
+            Some(block) => fleet.read_roster(&block.content, naming)?,
+            None if version == FILE_VERSION_1 && naming.is_empty() => {}
+            None => return Err(FleetError::Missing(ROSTER_BLOCK)),
+        }
+        Ok(fleet)
     }
 
     /// Everything in one text, for a file that only its owner may read.
     pub fn to_text(&self) -> Zeroizing<String> {
         let mut about = Writer::default();
-        about.u8(FILE_VERSION);
+        about.u8(if self.signed_roster.is_some() { FILE_VERSION } else { FILE_VERSION_1 });
         about.str(self.name.as_str());
+        let about = about.into_vec();
         let comment = format!(
             "# SGC fleet. KEEP IT SECRET: whoever holds this file can make nodes of this fleet and derive its names.\n\
-             # Back it up; nodes need it only to be enrolled.\n\
+             # Back it up whenever it changes; nodes need it only to be enrolled, renewed and revoked.\n\
              # fleet:   {}\n# CA:      {}\n# expires: {}\n",
             self.name,
             self.ca_fingerprint(),
             self.validity.not_after,
         );
-        let blocks: [(&str, &[u8]); 4] = [
-            (FLEET_BLOCK, &about.into_vec()),
+        let stored = self.naming.iter().filter(|n| n.generation >= NamingSecret::STORED_FROM);
+        let naming: Vec<_> = stored.map(NamingSecret::to_block).collect();
+        let mut blocks: Vec<(&str, &[u8])> = vec![
+            (FLEET_BLOCK, &about),
             (CERTIFICATE_BLOCK, &self.certificate),
             (KEY_BLOCK, self.key.pkcs8()),
             (SECRET_BLOCK, self.secret.expose()),
         ];
+        blocks.extend(naming.iter().map(|n| (NAMING_BLOCK, &n[..])));
+        blocks.extend(self.signed_roster.as_ref().map(|r| (ROSTER_BLOCK, &r[..])));
         pem::write(&comment, &blocks)
     }
 
-    /// Makes an identity: a key pair, a certificate for it, and unless it is for a router the fleet secret.
-    pub fn enroll(&self, request: &EnrollRequest, rng: &mut impl CryptoRng) -> Result<Identity, FleetError> {
-        let now = request.now;
-        if now.secs() > self.validity.not_after.secs() {
-            return Err(FleetError::CaExpired { not_after: self.validity.not_after, now });
-        }
-        if request.groups.len() > GROUPS_MAX {
-            return Err(FleetError::TooManyGroups { groups: request.groups.len() });
-        }
-        let pseudonym = self.secret.pseudonym(request.node.as_str());
-        let mut params = CertificateParams::default();
-        params.distinguished_name = common_name(&pseudonym.to_string());
-        params.subject_alt_names = vec![uri(NODE_URI, &pseudonym)?];
-        let mut groups: Vec<_> = request.groups.iter().collect();
-        groups.sort_unstable();
-        groups.dedup();
-        for group in groups {
-            params.subject_alt_names.push(uri(GROUP_URI, &self.secret.group_tag(group.as_str()))?);
-        }
-        if request.router || request.may_route {
-            params.subject_alt_names.push(SanType::URI(
-                crate::verify::ROUTER_URI.to_owned().try_into().map_err(FleetError::making)?,
-            ));
-        }
-        params.is_ca = IsCa::ExplicitNoCa;
-        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        params.extended_key_usages =
-            vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
-        params.use_authority_key_identifier_extension = true;
-        params.serial_number = Some(serial(rng));
-        // Not before the CA and not past it: a certificate that outlives its CA is a surprise for later.
-        params.not_before = date_time!(before(now, CLOCK_SKEW).max(self.validity.not_before));
-        params.not_after = date_time!(after(now, request.valid)?.min(self.validity.not_after));
-        let key = P256Key::generate(rng);
-        let ca_params = ca_params(&self.key);
-        let issuer = Issuer::from_params(&ca_params, &self.key);
-        let certificate = params.signed_by(&key, &issuer).map_err(FleetError::making)?;
-        let mut reset_key = Zeroizing::new([0; 32]);
-        rng.fill_bytes(&mut *reset_key);
-        let parts = IdentityParts {
-            node: request.node.clone(),
-            fleet: self.name.clone(),
-            chain: vec![certificate.into()],
-            key: Zeroizing::new(key.pkcs8().to_vec()),
-            anchors: self.anchors.clone(),
-            secret: (!request.router).then(|| self.secret.clone()),
-            reset_key: Some(reset_key),
-        };
-        Identity::assemble(parts).map_err(FleetError::making)
+    /// What a node of the roster holds besides its key: these certificates of it, and the secrets in use.
+    pub fn credentials_for(&self, node: &NodeName, chain: Vec<Bytes>) -> Result<Credentials, FleetError> {
+        let node = self.active_node(node)?;
+        let naming: &[NamingSecret] = if node.router { &[] } else { &self.naming };
+        let secrets = naming.iter().map(|n| SecretGeneration {
+            generation: n.generation,
+            secret: SecretBytes::new(*n.secret.expose()),
+        });
+        Ok(Credentials { chain, secrets: secrets.collect() })
     }
 
-    /// Signs a list of certificates that no longer hold, by serial number, and since when: DER, to be handed to every
-    /// node. It replaces lists with a smaller number.
+    /// Takes back every certificate of these nodes. What [`Fleet::revocation_list`] makes from then on says so.
+    /// Either all are revoked or none.
+    pub fn revoke(&mut self, nodes: &[NodeName], now: UnixMillis) -> Result<(), FleetError> {
+        if let Some(unknown) = nodes.iter().find(|n| !self.roster.nodes.contains_key(*n)) {
+            return Err(FleetError::UnknownNode { node: unknown.to_string() });
+        }
+        self.roster.prune(now);
+        for node in nodes {
+            let Some(node) = self.roster.nodes.get_mut(node) else { continue };
+            node.revoked.get_or_insert(now);
+            for certificate in &mut node.certificates {
+                certificate.revoked.get_or_insert(now);
+            }
+        }
+        // Following the clock, so that a fleet file restored from a copy makes no list that is older than the last.
+        self.roster.crl_number = now.secs().max(self.roster.crl_number.saturating_add(1));
+        self.sign_roster()
+    }
+
+    /// The list of all revoked certificates that are not over: DER, to be handed to every node.
+    pub fn revocation_list(&self, now: UnixMillis) -> Result<Vec<u8>, FleetError> {
+        self.revocation_list_of(&self.roster.revoked(), self.roster.crl_number, now)
+    }
+
+    /// Signs a list of any serial numbers, each with the time since when it is revoked, whatever the roster says.
     pub fn revocation_list_of(
         &self,
-        revoked: &[(Arc<[u8]>, UnixMillis)],
+        revoked: &[(Serial, UnixMillis)],
         number: u64,
         now: UnixMillis,
     ) -> Result<Vec<u8>, FleetError> {
-        let entry = |(serial, at): &(Arc<[u8]>, UnixMillis)| RevokedCertParams {
-            serial_number: SerialNumber::from_slice(serial),
-            revocation_time: date_time!(*at),
-            reason_code: None,
-            invalidity_date: None,
-        };
-        let next_update = after(now, CRL_VALIDITY)?;
-        let params = CertificateRevocationListParams {
-            this_update: date_time!(now),
-            next_update: date_time!(next_update),
-            crl_number: SerialNumber::from(number),
-            issuing_distribution_point: None,
-            revoked_certs: revoked.iter().map(entry).collect(),
-            key_identifier_method: KeyIdMethod::Sha256,
-        };
-        let ca_params = ca_params(&self.key);
-        let issuer = Issuer::from_params(&ca_params, &self.key);
-        Ok(params.signed_by(&issuer).map_err(FleetError::making)?.der().to_vec())
+        issue::revocation_list(&self.certificate, &self.key, revoked, number, now)
+    }
+
+    /// Makes the next generation of the naming secret, and returns its number. Shares made by who has it are named by
+    /// it; older generations stay in use until they are retired.
+    pub fn rotate_secret(&mut self, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<u32, FleetError> {
+        self.begin_roster_if_none(now)?;
+        if self.naming.len() >= SECRET_GENERATIONS_MAX {
+            return Err(FleetError::TooManyGenerations);
+        }
+        let generation = self.newest_generation().saturating_add(1);
+        let secret = NamingSecret { generation, secret: FleetSecret::generate(rng) };
+        self.roster.generations.push(recorded(&secret, now));
+        self.naming.insert(0, secret);
+        self.sign_roster()?;
+        Ok(generation)
+    }
+
+    /// Takes the generations before this one out of use: what is named by them is found no more. Who nodes are, and
+    /// their groups, stay with generation 1.
+    pub fn retire_secrets(&mut self, before: u32) -> Result<(), FleetError> {
+        let newest = self.newest_generation();
+        if before > newest {
+            return Err(FleetError::NewestGeneration { newest });
+        }
+        self.naming.retain(|n| n.generation >= before);
+        self.roster.generations.retain(|g| g.number >= before);
+        self.sign_roster()
+    }
+
+    /// Says which node renews certificates for the fleet. Nodes learn it when they are enrolled or renewed by file.
+    pub fn set_authority(&mut self, node: Option<NodeName>, now: UnixMillis) -> Result<(), FleetError> {
+        self.begin_roster_if_none(now)?;
+        self.roster.authority = node;
+        self.sign_roster()
+    }
+
+    /// Says whether links and grants of the fleet resist quantum computers. Nodes learn it as they do the authority.
+    pub fn set_post_quantum(&mut self, on: bool, now: UnixMillis) -> Result<(), FleetError> {
+        self.begin_roster_if_none(now)?;
+        self.roster.post_quantum = on;
+        self.sign_roster()
     }
 
     /// Its name, for people.
@@ -255,6 +265,16 @@ impl Fleet {
     /// Its secret.
     pub fn secret(&self) -> &FleetSecret {
         &self.secret
+    }
+
+    /// The secrets that names are derived from, newest first.
+    pub fn naming_secrets(&self) -> &[NamingSecret] {
+        &self.naming
+    }
+
+    /// The generations of the naming secret in use and when they were made, oldest first; empty without a roster.
+    pub fn generations(&self) -> &[Generation] {
+        &self.roster.generations
     }
 
     /// Its CA, as the one to trust.
@@ -272,6 +292,111 @@ impl Fleet {
         self.validity.not_after
     }
 
+    /// Its nodes, by name. A fleet file from before rosters has none until it changes.
+    pub fn nodes(&self) -> impl ExactSizeIterator<Item = &RosterNode> {
+        self.roster.nodes.values()
+    }
+
+    /// One node.
+    pub fn node(&self, name: &NodeName) -> Option<&RosterNode> {
+        self.roster.nodes.get(name)
+    }
+
+    /// The node that certificates call so.
+    pub fn node_by_pseudonym(&self, pseudonym: &Pseudonym) -> Option<&RosterNode> {
+        self.nodes().find(|n| self.secret.pseudonym(n.name.as_str()) == *pseudonym)
+    }
+
+    /// False for a file from before rosters: nodes enrolled with it are not known.
+    pub fn has_roster(&self) -> bool {
+        self.signed_roster.is_some()
+    }
+
+    /// The number of its last revocation list; 0 if nothing was ever revoked.
+    pub fn crl_number(&self) -> u64 {
+        self.roster.crl_number
+    }
+
+    /// The name of the node that renews certificates.
+    pub fn authority(&self) -> Option<&NodeName> {
+        self.roster.authority.as_ref()
+    }
+
+    /// True if links and grants of the fleet resist quantum computers.
+    pub fn post_quantum(&self) -> bool {
+        self.roster.post_quantum
+    }
+
+    /// Who the node of that name is.
+    pub fn node_id_of(&self, node: &NodeName) -> NodeId {
+        node_id(&self.key.subject_public_key_info(), &self.secret.pseudonym(node.as_str()))
+    }
+
+    pub(crate) fn active_node(&self, name: &NodeName) -> Result<&RosterNode, FleetError> {
+        let node = self.roster.nodes.get(name);
+        let node = node.ok_or_else(|| FleetError::UnknownNode { node: name.to_string() })?;
+        match node.revoked {
+            Some(at) => Err(FleetError::NodeRevoked { node: name.clone(), at }),
+            None => Ok(node),
+        }
+    }
+
+    pub(crate) fn check_ca_holds(&self, now: UnixMillis) -> Result<(), FleetError> {
+        let not_after = self.validity.not_after;
+        if now.secs() > not_after.secs() { Err(FleetError::CaExpired { not_after, now }) } else { Ok(()) }
+    }
+
+    fn newest_generation(&self) -> u32 {
+        self.naming.first().map_or(1, |n| n.generation)
+    }
+
+    pub(crate) fn begin_roster_if_none(&mut self, now: UnixMillis) -> Result<(), FleetError> {
+        if self.has_roster() { Ok(()) } else { self.begin_roster(now) }
+    }
+
+    fn begin_roster(&mut self, now: UnixMillis) -> Result<(), FleetError> {
+        self.roster.generations = self.naming.iter().map(|n| recorded(n, now)).collect();
+        self.sign_roster()
+    }
+
+    pub(crate) fn sign_roster(&mut self) -> Result<(), FleetError> {
+        let body = self.roster.encode();
+        if body.len() > ROSTER_BYTES_MAX {
+            return Err(FleetError::RosterFull { bytes: body.len() });
+        }
+        let signature = self.key.sign(&signature_input(ROSTER_CONTEXT, &body)).map_err(FleetError::making)?;
+        let mut w = Writer::default();
+        w.bytes(&body);
+        w.bytes(&signature);
+        self.signed_roster = Some(w.into_vec());
+        Ok(())
+    }
+
+    fn read_roster(&mut self, signed: &[u8], mut naming: Vec<NamingSecret>) -> Result<(), FleetError> {
+        let mut r = Reader::new(signed);
+        let mut read = || {
+            let body = r.bytes("roster", ROSTER_BYTES_MAX)?;
+            Ok((body, r.bytes("signature", SIGNATURE_BYTES_MAX)?))
+        };
+        let (body, signature) = read().map_err(FleetError::Roster)?;
+        r.finish().map_err(FleetError::Roster)?;
+        if !self.anchors.signed_by_first(&signature_input(ROSTER_CONTEXT, body), signature) {
+            return Err(FleetError::RosterSignature);
+        }
+        let roster = Roster::decode(body).map_err(FleetError::Roster)?;
+        if roster.generations.iter().any(|g| g.number < NamingSecret::STORED_FROM) {
+            naming.push(NamingSecret { generation: 1, secret: self.secret.clone() });
+        }
+        naming.sort_unstable_by_key(|n| n.generation);
+        let found = naming.iter().map(|n| (n.generation, hash(n)));
+        if !found.eq(roster.generations.iter().map(|g| (g.number, g.hash))) {
+            return Err(FleetError::NamingSecret);
+        }
+        naming.reverse();
+        (self.roster, self.naming, self.signed_roster) = (roster, naming, Some(signed.to_vec()));
+        Ok(())
+    }
+
     fn ca_fingerprint(&self) -> String {
         hex(digest::digest(&digest::SHA256, &self.key.subject_public_key_info()).as_ref())
     }
@@ -279,7 +404,7 @@ impl Fleet {
     fn assemble(
         name: FleetName,
         secret: FleetSecret,
-        key: P256Key,
+        key: Key,
         certificate: CertificateDer<'static>,
     ) -> Result<Self, FleetError> {
         let anchors = TrustAnchors::new([certificate.clone()]).map_err(FleetError::Certificate)?;
@@ -289,7 +414,9 @@ impl Fleet {
         if !is_of_key {
             return Err(FleetError::KeyMismatch);
         }
-        Ok(Self { name, secret, key, certificate, anchors, validity })
+        let naming = vec![NamingSecret { generation: 1, secret: secret.clone() }];
+        let (roster, signed_roster) = (Roster::default(), None);
+        Ok(Self { name, secret, naming, key, certificate, anchors, validity, roster, signed_roster })
     }
 }
 
@@ -299,152 +426,27 @@ impl fmt::Debug for Fleet {
     }
 }
 
-/// What is asked of [`Fleet::enroll`].
-#[derive(Clone, Debug)]
-pub struct EnrollRequest {
-    /// For which node.
-    pub node: NodeName,
-    /// The groups it is to be in, at most [`GROUPS_MAX`].
-    pub groups: Vec<GroupName>,
-    /// For a node that only routes: its identity lacks the fleet secret, so that it can derive no name and open
-    /// no payload.
-    pub router: bool,
-    /// For a member that also carries others' names.
-    pub may_route: bool,
-    /// How long the certificate is to hold; never longer than the CA.
-    pub valid: Duration,
-    /// The time.
-    pub now: UnixMillis,
+fn recorded(naming: &NamingSecret, now: UnixMillis) -> Generation {
+    Generation { number: naming.generation, created: now, hash: hash(naming) }
 }
 
-impl EnrollRequest {
-    /// A node in no group, for [`LEAF_VALIDITY_DEFAULT`].
-    pub fn new(node: NodeName, now: UnixMillis) -> Self {
-        Self { node, groups: Vec::new(), router: false, may_route: false, valid: LEAF_VALIDITY_DEFAULT, now }
-    }
-}
-
-/// Why a fleet cannot be made, read, or enrol a node.
-#[derive(Debug, thiserror::Error)]
-pub enum FleetError {
-    /// The file is not a sequence of blocks.
-    #[error("this is not a fleet file")]
-    File(#[source] PemError),
-    /// A block that this version does not know.
-    #[error("block \"{0}\" does not belong into a fleet file")]
-    UnknownBlock(String),
-    /// A block occurs twice.
-    #[error("block \"{0}\" occurs twice in the fleet file")]
-    Repeated(&'static str),
-    /// A block is missing.
-    #[error("block \"{0}\" is missing from the fleet file")]
-    Missing(&'static str),
-    /// The block that names the fleet is broken.
-    #[error("block \"{FLEET_BLOCK}\" is broken")]
-    About(#[source] DecodeError),
-    /// The fleet's name is none.
-    #[error("block \"{FLEET_BLOCK}\" holds an illegal name")]
-    Name(#[source] LabelError),
-    /// The CA certificate is broken.
-    #[error("block \"{CERTIFICATE_BLOCK}\" is broken")]
-    Certificate(#[source] AnchorError),
-    /// The CA key is broken.
-    #[error("block \"{KEY_BLOCK}\" is no P-256 key in PKCS #8")]
-    Key,
-    /// The key is not that of the certificate.
-    #[error("the key and the certificate in the fleet file do not belong together")]
-    KeyMismatch,
-    /// The secret has a wrong length.
-    #[error("block \"{SECRET_BLOCK}\" does not hold {SECRET_BYTES} bytes")]
-    Secret,
-    /// The CA is over.
-    #[error(
-        "the fleet's CA expired at {not_after} and the clock here says {now}: create a new fleet, or set the clock"
-    )]
-    CaExpired {
-        /// Its end.
-        not_after: UnixMillis,
-        /// The time of the request.
-        now: UnixMillis,
-    },
-    /// Too many groups are asked for.
-    #[error("a node is in at most {GROUPS_MAX} groups, {groups} are asked for")]
-    TooManyGroups {
-        /// How many.
-        groups: usize,
-    },
-    /// The time, or the time plus the validity, is no date that certificates can hold.
-    #[error("a certificate cannot be valid until {0}: is the clock right?")]
-    Time(UnixMillis),
-    /// The certificate could not be made.
-    #[error("the certificate could not be made: {0}")]
-    Making(String),
-}
-
-impl FleetError {
-    fn making(error: impl fmt::Display) -> Self {
-        Self::Making(error.to_string())
-    }
-}
-
-pub(crate) fn read_secret(bytes: &[u8]) -> Option<FleetSecret> {
-    bytes.try_into().ok().map(FleetSecret::from_bytes)
-}
-
-fn read_name(about: &[u8]) -> Result<FleetName, FleetError> {
-    let mut r = Reader::new(about);
-    let decode = |r: &mut Reader<'_>| {
-        let found = r.u8()?;
-        if found != FILE_VERSION {
-            let (what, known) = ("fleet file", FILE_VERSION.into());
-            return Err(DecodeError::Version { what, found: found.into(), known });
-        }
-        r.str("fleet name", LABEL_BYTES_MAX)
-    };
-    let name = decode(&mut r).map_err(FleetError::About)?;
-    r.finish().map_err(FleetError::About)?;
-    name.parse().map_err(FleetError::Name)
-}
-
-/// The CA's subject is made from its key: two CAs never share one, so that a certificate of another fleet is
-/// told apart from a forged one, and nothing is said of the fleet.
-fn ca_params(key: &P256Key) -> CertificateParams {
-    let fingerprint = digest::digest(&digest::SHA256, &key.subject_public_key_info());
-    let mut params = CertificateParams::default();
-    params.distinguished_name = common_name(&format!("sgc fleet CA {}", hex(&fingerprint.as_ref()[..4])));
-    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(1));
-    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-    params
-}
-
-fn common_name(name: &str) -> DistinguishedName {
-    let mut out = DistinguishedName::new();
-    out.push(DnType::CommonName, name);
+fn hash(naming: &NamingSecret) -> [u8; 32] {
+    let mut out = [0; 32];
+    out.copy_from_slice(digest::digest(&digest::SHA256, naming.secret.expose()).as_ref());
     out
 }
 
-fn uri(prefix: &str, id: &impl fmt::Display) -> Result<SanType, FleetError> {
-    Ok(SanType::URI(format!("{prefix}{id}").try_into().map_err(FleetError::making)?))
-}
-
-/// 126 random bits, positive and of a fixed length as RFC 5280, 4.1.2.2 wants it.
-fn serial(rng: &mut impl CryptoRng) -> SerialNumber {
-    let mut bytes = [0; 16];
-    rng.fill_bytes(&mut bytes);
-    bytes[0] = (bytes[0] & 0x3f) | 0x40;
-    SerialNumber::from_slice(&bytes)
-}
-
-fn before(now: UnixMillis, by: Duration) -> UnixMillis {
-    UnixMillis(now.0.saturating_sub(by.as_millis() as u64))
-}
-
-fn after(now: UnixMillis, by: Duration) -> Result<UnixMillis, FleetError> {
-    let by = u64::try_from(by.as_millis()).unwrap_or(u64::MAX);
-    let then = UnixMillis(now.0.saturating_add(by));
-    if then > TIME_MAX { Err(FleetError::Time(then)) } else { Ok(then) }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
+fn read_about(about: &[u8]) -> Result<(u8, FleetName), FleetError> {
+    let mut r = Reader::new(about);
+    let decode = |r: &mut Reader<'_>| {
+        let version = r.u8()?;
+        if !(FILE_VERSION_1..=FILE_VERSION).contains(&version) {
+            let (what, known) = ("fleet file", FILE_VERSION.into());
+            return Err(DecodeError::Version { what, found: version.into(), known });
+        }
+        Ok((version, r.str("fleet name", LABEL_BYTES_MAX)?))
+    };
+    let (version, name) = decode(&mut r).map_err(FleetError::About)?;
+    r.finish().map_err(FleetError::About)?;
+    Ok((version, name.parse().map_err(FleetError::Name)?))
 }

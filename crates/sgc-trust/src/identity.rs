@@ -1,5 +1,5 @@
 //! What one node holds to be itself: certificate chain, private key, the CAs it trusts, and (not for routers) the
-//! fleet secret; and the one text file in which they are kept.
+//! secrets of its fleet; and the one text file in which they are kept.
 //!
 //! It does not read the file (that, and its permissions, is the node's) and knows no clock: whether the
 //! certificate still holds is for its user to ask. No output of this module but [`Identity::to_text`] holds a
@@ -8,24 +8,24 @@
 use std::fmt;
 use std::sync::Arc;
 
+use rand_core::CryptoRng;
+use rcgen::PublicKeyData as _;
 use rustls::SignatureScheme;
 use rustls::sign::{CertifiedKey, SigningKey};
 use rustls_pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer};
-use sgc_wire::{DecodeError, GroupTag, NodeId, Pseudonym, Reader, UnixMillis, Writer};
+use sgc_wire::{Credentials, DecodeError, GroupTag, NodeId, Pseudonym, UnixMillis};
 use zeroize::Zeroizing;
 
-use crate::fleet::{FleetSecret, SECRET_BLOCK, read_secret};
-use crate::label::{FleetName, LABEL_BYTES_MAX, LabelError, NodeName};
-use crate::pem::{self, Block, PemError};
+use crate::issue;
+use crate::key::Key;
+use crate::label::{FleetName, LabelError, NodeName};
+use crate::member::{
+    self, ABOUT_BLOCK, CA_BLOCK, CHAIN_BLOCK, FileParts, KEY_BLOCK, Membership, check_generations,
+};
+use crate::pem::PemError;
+use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret};
 use crate::verify::{AnchorError, CertError, TrustAnchors, VerifiedPeer, node_id, signature_input};
 use crate::x509::Validity;
-
-const FILE_VERSION: u8 = 1;
-const ABOUT_BLOCK: &str = "SGC IDENTITY";
-const CHAIN_BLOCK: &str = "CERTIFICATE";
-const KEY_BLOCK: &str = "PRIVATE KEY";
-const CA_BLOCK: &str = "SGC CA CERTIFICATE";
-const RESET_BLOCK: &str = "SGC RESET KEY";
 
 /// What an identity signs with, by the kind of its key; [`VerifiedPeer::verify_signature`] has the same list.
 const SCHEMES: [SignatureScheme; 4] = [
@@ -44,120 +44,152 @@ pub struct Identity {
 
 /// What an identity consists of.
 #[derive(Clone)]
-pub(crate) struct IdentityParts {
-    pub(crate) node: NodeName,
-    pub(crate) fleet: FleetName,
-    pub(crate) chain: Vec<CertificateDer<'static>>,
-    pub(crate) key: Zeroizing<Vec<u8>>,
-    pub(crate) anchors: TrustAnchors,
-    pub(crate) secret: Option<FleetSecret>,
-    pub(crate) reset_key: Option<Zeroizing<[u8; 32]>>,
+struct IdentityParts {
+    member: Membership,
+    key: Zeroizing<Vec<u8>>,
+    reset_key: Option<Zeroizing<[u8; 32]>>,
 }
 
 impl Identity {
     /// Reads what [`Identity::to_text`] wrote. The parts have to fit together; whether the certificate holds
     /// now is not asked.
     pub fn parse(text: &str) -> Result<Self, IdentityError> {
-        let mut about: Option<Block> = None;
-        let mut key: Option<Block> = None;
-        let mut secret: Option<Block> = None;
-        let mut reset_key: Option<Block> = None;
-        let mut chain = Vec::new();
-        let mut cas = Vec::new();
-        for block in pem::parse(text).map_err(IdentityError::File)? {
-            let (name, slot) = match block.label.as_str() {
-                CHAIN_BLOCK => {
-                    chain.push(CertificateDer::from(block.content.to_vec()));
-                    continue;
-                }
-                CA_BLOCK => {
-                    cas.push(CertificateDer::from(block.content.to_vec()));
-                    continue;
-                }
-                ABOUT_BLOCK => (ABOUT_BLOCK, &mut about),
-                KEY_BLOCK => (KEY_BLOCK, &mut key),
-                SECRET_BLOCK => (SECRET_BLOCK, &mut secret),
-                RESET_BLOCK => (RESET_BLOCK, &mut reset_key),
-                _ => return Err(IdentityError::UnknownBlock(block.label)),
-            };
-            if slot.replace(block).is_some() {
-                return Err(IdentityError::Repeated(name));
-            }
-        }
-        let about = about.ok_or(IdentityError::Missing(ABOUT_BLOCK))?;
+        let FileParts { member, key, reset_key } = member::read(text)?;
         let key = key.ok_or(IdentityError::Missing(KEY_BLOCK))?;
-        if chain.is_empty() {
-            return Err(IdentityError::Missing(CHAIN_BLOCK));
-        }
-        if cas.is_empty() {
-            return Err(IdentityError::Missing(CA_BLOCK));
-        }
-        let (node, fleet) = read_about(&about.content)?;
-        let length = |name| move || IdentityError::SecretLength(name);
-        let secret = secret.map(|b| read_secret(&b.content).ok_or_else(length(SECRET_BLOCK))).transpose()?;
-        let reset_key = reset_key
-            .map(|b| b.content.as_slice().try_into().map_err(|_| length(RESET_BLOCK)()).map(Zeroizing::new))
-            .transpose()?;
+        Self::assemble(IdentityParts { member, key, reset_key })
+    }
+
+    /// The identity of a node that made its key itself (PKCS #8) and was answered with the rest.
+    pub fn join(member: Membership, key: &[u8], rng: &mut impl CryptoRng) -> Result<Self, IdentityError> {
+        let mut reset_key = Zeroizing::new([0; 32]);
+        rng.fill_bytes(&mut *reset_key);
+        let key = Zeroizing::new(key.to_vec());
+        Self::assemble(IdentityParts { member, key, reset_key: Some(reset_key) })
+    }
+
+    /// An identity from a certificate of an existing PKI, made for a request as [`Identity::csr`] or
+    /// `sgc fleet request` writes it. Without a secret it is a router's.
+    pub fn import(import: Import, rng: &mut impl CryptoRng) -> Result<Self, IdentityError> {
+        let Import { node, fleet, chain, key, cas, secret } = import;
+        let naming = secret.iter().map(|s| NamingSecret { generation: 1, secret: s.clone() }).collect();
         let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
-        Self::assemble(IdentityParts { node, fleet, chain, key: key.content, anchors, secret, reset_key })
+        let (authority, post_quantum) = (None, false);
+        let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
+        Self::join(member, &key, rng)
     }
 
     /// Everything in one text, for a file that only its owner may read.
     pub fn to_text(&self) -> Zeroizing<String> {
         let parts = &self.parts;
-        let mut about = Writer::default();
-        about.u8(FILE_VERSION);
-        about.str(parts.node.as_str());
-        about.str(parts.fleet.as_str());
-        let about = about.into_vec();
-        let comment = format!(
-            "# SGC identity. KEEP IT SECRET: whoever holds this file is this node.\n\
-             # node:    {}{}\n# fleet:   {}\n# expires: {}\n# id:      {}\n",
-            parts.node,
-            if parts.secret.is_none() { " (router: it can read no payload)" } else { "" },
-            parts.fleet,
-            self.not_after(),
-            self.node_id(),
-        );
-        let mut blocks: Vec<(&str, &[u8])> = vec![(ABOUT_BLOCK, &about)];
-        blocks.extend(parts.chain.iter().map(|c| (CHAIN_BLOCK, c.as_ref())));
-        blocks.push((KEY_BLOCK, &parts.key));
-        blocks.extend(parts.anchors.certificates().map(|c| (CA_BLOCK, c.as_ref())));
-        blocks.extend(parts.secret.as_ref().map(|s| (SECRET_BLOCK, &s.expose()[..])));
-        blocks.extend(parts.reset_key.as_ref().map(|k| (RESET_BLOCK, &k[..])));
-        pem::write(&comment, &blocks)
+        let head = "# SGC identity. KEEP IT SECRET: whoever holds this file is this node.\n";
+        let comment = format!("{}# id:      {}\n", parts.member.comment(head), self.node_id());
+        let reset_key = parts.reset_key.as_ref().map(|k| &k[..]);
+        member::write(&parts.member, &comment, Some(&parts.key), reset_key)
     }
 
     /// The node's name in its fleet.
     pub fn node_name(&self) -> &NodeName {
-        &self.parts.node
+        &self.parts.member.node
     }
 
     /// The fleet's name, for people.
     pub fn fleet_name(&self) -> &FleetName {
-        &self.parts.fleet
+        &self.parts.member.fleet
     }
 
     /// The certificate chain, leaf first.
     pub fn chain(&self) -> &[CertificateDer<'static>] {
-        &self.parts.chain
+        &self.parts.member.chain
     }
 
     /// The CAs that this node trusts.
     pub fn anchors(&self) -> &TrustAnchors {
-        &self.parts.anchors
+        &self.parts.member.anchors
     }
 
     /// The same node with other CAs or newer revocation lists. Nothing of itself is checked against them: a node
     /// may find out so that it is revoked.
     pub fn with_anchors(&self, anchors: TrustAnchors) -> Self {
-        let parts = IdentityParts { anchors, ..self.parts.clone() };
+        let mut parts = self.parts.clone();
+        parts.member.anchors = anchors;
         Self { parts, certified: Arc::clone(&self.certified), own: self.own.clone() }
+    }
+
+    /// The same node with the certificates and secrets that its fleet's authority sent for [`Identity::csr`]. Key,
+    /// CAs and name stay; everything else has to fit them.
+    pub fn with_credentials(&self, credentials: &Credentials) -> Result<Self, IdentityError> {
+        let mut parts = self.parts.clone();
+        let chain = credentials.chain.iter().map(|c| CertificateDer::from(c.to_vec()));
+        parts.member.chain = chain.collect();
+        let secret = |bytes: &[u8; 32]| FleetSecret::from_bytes(*bytes);
+        let naming = credentials
+            .secrets
+            .iter()
+            .map(|s| NamingSecret { generation: s.generation, secret: secret(s.secret.expose()) });
+        parts.member.naming = naming.collect();
+        check_generations(parts.member.secret.as_ref(), &parts.member.naming)?;
+        let newest = |naming: &[NamingSecret]| naming.first().map(|n| n.generation);
+        if newest(&parts.member.naming) < newest(self.naming_secrets()) {
+            return Err(IdentityError::OldSecrets);
+        }
+        let new = Self::assemble(parts)?;
+        if new.node_id() != self.node_id() {
+            return Err(IdentityError::NameMismatch { node: new.parts.member.node });
+        }
+        Ok(new)
+    }
+
+    /// The same node and key with everything else anew, as a fleet answered [`Identity::csr`]. CAs that it trusts
+    /// besides stay trusted.
+    pub fn with_membership(&self, member: Membership) -> Result<Self, IdentityError> {
+        let more = member.anchors.certificates().cloned().collect::<Vec<_>>();
+        let anchors = self.anchors().with_anchors(more).map_err(IdentityError::Ca)?;
+        let parts = IdentityParts { member: Membership { anchors, ..member }, ..self.parts.clone() };
+        let new = Self::assemble(parts)?;
+        if new.node_id() != self.node_id() {
+            return Err(IdentityError::NameMismatch { node: new.parts.member.node });
+        }
+        Ok(new)
+    }
+
+    /// A request for another certificate of the same node and key, DER (PKCS #10).
+    pub fn csr(&self) -> Vec<u8> {
+        let own = &self.own;
+        Key::from_pkcs8(&self.parts.key)
+            .and_then(|key| issue::signing_request(&key, Some(&own.pseudonym), &own.groups, own.may_route))
+            .expect("`assemble` made a signature with this key already")
+    }
+
+    /// The secrets that names are derived from, newest first; none for a router. Shares made now use the first.
+    pub fn naming_secrets(&self) -> &[NamingSecret] {
+        &self.parts.member.naming
+    }
+
+    /// The node that renews certificates for its fleet, if there is one.
+    pub fn authority(&self) -> Option<NodeId> {
+        self.parts.member.authority
+    }
+
+    /// True if its fleet wants links and grants that a quantum computer does not open later.
+    pub fn post_quantum(&self) -> bool {
+        self.parts.member.post_quantum
+    }
+
+    /// What its key keeps it from, for people: one sentence each.
+    pub fn transport_notes(&self) -> Vec<&'static str> {
+        let is_ecdsa = matches!(
+            self.certified.key.choose_scheme(&SCHEMES).map(|s| s.scheme()),
+            Some(SignatureScheme::ECDSA_NISTP256_SHA256 | SignatureScheme::ECDSA_NISTP384_SHA384)
+        );
+        match is_ecdsa {
+            true => Vec::new(),
+            false => vec!["DTLS cannot use this identity: it needs a P-256 or P-384 key; QUIC and TLS can"],
+        }
     }
 
     /// The fleet secret; a router has none.
     pub fn fleet_secret(&self) -> Option<&FleetSecret> {
-        self.parts.secret.as_ref()
+        self.parts.member.secret.as_ref()
     }
 
     /// Chain and private key for TLS. The key can sign and cannot be read.
@@ -198,7 +230,7 @@ impl Identity {
 
     /// Who the member of this fleet with that name is; `None` without the fleet secret.
     pub fn node_id_of(&self, node_name: &str) -> Option<NodeId> {
-        let spki = self.parts.anchors.ca_spki(&self.own.ca)?;
+        let spki = self.parts.member.anchors.ca_spki(&self.own.ca)?;
         Some(node_id(spki, &self.fleet_secret()?.pseudonym(node_name)))
     }
 
@@ -212,22 +244,30 @@ impl Identity {
     }
 
     /// Checks that the parts fit together.
-    pub(crate) fn assemble(parts: IdentityParts) -> Result<Self, IdentityError> {
+    fn assemble(parts: IdentityParts) -> Result<Self, IdentityError> {
+        let member = &parts.member;
+        // What cannot sign requests cannot renew itself later.
+        let stored = Key::from_pkcs8(&parts.key).ok_or(IdentityError::Key)?;
         let pkcs8 = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(parts.key.as_slice()));
         let key =
             rustls::crypto::aws_lc_rs::sign::any_supported_type(&pkcs8).map_err(|_| IdentityError::Key)?;
         check_signs(&*key)?;
-        let leaf = parts.chain.first().ok_or(IdentityError::Missing(CHAIN_BLOCK))?;
+        let leaf = member.chain.first().ok_or(IdentityError::Missing(CHAIN_BLOCK))?;
         // At the chain's own beginning: whether it holds now is another question.
         let validity = Validity::of(leaf).ok_or_else(|| {
             IdentityError::Chain(CertError::Malformed("its validity cannot be read".into()))
         })?;
-        let own = parts.anchors.verify(&parts.chain, validity.not_before).map_err(IdentityError::Chain)?;
-        let certified = CertifiedKey::new(parts.chain.clone(), key);
-        certified.keys_match().map_err(|_| IdentityError::KeyMismatch)?;
-        let is_named = |s: &FleetSecret| s.pseudonym(parts.node.as_str()) == own.pseudonym;
-        if !parts.secret.as_ref().is_none_or(is_named) {
-            return Err(IdentityError::NameMismatch { node: parts.node });
+        let own = member.anchors.verify(&member.chain, validity.not_before).map_err(IdentityError::Chain)?;
+        let certified = CertifiedKey::new(member.chain.clone(), key);
+        let same = webpki::EndEntityCert::try_from(leaf)
+            .is_ok_and(|c| c.subject_public_key_info().as_ref() == stored.subject_public_key_info());
+        if !same || certified.keys_match().is_err() {
+            return Err(IdentityError::KeyMismatch);
+        }
+        member.check_secrets()?;
+        let is_named = |s: &FleetSecret| s.pseudonym(member.node.as_str()) == own.pseudonym;
+        if !member.secret.as_ref().is_none_or(is_named) {
+            return Err(IdentityError::NameMismatch { node: member.node.clone() });
         }
         Ok(Self { parts, certified: Arc::new(certified), own })
     }
@@ -236,12 +276,28 @@ impl Identity {
 impl fmt::Debug for Identity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Identity")
-            .field("node", &self.parts.node)
-            .field("fleet", &self.parts.fleet)
+            .field("node", &self.parts.member.node)
+            .field("fleet", &self.parts.member.fleet)
             .field("id", &self.own.node_id)
             .field("ca", &self.own.ca)
             .finish_non_exhaustive()
     }
+}
+
+/// What [`Identity::import`] takes.
+pub struct Import {
+    /// The node's name.
+    pub node: NodeName,
+    /// The fleet's name, for people.
+    pub fleet: FleetName,
+    /// Its certificates, leaf first.
+    pub chain: Vec<CertificateDer<'static>>,
+    /// Its private key, PKCS #8: P-256, P-384, Ed25519 or RSA.
+    pub key: Zeroizing<Vec<u8>>,
+    /// The CAs that it is to trust, its own among them.
+    pub cas: Vec<CertificateDer<'static>>,
+    /// The fleet's secret; the certificate's pseudonym has to be the node's under it.
+    pub secret: Option<FleetSecret>,
 }
 
 /// Why a text is no identity.
@@ -280,6 +336,20 @@ pub enum IdentityError {
     /// A secret has a wrong length.
     #[error("block \"{0}\" does not hold 32 bytes")]
     SecretLength(&'static str),
+    /// A naming secret is broken.
+    #[error("block \"{NAMING_BLOCK}\" does not hold a number of at least 2 and 32 bytes")]
+    NamingSecret,
+    /// The generations of secrets do not fit together.
+    #[error(
+        "the naming secrets do not fit: a member has one to eight generations, each once; a router has none"
+    )]
+    Generations,
+    /// Secrets that are older than those in use.
+    #[error("the naming secrets are older than those in use: they were rotated meanwhile")]
+    OldSecrets,
+    /// A private key where none belongs.
+    #[error("this is an identity with its private key, not an answer to a request for one")]
+    HasKey,
     /// The certificate is for a node of another name, or the secret is another fleet's.
     #[error("the certificate is not that of node \"{node}\" under the fleet secret in this file")]
     NameMismatch {
@@ -291,19 +361,4 @@ pub enum IdentityError {
 fn check_signs(key: &dyn SigningKey) -> Result<(), IdentityError> {
     let signer = key.choose_scheme(&SCHEMES).ok_or(IdentityError::Key)?;
     signer.sign(b"").map(drop).map_err(|_| IdentityError::Key)
-}
-
-fn read_about(about: &[u8]) -> Result<(NodeName, FleetName), IdentityError> {
-    let decode = |r: &mut Reader<'_>| {
-        let found = r.u8()?;
-        if found != FILE_VERSION {
-            let (what, known) = ("identity file", FILE_VERSION.into());
-            return Err(DecodeError::Version { what, found: found.into(), known });
-        }
-        Ok((r.str("node name", LABEL_BYTES_MAX)?, r.str("fleet name", LABEL_BYTES_MAX)?))
-    };
-    let mut r = Reader::new(about);
-    let (node, fleet) = decode(&mut r).map_err(IdentityError::About)?;
-    r.finish().map_err(IdentityError::About)?;
-    Ok((node.parse().map_err(IdentityError::Name)?, fleet.parse().map_err(IdentityError::Name)?))
 }

@@ -1,9 +1,13 @@
-//! P-256 keys made from the caller's random generator, so that a seeded test fleet is the same on each run.
+//! Private keys: new P-256 ones made from the caller's random generator, so that a seeded test fleet is the same on
+//! each run, and stored ones of every kind that certificates may have.
 //!
-//! It holds keys only while they are made and while a CA signs; [`crate::Identity`] signs with what it read.
+//! They sign certificates, requests and lists here; what a running node signs, [`crate::Identity`] signs.
 
 use aws_lc_rs::rand::SystemRandom;
-use aws_lc_rs::signature::{ECDSA_P256_SHA256_ASN1_SIGNING, EcdsaKeyPair, KeyPair as _};
+use aws_lc_rs::signature::{
+    ECDSA_P256_SHA256_ASN1_SIGNING, ECDSA_P384_SHA384_ASN1_SIGNING, EcdsaKeyPair, Ed25519KeyPair,
+    KeyPair as _, RSA_PKCS1_SHA256, RsaKeyPair,
+};
 use rand_core::CryptoRng;
 use zeroize::Zeroizing;
 
@@ -21,14 +25,24 @@ const PKCS8_POINT: [u8; 5] = [0xa1, 0x44, 0x03, 0x42, 0x00];
 const SEC1_HEAD: [u8; 7] = [0x30, 0x31, 0x02, 0x01, 0x01, 0x04, 0x20];
 const SEC1_TAIL: [u8; 12] = [0xa0, 0x0a, 0x06, 0x08, 0x2a, 0x86, 0x48, 0xce, 0x3d, 0x03, 0x01, 0x07];
 
-/// A P-256 key pair that rcgen can sign with. Unlike rcgen's own it leaves no copy of the key in plain memory.
-pub(crate) struct P256Key {
-    pair: EcdsaKeyPair,
+/// Shortest RSA key that is taken, bytes: 2048 bits, as in every verifier here.
+const RSA_BYTES_MIN: usize = 256;
+
+/// A key pair that rcgen can sign with. Unlike rcgen's own it leaves no copy of the key in plain memory.
+pub(crate) struct Key {
+    pair: Pair,
     pkcs8: Zeroizing<Vec<u8>>,
 }
 
-impl P256Key {
-    /// A new key.
+enum Pair {
+    P256(EcdsaKeyPair),
+    P384(EcdsaKeyPair),
+    Ed25519(Ed25519KeyPair),
+    Rsa(RsaKeyPair),
+}
+
+impl Key {
+    /// A new P-256 key: every transport can use it.
     pub(crate) fn generate(rng: &mut impl CryptoRng) -> Self {
         let mut scalar = Zeroizing::new([0; 32]);
         loop {
@@ -40,9 +54,17 @@ impl P256Key {
         }
     }
 
-    /// A key that was stored.
+    /// A key that was stored: P-256, P-384, Ed25519, or RSA of 2048 bits and more.
     pub(crate) fn from_pkcs8(pkcs8: &[u8]) -> Option<Self> {
-        let pair = EcdsaKeyPair::from_private_key_der(&ECDSA_P256_SHA256_ASN1_SIGNING, pkcs8).ok()?;
+        let ecdsa = |algorithm| EcdsaKeyPair::from_pkcs8(algorithm, pkcs8).ok();
+        let pair = None
+            .or_else(|| ecdsa(&ECDSA_P256_SHA256_ASN1_SIGNING).map(Pair::P256))
+            .or_else(|| ecdsa(&ECDSA_P384_SHA384_ASN1_SIGNING).map(Pair::P384))
+            .or_else(|| Ed25519KeyPair::from_pkcs8(pkcs8).ok().map(Pair::Ed25519))
+            .or_else(|| {
+                let pair = RsaKeyPair::from_pkcs8(pkcs8).ok()?;
+                (pair.public_modulus_len() >= RSA_BYTES_MIN).then_some(Pair::Rsa(pair))
+            })?;
         Some(Self { pair, pkcs8: Zeroizing::new(pkcs8.to_vec()) })
     }
 
@@ -63,25 +85,42 @@ impl P256Key {
         pkcs8.extend_from_slice(scalar);
         pkcs8.extend_from_slice(&PKCS8_POINT);
         pkcs8.extend_from_slice(pair.public_key().as_ref());
-        Some(Self { pair, pkcs8 })
+        Some(Self { pair: Pair::P256(pair), pkcs8 })
     }
 }
 
-impl rcgen::PublicKeyData for P256Key {
+impl rcgen::PublicKeyData for Key {
     fn der_bytes(&self) -> &[u8] {
-        self.pair.public_key().as_ref()
+        match &self.pair {
+            Pair::P256(pair) | Pair::P384(pair) => pair.public_key().as_ref(),
+            Pair::Ed25519(pair) => pair.public_key().as_ref(),
+            Pair::Rsa(pair) => pair.public_key().as_ref(),
+        }
     }
 
     fn algorithm(&self) -> &'static rcgen::SignatureAlgorithm {
-        &rcgen::PKCS_ECDSA_P256_SHA256
+        match &self.pair {
+            Pair::P256(_) => &rcgen::PKCS_ECDSA_P256_SHA256,
+            Pair::P384(_) => &rcgen::PKCS_ECDSA_P384_SHA384,
+            Pair::Ed25519(_) => &rcgen::PKCS_ED25519,
+            Pair::Rsa(_) => &rcgen::PKCS_RSA_SHA256,
+        }
     }
 }
 
-impl rcgen::SigningKey for P256Key {
+impl rcgen::SigningKey for Key {
     fn sign(&self, message: &[u8]) -> Result<Vec<u8>, rcgen::Error> {
         // The generator only blinds here; aws-lc has no other way to be called.
-        let signature = self.pair.sign(&SystemRandom::new(), message);
-        signature.map(|s| s.as_ref().to_vec()).map_err(|_| rcgen::Error::RingUnspecified)
+        let rng = SystemRandom::new();
+        let signature = match &self.pair {
+            Pair::P256(pair) | Pair::P384(pair) => pair.sign(&rng, message).map(|s| s.as_ref().to_vec()),
+            Pair::Ed25519(pair) => Ok(pair.sign(message).as_ref().to_vec()),
+            Pair::Rsa(pair) => {
+                let mut signature = vec![0; pair.public_modulus_len()];
+                pair.sign(&RSA_PKCS1_SHA256, &rng, message, &mut signature).map(|()| signature)
+            }
+        };
+        signature.map_err(|_| rcgen::Error::RingUnspecified)
     }
 }
 
@@ -94,19 +133,19 @@ mod tests {
 
     #[test]
     fn keys_follow_the_seed_and_survive_storing() {
-        let key = P256Key::generate(&mut ChaCha20Rng::seed_from_u64(1));
-        let same = P256Key::generate(&mut ChaCha20Rng::seed_from_u64(1));
-        let other = P256Key::generate(&mut ChaCha20Rng::seed_from_u64(2));
+        let key = Key::generate(&mut ChaCha20Rng::seed_from_u64(1));
+        let same = Key::generate(&mut ChaCha20Rng::seed_from_u64(1));
+        let other = Key::generate(&mut ChaCha20Rng::seed_from_u64(2));
         assert_eq!(key.der_bytes(), same.der_bytes());
         assert_ne!(key.der_bytes(), other.der_bytes());
         assert_eq!(key.pkcs8().len(), 138);
-        assert_eq!(P256Key::from_pkcs8(key.pkcs8()).unwrap().der_bytes(), key.der_bytes());
+        assert_eq!(Key::from_pkcs8(key.pkcs8()).unwrap().der_bytes(), key.der_bytes());
     }
 
     #[test]
     fn impossible_scalars_are_refused() {
-        assert!(P256Key::from_scalar(&[0; 32]).is_none());
-        assert!(P256Key::from_scalar(&[0xff; 32]).is_none());
-        assert!(P256Key::from_pkcs8(b"no key").is_none());
+        assert!(Key::from_scalar(&[0; 32]).is_none());
+        assert!(Key::from_scalar(&[0xff; 32]).is_none());
+        assert!(Key::from_pkcs8(b"no key").is_none());
     }
 }

@@ -7,43 +7,54 @@
 
 mod batch;
 mod crl;
+mod enrol;
 mod fleet;
+mod fleet_error;
 mod grant;
 mod hpke;
 mod identity;
+mod issue;
 mod key;
 mod label;
+mod member;
 mod message_key;
 mod names;
 mod pem;
 mod policy;
 mod replay;
+mod roster;
 mod seal;
+mod secret;
 mod signed;
 mod suite;
+mod token;
 mod verify;
 mod x509;
 mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
 pub use crl::CrlError;
-pub use fleet::{
-    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, EnrollRequest, Fleet, FleetError, FleetSecret,
-    LEAF_VALIDITY_DEFAULT,
-};
+pub use enrol::EnrollRequest;
+pub use fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, ROSTER_BYTES_MAX};
+pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
-pub use identity::{Identity, IdentityError};
+pub use identity::{Identity, IdentityError, Import};
+pub use issue::KeyRequest;
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
+pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
 pub use names::{TopicSecret, derive_name, name_of, renewal_blind};
-pub use pem::PemError;
+pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
+pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes};
+pub use secret::{FleetSecret, NamingSecret};
 pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, verify_advert, verify_answer, verify_join,
 };
 pub use suite::{ParseSuiteError, Suite};
+pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};
 pub use verify::{
     ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, SignatureError, TrustAnchors,
     VerifiedPeer, node_id,

@@ -27,6 +27,16 @@ impl TopicSecret {
         Self(out)
     }
 
+    /// Takes the bytes of a secret.
+    pub fn from_bytes(bytes: [u8; 32]) -> Self {
+        Self(bytes)
+    }
+
+    /// The bytes, for handing on this one interface. They belong in no log, and in no packet.
+    pub fn expose(&self) -> &[u8; 32] {
+        &self.0
+    }
+
     /// `HMAC-SHA-256(topic secret, "sgc name")`.
     pub fn blind(&self) -> Blind {
         let key = hmac::Key::new(hmac::HMAC_SHA256, &self.0);
@@ -35,6 +45,15 @@ impl TopicSecret {
         Blind(out)
     }
 }
+
+impl PartialEq for TopicSecret {
+    /// In constant time.
+    fn eq(&self, other: &Self) -> bool {
+        aws_lc_rs::constant_time::verify_slices_are_equal(&self.0, &other.0).is_ok()
+    }
+}
+
+impl Eq for TopicSecret {}
 
 impl std::fmt::Debug for TopicSecret {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

@@ -7,8 +7,10 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use zeroize::Zeroizing;
 
-/// Longest file that is read, bytes.
+/// Longest identity file that is read, bytes.
 pub(crate) const FILE_BYTES_MAX: usize = 256 * 1024;
+/// Longest fleet file that is read, bytes: it knows thousands of nodes.
+pub const FLEET_FILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 /// Most blocks of one file.
 const BLOCKS_MAX: usize = 64;
 const LINE_CHARS: usize = 64;
@@ -17,10 +19,12 @@ const LINE_CHARS: usize = 64;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PemError {
     /// The file is too long to be one of ours.
-    #[error("the file has {bytes} bytes, at most {FILE_BYTES_MAX} are read")]
+    #[error("the file has {bytes} bytes, at most {max} are read")]
     TooLong {
         /// Its length.
         bytes: usize,
+        /// The longest that is read.
+        max: usize,
     },
     /// Too many blocks.
     #[error("the file has more than {BLOCKS_MAX} blocks")]
@@ -49,16 +53,23 @@ pub enum PemError {
     },
 }
 
+/// The contents of the blocks of a file that have one of these labels, in their order; others are passed over.
+pub fn pem_contents(text: &str, labels: &[&str]) -> Result<Vec<Zeroizing<Vec<u8>>>, PemError> {
+    let blocks = parse(text, FILE_BYTES_MAX)?;
+    let wanted = blocks.into_iter().filter(|b| labels.contains(&b.label.as_str()));
+    Ok(wanted.map(|b| b.content).collect())
+}
+
 /// One block, decoded.
 pub(crate) struct Block {
     pub(crate) label: String,
     pub(crate) content: Zeroizing<Vec<u8>>,
 }
 
-/// Reads all blocks of `text`.
-pub(crate) fn parse(text: &str) -> Result<Vec<Block>, PemError> {
-    if text.len() > FILE_BYTES_MAX {
-        return Err(PemError::TooLong { bytes: text.len() });
+/// Reads all blocks of `text`, which has at most `max` bytes.
+pub(crate) fn parse(text: &str, max: usize) -> Result<Vec<Block>, PemError> {
+    if text.len() > max {
+        return Err(PemError::TooLong { bytes: text.len(), max });
     }
     let mut blocks = Vec::new();
     let mut open: Option<(String, usize, Zeroizing<String>)> = None;
@@ -129,14 +140,14 @@ mod tests {
         let long = vec![7; 200];
         let text = write("# hello\n", &[("A B", &long), ("C", &[])]);
         assert!(text.lines().all(|l| l.len() <= LINE_CHARS));
-        let blocks = parse(&format!("{}trailing words\n", text.as_str())).unwrap();
+        let blocks = parse(&format!("{}trailing words\n", text.as_str()), FILE_BYTES_MAX).unwrap();
         let got: Vec<_> = blocks.iter().map(|b| (b.label.as_str(), b.content.as_slice())).collect();
         assert_eq!(got, [("A B", long.as_slice()), ("C", &[])]);
     }
 
     #[test]
     fn broken_files_name_the_line() {
-        let refused = |text: &str| parse(text).err().unwrap();
+        let refused = |text: &str| parse(text, FILE_BYTES_MAX).err().unwrap();
         assert_eq!(
             refused("x\n-----BEGIN A-----\nAAAA\n"),
             PemError::Unterminated { label: "A".into(), line: 2 }

@@ -31,11 +31,17 @@ pub enum Listed {
 impl Grantees {
     /// How `peer` is among them, if it is.
     pub fn find(&self, peer: &VerifiedPeer) -> Option<Listed> {
-        if self.nodes.contains(&peer.node_id) {
+        self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
+    }
+
+    /// How a node whose certificate proves this is among them, if it is. For those who ask about a node that is
+    /// not there; what decides about one that is, is [`Grantees::find`].
+    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<Listed> {
+        if self.nodes.contains(node) {
             return Some(Listed::Node);
         }
-        let group = peer.groups.iter().find(|g| self.groups.contains(&(peer.ca, **g)));
-        group.map(|g| Listed::Group(*g)).or(self.fleets.contains(&peer.ca).then_some(Listed::Fleet))
+        let group = groups.iter().find(|g| self.groups.contains(&(*ca, **g)));
+        group.map(|g| Listed::Group(*g)).or(self.fleets.contains(ca).then_some(Listed::Fleet))
     }
 
     /// True if nobody is.

@@ -144,6 +144,11 @@ impl TrustAnchors {
         self.anchors.iter().map(|a| &a.der)
     }
 
+    /// The CAs, by their public keys, in the order of [`TrustAnchors::certificates`].
+    pub fn fingerprints(&self) -> impl Iterator<Item = CaFingerprint> {
+        self.anchors.iter().map(|a| a.fingerprint)
+    }
+
     /// The public key (SubjectPublicKeyInfo, DER) of a CA that is trusted here.
     pub fn ca_spki(&self, ca: &CaFingerprint) -> Option<&[u8]> {
         self.anchors.iter().find(|a| a.fingerprint == *ca).map(|a| &*a.spki)
@@ -411,7 +416,10 @@ pub enum CertError {
     #[error("the certificate cannot be used: {0}")]
     Malformed(String),
     /// The leaf does not say which node it is for.
-    #[error("the certificate names no SGC node: it was not made by `sgc fleet enroll`")]
+    #[error(
+        "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign a \
+         request that `sgc fleet request` made, with its subject alternative names"
+    )]
     NoPseudonym,
     /// The leaf names too many groups.
     #[error("the certificate names more than {GROUPS_MAX} groups")]

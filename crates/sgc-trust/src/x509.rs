@@ -13,15 +13,20 @@ const OBJECT_ID: u8 = 0x06;
 const UTC_TIME: u8 = 0x17;
 const GENERALIZED_TIME: u8 = 0x18;
 const SEQUENCE: u8 = 0x30;
+const SET: u8 = 0x31;
 const VERSION: u8 = 0xa0;
 const CERT_EXTENSIONS: u8 = 0xa3;
 const CRL_EXTENSIONS: u8 = 0xa0;
 
+const SUBJECT_KEY_ID: &[u8] = &[0x55, 0x1d, 0x0e];
+const BASIC_CONSTRAINTS: &[u8] = &[0x55, 0x1d, 0x13];
 const KEY_USAGE: &[u8] = &[0x55, 0x1d, 0x0f];
 const CRL_NUMBER: &[u8] = &[0x55, 0x1d, 0x14];
 const DISTRIBUTION_POINT: &[u8] = &[0x55, 0x1d, 0x1c];
 /// Bit 6 of a key usage: the key may sign revocation lists (RFC 5280, 4.2.1.3).
 const CRL_SIGN: u8 = 0x02;
+/// Bit 5: the key may sign certificates.
+const KEY_CERT_SIGN: u8 = 0x04;
 
 /// From when until when a certificate holds, both inclusive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,23 +61,137 @@ pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
     }
 }
 
+/// The serial number of a DER certificate, without leading zeros.
+pub(crate) fn serial_of(certificate: &[u8]) -> Option<&[u8]> {
+    let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
+    if tbs.peek()? == VERSION {
+        tbs.skip()?;
+    }
+    tbs.enter(INTEGER).map(|serial| without_zeros(serial.0))
+}
+
+/// What the making of certificates and lists needs of the certificate of their CA.
+pub(crate) struct CaFields<'a> {
+    /// Its components in order: type, tag of the value, value.
+    pub(crate) name: Vec<(Vec<u64>, u8, &'a [u8])>,
+    pub(crate) key_id: Option<&'a [u8]>,
+    /// True if its basic constraints say that it is one.
+    pub(crate) is_ca: bool,
+    /// True unless its key usage leaves out the signing of certificates.
+    pub(crate) may_sign_certificates: bool,
+}
+
+impl<'a> CaFields<'a> {
+    pub(crate) fn of(certificate: &'a [u8]) -> Option<Self> {
+        let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
+        if tbs.peek()? == VERSION {
+            tbs.skip()?;
+        }
+        for tag in [INTEGER, SEQUENCE, SEQUENCE, SEQUENCE] {
+            tbs.enter(tag)?; // serial, signature algorithm, issuer, validity
+        }
+        let mut components = tbs.enter(SEQUENCE)?;
+        let mut name = Vec::new();
+        while components.peek().is_some() {
+            let mut set = components.enter(SET)?;
+            while set.peek().is_some() {
+                let mut component = set.enter(SEQUENCE)?;
+                let id = object_id(component.enter(OBJECT_ID)?.0)?;
+                let tag = component.peek()?;
+                name.push((id, tag, component.enter(tag)?.0));
+            }
+        }
+        let extensions = extensions_of(certificate)?;
+        let find = |id| extensions.map_or(Some(None), |e| e.find_extension(id));
+        let key_id = match find(SUBJECT_KEY_ID)? {
+            None => None,
+            Some(content) => Some(Der(content).enter(OCTET_STRING)?.0),
+        };
+        let is_ca = match find(BASIC_CONSTRAINTS)? {
+            None => false,
+            Some(content) => {
+                let mut constraints = Der(content).enter(SEQUENCE)?;
+                constraints.peek() == Some(BOOLEAN) && constraints.enter(BOOLEAN)?.0 != [0]
+            }
+        };
+        let usage = key_usage(certificate)?;
+        let may_sign_certificates = usage.is_none_or(|bits| bits & KEY_CERT_SIGN != 0);
+        Some(Self { name, key_id, is_ca, may_sign_certificates })
+    }
+}
+
+/// The fields of a DER CertificationRequest (PKCS #10, RFC 2986) that we read: its key, and that it signed.
+pub(crate) struct RequestFields<'a> {
+    /// What is signed: the whole first element.
+    pub(crate) info: &'a [u8],
+    /// The outer algorithm identifier without its tag.
+    pub(crate) algorithm: &'a [u8],
+    pub(crate) signature: &'a [u8],
+    /// Algorithm identifier without its tag, and bare key.
+    pub(crate) key: (&'a [u8], &'a [u8]),
+}
+
+impl<'a> RequestFields<'a> {
+    pub(crate) fn of(request: &'a [u8]) -> Option<Self> {
+        let mut whole = Der(request);
+        let mut request = whole.enter(SEQUENCE)?;
+        let from = request.0;
+        let mut fields = request.enter(SEQUENCE)?;
+        let info = from.get(..from.len() - request.0.len())?;
+        let algorithm = request.enter(SEQUENCE)?.0;
+        let (0, signature) = request.enter(BIT_STRING)?.0.split_first()? else { return None };
+        fields.enter(INTEGER)?; // version
+        fields.enter(SEQUENCE)?; // subject
+        let from = fields.0;
+        fields.enter(SEQUENCE)?;
+        let key = split_spki(from.get(..from.len() - fields.0.len())?)?;
+        (whole.0.is_empty() && request.0.is_empty()).then_some(Self { info, algorithm, signature, key })
+    }
+}
+
+fn object_id(content: &[u8]) -> Option<Vec<u64>> {
+    let mut arcs = Vec::new();
+    let mut arc = 0_u64;
+    for byte in content {
+        arc = arc.checked_mul(128)?.checked_add(u64::from(byte & 0x7f))?;
+        if byte & 0x80 == 0 {
+            if arcs.is_empty() {
+                let first = (arc / 40).min(2);
+                arcs.push(first);
+                arc -= 40 * first;
+            }
+            arcs.push(arc);
+            arc = 0;
+        }
+    }
+    (!arcs.is_empty() && arc == 0).then_some(arcs)
+}
+
 /// True unless a DER certificate has a key usage that leaves out the signing of revocation lists.
 pub(crate) fn may_sign_lists(certificate: &[u8]) -> Option<bool> {
-    let mut certificate = Der(certificate).enter(SEQUENCE)?;
-    let mut tbs = certificate.enter(SEQUENCE)?;
+    Some(key_usage(certificate)?.is_none_or(|bits| bits & CRL_SIGN != 0))
+}
+
+/// The first byte of its key usage, if it has one.
+fn key_usage(certificate: &[u8]) -> Option<Option<u8>> {
+    let Some(extensions) = extensions_of(certificate)? else { return Some(None) };
+    match extensions.find_extension(KEY_USAGE)? {
+        None => Some(None),
+        Some(usage) => {
+            let (_unused_bits, bits) = Der(usage).enter(BIT_STRING)?.0.split_first()?;
+            Some(Some(bits.first().copied().unwrap_or(0)))
+        }
+    }
+}
+
+fn extensions_of(certificate: &[u8]) -> Option<Option<Der<'_>>> {
+    let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
     while tbs.peek().is_some_and(|tag| tag != CERT_EXTENSIONS) {
         tbs.skip()?;
     }
-    if tbs.peek().is_none() {
-        return Some(true);
-    }
-    let extensions = tbs.enter(CERT_EXTENSIONS)?.enter(SEQUENCE)?;
-    match extensions.find_extension(KEY_USAGE)? {
-        None => Some(true),
-        Some(usage) => {
-            let (_unused_bits, bits) = Der(usage).enter(BIT_STRING)?.0.split_first()?;
-            Some(bits.first().is_some_and(|b| b & CRL_SIGN != 0))
-        }
+    match tbs.peek() {
+        None => Some(None),
+        Some(_) => Some(Some(tbs.enter(CERT_EXTENSIONS)?.enter(SEQUENCE)?)),
     }
 }
 

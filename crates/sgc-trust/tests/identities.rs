@@ -8,7 +8,7 @@ use rand_core::SeedableRng as _;
 use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
 use rustls_pki_types::CertificateDer;
 use sgc_trust::*;
-use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, Pseudonym, UnixMillis};
+use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, Metadata, Pseudonym, UnixMillis};
 
 const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
 const MINUTE: u64 = 60_000;
@@ -27,11 +27,15 @@ fn request(node: &str) -> EnrollRequest {
 }
 
 fn enroll(fleet: &Fleet, request: &EnrollRequest) -> Identity {
-    fleet.enroll(request, &mut rng(7)).unwrap()
+    fleet.issue(request, &mut rng(7)).unwrap()
 }
 
 fn at(offset: i64) -> UnixMillis {
     UnixMillis(NOW.0.checked_add_signed(offset).unwrap())
+}
+
+fn sha256(bytes: &[u8]) -> [u8; 32] {
+    aws_lc_rs::digest::digest(&aws_lc_rs::digest::SHA256, bytes).as_ref().try_into().unwrap()
 }
 
 fn contains(haystack: &[u8], needle: &[u8]) -> bool {
@@ -58,6 +62,24 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         "0ab23d5bda0052488b9dafdaf8a676fbeb840fe6043e5e4f91a41173c4d5ccdf"
     );
     assert_ne!(secret.pseudonym("operators").0, secret.group_tag("operators").0);
+    // `scripts/pki-vectors.py` prints these and those above: who a node is follows from the first secret, what its
+    // shares are called from each generation.
+    let owner = node_id(&spki, &pseudonym);
+    let topic = Metadata::topic("arm-1", "/camera/image", "sensor_msgs/msg/Image");
+    let named = |secret: &FleetSecret| derive_name(secret, &owner, &topic).to_string();
+    assert_eq!(named(&secret), "c2d1e2ccc66628a53e5d64e052bc756df604d7706f928b133b6a5117fe0108cf");
+    let rotated = FleetSecret::from_bytes(std::array::from_fn(|i| i as u8 + 32));
+    assert_eq!(named(&rotated), "174148a916325a353c7cf2df75e9484666a5d8bbc5ec1a6d8596aef1de3456da");
+    let ca = CaFingerprint(sha256(&spki));
+    assert_eq!(ca.to_string(), "0131dda9654fef86d57812b9960f260523c27a40c3a18fa8ecc7303510e78c22");
+    assert_eq!(
+        renewal_blind(&ca).to_string(),
+        "367b4a3010a84d06b4ee2a8a0f11a7f82db8a69b16f24f8a390455ad1513195b"
+    );
+    assert_eq!(
+        name_of(&owner, &renewal_blind(&ca)).to_string(),
+        "3d8e6a2cd48f7918a009a78f8c0ba2cc2ce2f3f5dd728d4fc34edc9aa74775a5"
+    );
 }
 
 #[test]
@@ -100,7 +122,7 @@ fn a_certificate_with_all_groups_fits() {
     assert_eq!(full.groups().len(), GROUPS_MAX);
     assert!(full.chain()[0].len() <= CERT_BYTES_MAX, "{}", full.chain()[0].len());
     let over = EnrollRequest { groups: groups(GROUPS_MAX + 1), ..request("a") };
-    assert!(matches!(fleet.enroll(&over, &mut rng(1)), Err(FleetError::TooManyGroups { groups: 33 })));
+    assert!(matches!(fleet.issue(&over, &mut rng(1)), Err(FleetError::TooManyGroups { groups: 33 })));
 }
 
 #[test]
@@ -137,7 +159,7 @@ fn a_leaf_never_outlives_its_ca_and_an_expired_ca_is_not_believed() {
     assert_eq!(arm.not_after(), fleet.not_after());
     let after = UnixMillis(fleet.not_after().0 + 1000);
     assert!(matches!(
-        fleet.enroll(&EnrollRequest { now: after, ..request("b") }, &mut rng(1)),
+        fleet.issue(&EnrollRequest { now: after, ..request("b") }, &mut rng(1)),
         Err(FleetError::CaExpired { .. })
     ));
     assert!(matches!(
@@ -259,7 +281,7 @@ fn leaves_of_an_existing_pki_are_judged_by_what_they_say() {
 fn signatures_hold_for_their_signer_message_and_context_only() {
     let fleet = fleet(1);
     let arm = enroll(&fleet, &request("arm-1"));
-    let desk = fleet.enroll(&request("desk"), &mut rng(8)).unwrap();
+    let desk = fleet.issue(&request("desk"), &mut rng(8)).unwrap();
     let peer = fleet.anchors().verify(arm.chain(), NOW).unwrap();
     let signature = arm.sign("test v1", b"message");
     assert_eq!(peer.verify_signature("test v1", b"message", &signature), Ok(()));
@@ -345,7 +367,7 @@ fn block<'a>(text: &'a str, label: &str) -> &'a str {
 fn broken_identity_files_name_the_block() {
     let (ours, theirs) = (fleet(1), fleet(2));
     let text = enroll(&ours, &request("arm-1")).to_text();
-    let foreign = theirs.enroll(&request("arm-1"), &mut rng(9)).unwrap().to_text();
+    let foreign = theirs.issue(&request("arm-1"), &mut rng(9)).unwrap().to_text();
     let refused = |text: &str| Identity::parse(text).unwrap_err();
     for label in ["SGC IDENTITY", "CERTIFICATE", "PRIVATE KEY", "SGC CA CERTIFICATE"] {
         let error = refused(&without(&text, label));
@@ -357,7 +379,7 @@ fn broken_identity_files_name_the_block() {
     assert_eq!(refused(&swap("SGC CA CERTIFICATE")), IdentityError::Chain(CertError::UnknownIssuer));
     assert_eq!(refused(&swap("PRIVATE KEY")), IdentityError::KeyMismatch);
     assert!(matches!(refused(&swap("SGC FLEET SECRET")), IdentityError::NameMismatch { .. }));
-    let desk = ours.enroll(&request("desk"), &mut rng(9)).unwrap().to_text();
+    let desk = ours.issue(&request("desk"), &mut rng(9)).unwrap().to_text();
     let renamed = text.replace(block(&text, "SGC IDENTITY"), block(&desk, "SGC IDENTITY"));
     assert!(matches!(refused(&renamed), IdentityError::NameMismatch { node } if node.as_str() == "desk"));
     let twice = format!("{}{}", text.as_str(), block(&text, "PRIVATE KEY"));

@@ -9,7 +9,7 @@ use rand_core::SeedableRng as _;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateRevocationListParams, CrlDistributionPoint,
     CrlIssuingDistributionPoint, DnType, IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose,
-    RevokedCertParams, SanType, SerialNumber,
+    RevokedCertParams, SanType, SerialNumber, SigningKey as _,
 };
 use rustls_pki_types::CertificateDer;
 use sgc_trust::*;
@@ -31,7 +31,7 @@ fn fleet(seed: u64) -> Fleet {
 }
 
 fn enroll(fleet: &Fleet, node: &str, seed: u64) -> Identity {
-    fleet.enroll(&EnrollRequest::new(node.parse().unwrap(), NOW), &mut rng(seed)).unwrap()
+    fleet.issue(&EnrollRequest::new(node.parse().unwrap(), NOW), &mut rng(seed)).unwrap()
 }
 
 /// A list that revokes these.
@@ -255,6 +255,16 @@ fn lists_that_decide_nothing_are_refused_with_the_cause() {
     assert_eq!(refused(&namesake.crl(&[1], &[5], None)), CrlError::BadSignature);
     let both = ca.anchors().with_anchors([namesake.certificate.clone()]).unwrap();
     assert_eq!(with(&both, &namesake.crl(&[1], &[5], None)).crls().count(), 1);
+    // Without a number nobody could tell which of two lists is newer.
+    let mut unnumbered = ca.crl(&[1], &[5], None);
+    let at = unnumbered.windows(3).rposition(|w| w == [0x55, 0x1d, 0x14]).unwrap();
+    unnumbered[at + 2] = 0x7f;
+    let head = if unnumbered[1] == 0x82 { 4 } else { 3 };
+    // Behind what is signed: the algorithm (7 bytes), the head of the signature (3) and the signature.
+    let end = unnumbered.len() - 7 - 3 - 64;
+    let signature = ca.key.sign(&unnumbered[head..end]).unwrap();
+    unnumbered[end + 10..].copy_from_slice(&signature);
+    assert_eq!(refused(&unnumbered), CrlError::NoNumber);
     // A CA may be made not to sign lists.
     let other = ForeignCa::new("other", &[KeyUsagePurpose::KeyCertSign]);
     assert_eq!(

@@ -6,7 +6,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use sgc_node::config::{self, Config, DiscoveryRange, ShareConfig};
+use sgc_node::config::{self, Config, DiscoveryRange, ShareConfig, TokenSource};
 use sgc_trust::Identity;
 
 use crate::error::CliError;
@@ -68,12 +68,31 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
         let to: Vec<_> = share.to.iter().map(ToString::to_string).collect();
         let to = if to == ["*"] { "everyone in the fleet".to_owned() } else { to.join(", ") };
         row("shares", format!("{}{} with {to}", share.topic, type_of(share.type_name.as_deref())));
+        if !share.publish.is_empty() {
+            let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
+            row("", format!("published on by {} besides", publish.join(", ")));
+        }
         if let Some(name) = name_of(config, identity, share)? {
             row("", format!("named {name}"));
         }
     }
     for one in &config.uses {
         row("uses", format!("{}{} from {}", one.topic, type_of(one.type_name.as_deref()), one.from));
+    }
+    for token in &config.tokens {
+        match token {
+            TokenSource::File(path) => row("uses", format!("by token, {}", path.display())),
+            TokenSource::Text(token) => {
+                row("uses", format!("{} from {}, by token", token.metadata.ros_name, token.owner_name));
+            }
+        }
+    }
+    for partner in &config.partners {
+        let nodes = match partner.nodes.len() {
+            0 => "all of its nodes".to_owned(),
+            n => format!("{n} of its nodes"),
+        };
+        row("partner", format!("{}, {nodes}, CA in {}", partner.name, partner.ca.display()));
     }
     Ok(rows)
 }

@@ -9,9 +9,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
-use sgc_node::NodeError;
 use sgc_node::config::ConfigErrors;
-use sgc_trust::{FleetError, LabelError};
+use sgc_node::partners::PartnerError;
+use sgc_node::{NodeError, RulesError, StateError};
+use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
 
@@ -65,16 +66,40 @@ pub(crate) enum CliError {
         hint: &'static str,
     },
     /// A file of secrets that others may read.
-    #[error(
-        "{}: its mode {mode:04o} lets others at the CA's private key: chmod 600 {}",
-        path.display(),
-        path.display()
-    )]
-    FleetExposed {
+    #[error("{}: its mode {mode:04o} lets others at {what}: chmod 600 {}", path.display(), path.display())]
+    Exposed {
         /// The file.
         path: PathBuf,
         /// Its permission bits.
         mode: u32,
+        /// What is in it.
+        what: &'static str,
+    },
+    /// A file that is not what was asked for.
+    #[error("{}: it holds no {what}: {hint}", path.display())]
+    NotInFile {
+        /// The file.
+        path: PathBuf,
+        /// What is missing.
+        what: &'static str,
+        /// What would be right.
+        hint: &'static str,
+    },
+    /// A file of blocks that is broken.
+    #[error("{}: {source}", path.display())]
+    Pem {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: PemError,
+    },
+    /// Parts of an identity that do not fit together.
+    #[error("{}: {source}", path.display())]
+    Identity {
+        /// The file that they are from.
+        path: PathBuf,
+        /// What is wrong.
+        source: IdentityError,
     },
     /// A fleet file that is broken, or a fleet that cannot enrol.
     #[error("{}: {source}", path.display())]
@@ -152,6 +177,49 @@ pub(crate) enum CliError {
         /// What the parser said.
         reason: String,
     },
+    /// No configuration was named and none is here.
+    #[error("no configuration here (no *.toml): name one with -c FILE")]
+    NoConfigHere,
+    /// No configuration was named and several are here.
+    #[error("which configuration? Name one with -c: {}", files.join(", "))]
+    SeveralConfigs {
+        /// Their names.
+        files: Vec<String>,
+    },
+    /// Partners or tokens given.
+    #[error(transparent)]
+    Partner(#[from] PartnerError),
+    /// Partners or tokens used.
+    #[error(transparent)]
+    Rules(#[from] RulesError),
+    /// The state directory.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// A text that is no token.
+    #[error("the token cannot be used: {0}")]
+    Token(#[from] TokenError),
+    /// What was asked for cannot be right.
+    #[error("{reason}")]
+    Cannot {
+        /// Why, with what would be right.
+        reason: String,
+    },
+    /// A running node refused what it was asked for.
+    #[error("the node at {} refused, everything there is as it was: {}", path.display(), reason.lines().last().unwrap_or_default())]
+    NodeRefused {
+        /// Its socket.
+        path: PathBuf,
+        /// Why, one line each.
+        reason: String,
+    },
+    /// There is no audit log.
+    #[error("cannot read the audit log {}: {reason}", path.display())]
+    NoAudit {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
     /// The demo cannot go on.
     #[error("demo: {reason}")]
     Demo {
@@ -184,6 +252,10 @@ impl CliError {
                     output::diagnostic(&error.to_string());
                 }
             }
+            Self::NodeRefused { reason, .. } => {
+                let above = reason.lines().count().saturating_sub(1);
+                reason.lines().take(above).for_each(output::diagnostic);
+            }
             _ => {}
         }
         output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
@@ -201,14 +273,24 @@ impl CliError {
             | Self::Arguments { .. }
             | Self::Label(_)
             | Self::Exists { .. }
-            | Self::FleetExposed { .. }
+            | Self::Exposed { .. }
+            | Self::NotInFile { .. }
+            | Self::Pem { .. }
+            | Self::Identity { .. }
             | Self::Fleet { .. }
             | Self::NoFleetHere
             | Self::SeveralFleets { .. }
             | Self::CheckIdentity { .. }
             | Self::RouterCannotName { .. }
             | Self::LogFilter { .. }
-            | Self::SeveralNodes { .. } => EXIT_USAGE,
+            | Self::SeveralNodes { .. }
+            | Self::NoConfigHere
+            | Self::SeveralConfigs { .. }
+            | Self::Partner(_)
+            | Self::Rules(_)
+            | Self::State(_)
+            | Self::Token(_)
+            | Self::Cannot { .. } => EXIT_USAGE,
             Self::Node(NodeError::Listen { .. } | NodeError::Ros(_) | NodeError::Randomness(_)) => {
                 EXIT_FAILURE
             }
@@ -218,6 +300,8 @@ impl CliError {
             | Self::NoNode { .. }
             | Self::NoNodeHere { .. }
             | Self::NotAStatus { .. }
+            | Self::NodeRefused { .. }
+            | Self::NoAudit { .. }
             | Self::Demo { .. }
             | Self::System { .. }
             | Self::Output(_) => EXIT_FAILURE,

@@ -3,17 +3,19 @@
 //!
 //! What is in them is the business of `sgc-trust`.
 
-use std::fs;
-use std::io::{self, Write};
-use std::os::unix::fs::PermissionsExt;
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use sgc_trust::FLEET_FILE_BYTES_MAX;
 use zeroize::Zeroizing;
 
 use crate::error::CliError;
 
-/// The largest file that is read as one of secrets.
-const SECRET_FILE_BYTES_MAX: u64 = 1024 * 1024;
+/// The largest file that is read.
+const SECRET_FILE_BYTES_MAX: u64 = FLEET_FILE_BYTES_MAX as u64;
+const PUBLIC_MODE: u32 = 0o644;
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
@@ -41,21 +43,92 @@ pub(crate) fn write_secret(path: &Path, text: &str, existing: Existing) -> Resul
             _ => failed(e.error),
         })?,
     };
+    // Without this the name may be gone after a power cut, though the file is whole.
+    File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)
+}
+
+/// Writes a file that is no secret: complete under its name, or not there. One that is there is replaced.
+pub(crate) fn write_public(path: &Path, content: &[u8]) -> Result<(), CliError> {
+    let failed = |source| CliError::Write { path: path.to_owned(), source };
+    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
+    file.write_all(content).map_err(failed)?;
+    file.as_file().set_permissions(fs::Permissions::from_mode(PUBLIC_MODE)).map_err(failed)?;
+    file.as_file().sync_all().map_err(failed)?;
+    file.persist(path).map_err(|e| failed(e.error))?;
     Ok(())
 }
 
-/// Reads a fleet file, which must be its owner's alone.
-pub(crate) fn read_fleet(path: &Path) -> Result<Zeroizing<String>, CliError> {
+/// Reads a text that is no secret.
+pub(crate) fn read_public(path: &Path) -> Result<String, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    if fs::metadata(path).map_err(failed)?.len() > SECRET_FILE_BYTES_MAX {
+        return Err(failed(io::Error::other("it is far too large")));
+    }
+    fs::read_to_string(path).map_err(failed)
+}
+
+/// True if there is something under this name.
+pub(crate) fn exists(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
+}
+
+/// Opens a file for changes that no other command makes at the same time: it is locked until it is closed.
+pub(crate) fn lock(path: &Path) -> Result<File, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    loop {
+        let file = File::open(path).map_err(failed)?;
+        rustix::fs::flock(&file, rustix::fs::FlockOperation::LockExclusive).map_err(|e| failed(e.into()))?;
+        // Whoever had the lock may have put another file in the place of this one meanwhile.
+        let (locked, named) = (file.metadata().map_err(failed)?, fs::metadata(path).map_err(failed)?);
+        if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
+            return Ok(file);
+        }
+    }
+}
+
+/// Reads a file of secrets, which must be its owner's alone; `what` is in it.
+pub(crate) fn read_secret(path: &Path, what: &'static str) -> Result<Zeroizing<String>, CliError> {
     let failed = |source| CliError::Read { path: path.to_owned(), source };
     let metadata = fs::metadata(path).map_err(failed)?;
     let mode = metadata.permissions().mode() & PERMISSION_BITS;
     if mode & OTHERS_BITS != 0 {
-        return Err(CliError::FleetExposed { path: path.to_owned(), mode });
+        return Err(CliError::Exposed { path: path.to_owned(), mode, what });
     }
     if metadata.len() > SECRET_FILE_BYTES_MAX {
-        return Err(failed(io::Error::other("it is far too large for a fleet file")));
+        return Err(failed(io::Error::other("it is far too large")));
     }
     fs::read_to_string(path).map(Zeroizing::new).map_err(failed)
+}
+
+/// Reads a file of at most `max` bytes.
+pub(crate) fn read_limited(path: &Path, max: u64) -> Result<Vec<u8>, CliError> {
+    let failed = |source| CliError::Read { path: path.to_owned(), source };
+    let mut content = Vec::new();
+    fs::File::open(path).and_then(|file| file.take(max + 1).read_to_end(&mut content)).map_err(failed)?;
+    if content.len() as u64 > max {
+        return Err(failed(io::Error::other(format!("it has more than {max} bytes"))));
+    }
+    Ok(content)
+}
+
+/// The configuration that is meant: as named, or the only one of this directory.
+pub(crate) fn config_here(named: Option<&Path>) -> Result<PathBuf, CliError> {
+    let dir = Path::new(".");
+    let found = match named {
+        Some(path) => return Ok(path.to_owned()),
+        None => {
+            with_extension(dir, "toml").map_err(|source| CliError::Read { path: dir.to_owned(), source })?
+        }
+    };
+    let name = |path: &PathBuf| path.strip_prefix(dir).unwrap_or(path).to_owned();
+    match &found[..] {
+        [] => Err(CliError::NoConfigHere),
+        [only] => Ok(name(only)),
+        several => Err(CliError::SeveralConfigs {
+            files: several.iter().map(|p| name(p).display().to_string()).collect(),
+        }),
+    }
 }
 
 /// The files of a directory with this extension, in order.
@@ -69,4 +142,30 @@ pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<Path
     }
     found.sort();
     Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        write_secret(&path, "1", Existing::Replace).unwrap();
+        let first = lock(&path).unwrap();
+        let waiting = std::thread::spawn({
+            let path = path.clone();
+            move || lock(&path).unwrap().metadata().unwrap().ino()
+        });
+        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
+        let inode = format!(":{} ", first.metadata().unwrap().ino());
+        let waits = |line: &str| line.contains("->") && line.contains(&inode);
+        while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {
+            std::thread::yield_now();
+        }
+        write_secret(&path, "2", Existing::Replace).unwrap();
+        drop(first);
+        assert_eq!(waiting.join().unwrap(), fs::metadata(&path).unwrap().ino());
+    }
 }

@@ -8,6 +8,7 @@
 //! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
 #![forbid(unsafe_code)]
 
+mod audit;
 mod check;
 mod demo;
 mod error;
@@ -15,8 +16,12 @@ mod files;
 mod fleet;
 mod name;
 mod output;
+mod policy;
+mod reload;
 mod run;
+mod share_token;
 mod status;
+mod use_token;
 
 use std::process::ExitCode;
 
@@ -46,6 +51,11 @@ enum Command {
     Router(run::RouterArgs),
     Check(check::CheckArgs),
     Status(status::StatusArgs),
+    Reload(reload::ReloadArgs),
+    Audit(audit::AuditArgs),
+    Policy(policy::PolicyArgs),
+    ShareToken(share_token::ShareTokenArgs),
+    Use(use_token::UseArgs),
     Name(name::NameArgs),
     #[command(hide = true)]
     DemoPeer(demo::PeerArgs),
@@ -70,6 +80,11 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Router(args) => run::router(args),
         Command::Check(args) => check::check(&args),
         Command::Status(args) => status::status(&args),
+        Command::Reload(args) => reload::reload(&args),
+        Command::Audit(args) => audit::audit(&args),
+        Command::Policy(args) => return policy::policy(&args),
+        Command::ShareToken(args) => share_token::share_token(&args),
+        Command::Use(args) => use_token::use_token(&args),
         Command::Name(args) => name::name(&args),
         Command::DemoPeer(args) => demo::peer(args),
     }

@@ -65,8 +65,8 @@ pub(crate) fn name_of(
     owner: &NodeName,
     share: &ShareConfig,
 ) -> Result<Name, CliError> {
-    let (Some(secret), Some(owner_id)) = (identity.fleet_secret(), identity.node_id_of(owner.as_str()))
-    else {
+    let newest = identity.naming_secrets().first().map(|n| &n.secret);
+    let (Some(secret), Some(owner_id)) = (newest, identity.node_id_of(owner.as_str())) else {
         return Err(CliError::RouterCannotName { path: identity_path.to_owned() });
     };
     let extra = share.metadata.clone();
@@ -108,7 +108,7 @@ impl NameArgs {
 }
 
 /// A basic string of TOML: what is not printable ASCII or could end it is escaped.
-fn toml_string(text: &str) -> String {
+pub(crate) fn toml_string(text: &str) -> String {
     let mut out = String::from("\"");
     for c in text.chars() {
         match c {

@@ -5,14 +5,15 @@
 
 use std::io::{IsTerminal, Read};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
-use sgc_node::RunOptions;
-use sgc_node::config::{self, ArgsConfig, Config};
+use sgc_node::config::{self, ArgsConfig};
+use sgc_node::{ConfigSource, RunOptions};
 use tokio::signal::unix::{Signal, SignalKind, signal};
-use tokio::sync::oneshot;
+use tokio::sync::{mpsc, oneshot};
 use tracing_subscriber::EnvFilter;
 
 use crate::error::{CliError, EXIT_FAILURE};
@@ -28,7 +29,7 @@ const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 /// Run a node: with a configuration file, or with arguments alone.
 ///
 /// A node with shares or uses joins the local ROS 2 network as ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE say; one
-/// that listens is a router, and may be both. SIGINT and SIGTERM end it cleanly, a second one at once.
+/// that listens is a router, and may be both. SIGINT and SIGTERM end it cleanly, a second one at once; SIGHUP has it read its configuration again.
 #[derive(Debug, Args)]
 pub(crate) struct RunArgs {
     /// The configuration
@@ -99,34 +100,36 @@ pub(crate) struct ReadyLine {
 pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
     start_log(args.process.log.as_deref())?;
     let is_open = args.to.is_empty() && args.share.iter().any(|share| !share.contains('='));
-    let config = match &args.config {
-        Some(path) => config::load(path, &environment)
-            .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?,
-        None => from_args(&ArgsConfig {
-            identity: args.identity,
-            routers: args.router,
-            shares: args.share,
-            to: args.to,
-            uses: args.uses,
-            listen: args.listen,
-        })?,
+    let arguments = ArgsConfig {
+        identity: args.identity,
+        routers: args.router,
+        shares: args.share,
+        to: args.to,
+        uses: args.uses,
+        listen: args.listen,
+    };
+    let what = args.config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());
+    let source: ConfigSource = match args.config {
+        Some(path) => Arc::new(move || config::load(&path, &environment)),
+        None => Arc::new(move || config::load_args(&arguments, &environment)),
     };
     if is_open {
         tracing::info!("--share without --to: every member of the fleet may subscribe, and nobody else");
     }
-    run_node(config, &args.process)
+    run_node(source, what, &args.process)
 }
 
 /// Runs `sgc router`.
 pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
     start_log(args.process.log.as_deref())?;
-    let config = from_args(&ArgsConfig {
+    let arguments = ArgsConfig {
         identity: Some(args.identity),
         routers: args.peer,
         listen: args.listen,
         ..ArgsConfig::default()
-    })?;
-    run_node(config, &args.process)
+    };
+    let source: ConfigSource = Arc::new(move || config::load_args(&arguments, &environment));
+    run_node(source, "command line".to_owned(), &args.process)
 }
 
 /// Looks a variable up for the configuration.
@@ -177,27 +180,36 @@ pub(crate) fn exit_after_grace() {
 
 /// The signals that ask a process to end.
 pub(crate) struct EndSignals {
-    signals: [Signal; 3],
+    interrupt: Signal,
+    terminate: Signal,
+    hang_up: Option<Signal>,
 }
 
 impl EndSignals {
     /// Listens from now on; needs a runtime.
     pub(crate) fn new() -> Result<Self, CliError> {
-        let listen = |kind| {
-            signal(kind).map_err(|source| CliError::System { what: "cannot listen for signals", source })
-        };
-        let kinds = [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()];
-        let [interrupt, terminate, hangup] = kinds.map(listen);
-        Ok(Self { signals: [interrupt?, terminate?, hangup?] })
+        Ok(Self { hang_up: Some(listen(SignalKind::hangup())?), ..Self::without_hang_up()? })
+    }
+
+    /// The same for a process to which a hang-up means something else.
+    fn without_hang_up() -> Result<Self, CliError> {
+        let (interrupt, terminate) = (listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?);
+        Ok(Self { interrupt, terminate, hang_up: None })
     }
 
     /// Waits for the next one.
     pub(crate) async fn next(&mut self) {
-        let [interrupt, terminate, hangup] = &mut self.signals;
+        let Self { interrupt, terminate, hang_up } = self;
+        let hung_up = async {
+            match hang_up {
+                Some(signal) => drop(signal.recv().await),
+                None => std::future::pending().await,
+            }
+        };
         tokio::select! {
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
-            _ = hangup.recv() => {}
+            () = hung_up => {}
         }
     }
 
@@ -210,20 +222,53 @@ impl EndSignals {
     }
 }
 
-fn from_args(args: &ArgsConfig) -> Result<Config, CliError> {
-    config::load_args(args, &environment)
-        .map_err(|errors| CliError::Config { what: "command line".to_owned(), errors })
+/// Hang-ups of a running node: the terminal went, which ends it, or somebody wants its configuration read again.
+struct HangUps {
+    signal: Signal,
+    /// It was started from a terminal.
+    has_terminal: bool,
 }
 
-fn run_node(config: Config, process: &ProcessArgs) -> Result<(), CliError> {
+impl HangUps {
+    fn new() -> Result<Self, CliError> {
+        Ok(Self { signal: listen(SignalKind::hangup())?, has_terminal: terminal_is_there() })
+    }
+
+    /// Passes on each wish to reload; returns when the terminal went.
+    async fn serve(mut self, wishes: mpsc::Sender<()>) {
+        loop {
+            if self.signal.recv().await.is_none() {
+                return std::future::pending().await;
+            }
+            if self.has_terminal && !terminal_is_there() {
+                return;
+            }
+            // One that waits is as good as two.
+            let _ = wishes.try_send(());
+        }
+    }
+}
+
+fn listen(kind: SignalKind) -> Result<Signal, CliError> {
+    signal(kind).map_err(|source| CliError::System { what: "cannot listen for signals", source })
+}
+
+fn terminal_is_there() -> bool {
+    std::fs::File::open("/dev/tty").is_ok()
+}
+
+fn run_node(source: ConfigSource, what: String, process: &ProcessArgs) -> Result<(), CliError> {
+    let config = source().map_err(|errors| CliError::Config { what, errors })?;
     let stdin_closed = process.until_stdin_closes.then(stdin_closed);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(|source| CliError::System { what: "cannot start threads", source })?;
     let result = runtime.block_on(async {
-        let signals = EndSignals::new()?;
-        let mut options = RunOptions::default();
+        let signals = EndSignals::without_hang_up()?;
+        let hang_ups = HangUps::new()?;
+        let (wishes, reload) = mpsc::channel(1);
+        let mut options = RunOptions { source: Some(source), reload: Some(reload), ..RunOptions::default() };
         if process.print_ready {
             let (ready, when_ready) = oneshot::channel::<Vec<_>>();
             options.ready = Some(ready);
@@ -235,14 +280,20 @@ fn run_node(config: Config, process: &ProcessArgs) -> Result<(), CliError> {
                 }
             });
         }
-        sgc_node::run(config, options, shutdown(signals, stdin_closed)).await.map_err(CliError::Node)
+        sgc_node::run(config, options, shutdown(signals, hang_ups.serve(wishes), stdin_closed))
+            .await
+            .map_err(CliError::Node)
     });
     runtime.shutdown_timeout(RUNTIME_GRACE);
     result
 }
 
 /// Ready at the first signal or at the end of standard input; from then on a signal ends the process at once.
-async fn shutdown(mut signals: EndSignals, stdin_closed: Option<oneshot::Receiver<()>>) {
+async fn shutdown(
+    mut signals: EndSignals,
+    terminal_gone: impl Future<Output = ()>,
+    stdin_closed: Option<oneshot::Receiver<()>>,
+) {
     let orphaned = async {
         match stdin_closed {
             Some(closed) => drop(closed.await),
@@ -252,6 +303,7 @@ async fn shutdown(mut signals: EndSignals, stdin_closed: Option<oneshot::Receive
     tokio::select! {
         () = signals.next() => {}
         () = orphaned => {}
+        () = terminal_gone => {}
     }
     signals.end_at_once();
 }

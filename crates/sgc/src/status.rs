@@ -4,13 +4,14 @@
 //! that it understands older and newer nodes.
 
 use std::collections::BTreeMap;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
 use serde::Deserialize;
+use sgc_node::admin::AdminRequest;
 use sgc_node::config::{self, Config};
 
 use crate::error::CliError;
@@ -96,8 +97,8 @@ struct RouterSize {
 
 /// Runs `sgc status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
-    let socket = socket(args)?;
-    let text = ask(&socket)?;
+    let socket = socket(args.config.as_deref(), args.socket.as_deref())?;
+    let text = ask(&socket, &AdminRequest::Status, ANSWER_MAX)?;
     let status = parse(&socket, &text)?;
     if args.json {
         return output::line(text.trim_end());
@@ -110,20 +111,22 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
 
 /// Asks the node at a socket; for programs that show a status in another way.
 pub(crate) fn of_node_at(socket: &Path) -> Result<Status, CliError> {
-    parse(socket, &ask(socket)?)
+    parse(socket, &ask(socket, &AdminRequest::Status, ANSWER_MAX)?)
 }
 
-fn socket(args: &StatusArgs) -> Result<PathBuf, CliError> {
-    if let Some(socket) = &args.socket {
-        return Ok(socket.clone());
+/// The socket of the node that is meant: as named, as the configuration has it, or the only one.
+pub(crate) fn socket(config: Option<&Path>, socket: Option<&Path>) -> Result<PathBuf, CliError> {
+    if let Some(socket) = socket {
+        return Ok(socket.to_owned());
     }
-    let Some(path) = &args.config else { return only_socket() };
+    let Some(path) = config else { return only_socket() };
     let config = config::load(path, &run::environment)
         .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
     Ok(sgc_node::admin_socket_path(&config, &node_name(&config)?))
 }
 
-fn node_name(config: &Config) -> Result<String, CliError> {
+/// The name of the node that has this configuration.
+pub(crate) fn node_name(config: &Config) -> Result<String, CliError> {
     match &config.node_name {
         Some(name) => Ok(name.to_string()),
         None => Ok(sgc_node::load_identity(&config.identity)?.node_name().to_string()),
@@ -142,18 +145,22 @@ fn only_socket() -> Result<PathBuf, CliError> {
     }
 }
 
-fn ask(socket: &Path) -> Result<String, CliError> {
+/// Asks a node; gives its answer as it came.
+pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
     let no_node = |error: std::io::Error| CliError::NoNode {
         path: socket.to_owned(),
         reason: match error.kind() {
             std::io::ErrorKind::NotFound => "there is no such socket".to_owned(),
             std::io::ErrorKind::ConnectionRefused => "its socket is left over".to_owned(),
-            std::io::ErrorKind::WouldBlock => format!("it did not answer within {} s", ANSWER_MAX.as_secs()),
+            std::io::ErrorKind::WouldBlock => format!("it did not answer within {} s", patience.as_secs()),
             _ => error.to_string(),
         },
     };
-    let stream = UnixStream::connect(socket).map_err(no_node)?;
-    stream.set_read_timeout(Some(ANSWER_MAX)).map_err(no_node)?;
+    let mut stream = UnixStream::connect(socket).map_err(no_node)?;
+    stream.set_read_timeout(Some(patience)).map_err(no_node)?;
+    stream.set_write_timeout(Some(patience)).map_err(no_node)?;
+    // A node of an earlier version answers without reading.
+    let _ = stream.write_all(request.to_line().as_bytes());
     let mut text = String::new();
     stream.take(STATUS_BYTES_MAX).read_to_string(&mut text).map_err(no_node)?;
     Ok(text)

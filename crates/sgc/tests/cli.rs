@@ -305,8 +305,8 @@ fn every_mistake_is_told_with_its_line() {
         place.bad(2, &["check", "-c", "node.toml"]),
         "node.toml:3: [node] has no key `router`; did you mean `routers`?\n\
          node.toml:5: `topic` is \"camera/image\"; a topic name starts with '/': \"/camera/image\"\n\
-         node.toml:6: `to` names \"Desk\"; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 \
-         to 64 of a-z, 0-9, '-', '_' and '.'\n\
+         node.toml:6: `to` names \"Desk\"; name nodes (\"desk\"), groups (\"group:operators\"), partners \
+         (\"partner:acme\") or \"*\", names of 1 to 64 of a-z, 0-9, '-', '_' and '.'\n\
          node.toml:7: [[use]] has no `from`; add one, such as from = \"arm-1\"\n\
          sgc: node.toml: 4 mistakes\n"
     );
@@ -348,7 +348,7 @@ fn an_expired_identity_is_found_by_check_and_by_run() {
     let mut rng = <rand_chacha::ChaCha20Rng as rand_core::SeedableRng>::from_seed([5; 32]);
     let then = UnixMillis(now().0 - 100 * 86_400_000);
     let fleet = Fleet::create("lab".parse().unwrap(), then, &mut rng).unwrap();
-    let old = fleet.enroll(&EnrollRequest::new("arm-1".parse().unwrap(), then), &mut rng).unwrap();
+    let old = fleet.issue(&EnrollRequest::new("arm-1".parse().unwrap(), then), &mut rng).unwrap();
     place.write("arm-1.identity", &old.to_text());
     place.set_mode("arm-1.identity", 0o600);
     place.write("node.toml", "[node]\nname = 'arm-1'\nrouters = ['quic://127.0.0.1:1']\n");

@@ -24,7 +24,7 @@ fn message_key(suite: Suite) -> MessageKey {
     static KEYS: OnceLock<[MessageKey; 4]> = OnceLock::new();
     let kinds = [Suite::Group, Suite::Standard, Suite::Paper, Suite::Paper3072];
     let keys = KEYS.get_or_init(|| kinds.map(MessageKey::generate));
-    keys.iter().find(|key| key.fits(suite)).unwrap().clone()
+    keys.iter().find(|key| key.fits(suite)).expect("a key of each kind was made").clone()
 }
 
 /// The grant of an epoch, whose topic key follows from its number.
@@ -49,7 +49,7 @@ fn source(suite: Suite, history_depth: usize) -> Source {
 }
 
 fn source_with(suite: Suite, config: SourceConfig) -> Source {
-    Source::new(config, &grant(suite, 1, &[]), message_key(suite)).unwrap()
+    Source::new(config, &grant(suite, 1, &[]), message_key(suite)).expect("the key is of the suite")
 }
 
 /// A sink that was told of these sources as they are now, in epoch 1.
@@ -63,7 +63,7 @@ fn announced(sources: &[&Source]) -> Vec<SourceAnnounce> {
 
 fn published(source: &mut Source, payload: impl Into<Bytes>, more: bool) -> Vec<Packet> {
     let mut packets = Vec::new();
-    source.publish(&HEAD, payload.into(), more, |p| packets.push(p)).unwrap();
+    source.publish(&HEAD, payload.into(), more, |p| packets.push(p)).expect("tests publish what fits");
     packets
 }
 

@@ -196,3 +196,16 @@ fn a_source_takes_no_key_of_another_suite() {
     let unknown = TopicGrant { suite: 99, ..grant(Suite::Standard, 1, &[]) };
     assert!(Source::new(config(1, 0), &unknown, ed25519).is_none());
 }
+
+#[test]
+fn the_mark_of_synchrony_is_no_message_and_no_message_is_the_mark() {
+    let mut source = source(Suite::Group, 1);
+    let announced = grant(Suite::Group, 1, &[source.announce()]);
+    let mut sink = Sink::new(NAME, SINK, announced, true, SinkLimits::default());
+    let head = MessageHead { kind: MessageKind::Synced, source_timestamp_ns: 0 };
+    source.publish(&head, Bytes::new(), false, |_| {}).unwrap();
+    let history = replayed(&mut source);
+    assert_eq!(sink.handle_packet(&history[0]), Err(SinkDrop::Head));
+    assert_eq!(sink.unsynced().count(), 1);
+    assert_eq!(sink.handle_packet(&history[1]), Ok(Delivery::Synced(source.id())));
+}

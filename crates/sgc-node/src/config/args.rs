@@ -7,7 +7,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use super::draft::{Draft, Located, RosDraft, ShareDraft, UseDraft, Words};
+use super::draft::{AuditDraft, Draft, Located, RosDraft, RotationDraft, ShareDraft, UseDraft, Words};
 use super::error::{ConfigError, Mistake, Origin};
 
 const WORDS: Words = Words {
@@ -92,6 +92,12 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         shares,
         uses,
         admin_socket: None,
+        state: None,
+        trust: Vec::new(),
+        authority: None,
+        rotation: RotationDraft::default(),
+        audit: AuditDraft::default(),
+        partners: Vec::new(),
     };
     (draft, errors)
 }

@@ -54,6 +54,12 @@ pub(super) struct Draft {
     pub(super) shares: Vec<ShareDraft>,
     pub(super) uses: Vec<UseDraft>,
     pub(super) admin_socket: Option<Located<PathBuf>>,
+    pub(super) state: Option<Located<PathBuf>>,
+    pub(super) trust: Vec<Located<String>>,
+    pub(super) authority: Option<Located<PathBuf>>,
+    pub(super) rotation: RotationDraft,
+    pub(super) audit: AuditDraft,
+    pub(super) partners: Vec<PartnerDraft>,
 }
 
 /// How a source of configuration names the settings that an error may ask for.
@@ -82,6 +88,7 @@ pub(super) struct RosDraft {
 pub(super) struct ShareDraft {
     pub(super) topic: Option<Located<String>>,
     pub(super) to: Option<Located<Vec<Located<String>>>>,
+    pub(super) publish: Option<Located<Vec<Located<String>>>>,
     pub(super) type_name: Option<Located<String>>,
     pub(super) priority: Option<Located<String>>,
     pub(super) suite: Option<Located<String>>,
@@ -99,4 +106,28 @@ pub(super) struct UseDraft {
     pub(super) from: Option<Located<String>>,
     pub(super) topic: Option<Located<String>>,
     pub(super) type_name: Option<Located<String>>,
+    pub(super) token: Option<Located<String>>,
+}
+
+/// `[rotation]`.
+#[derive(Debug, Default)]
+pub(super) struct RotationDraft {
+    pub(super) every: Option<Located<String>>,
+    pub(super) messages: Option<Located<i64>>,
+}
+
+/// `[audit]`.
+#[derive(Debug, Default)]
+pub(super) struct AuditDraft {
+    pub(super) file: Option<Located<PathBuf>>,
+    pub(super) max_bytes: Option<Located<i64>>,
+    pub(super) off: Option<Located<bool>>,
+}
+
+/// `[[partner]]`. What is required is `None` only where an error has been recorded already.
+#[derive(Debug, Default)]
+pub(super) struct PartnerDraft {
+    pub(super) name: Option<Located<String>>,
+    pub(super) ca: Option<Located<PathBuf>>,
+    pub(super) node: Option<Located<Vec<Located<String>>>>,
 }

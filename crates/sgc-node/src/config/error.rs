@@ -6,8 +6,12 @@
 use std::fmt;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use sgc_transport::UrlError;
+use sgc_trust::TokenError;
+
+use super::names::duration_text;
 
 /// Everything that is wrong, in the order of the file; never empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -312,10 +316,26 @@ pub enum Mistake {
         /// What was probably meant.
         right: Option<String>,
     },
-    /// Not a node, a group or everyone.
+    /// Not the name of a partner.
     #[error(
-        "`{key}` names {value:?}; name nodes (\"desk\"), groups (\"group:operators\") or \"*\", names of 1 to {max} \
-         of a-z, 0-9, '-', '_' and '.'"
+        "`{key}` is {value:?}; a partner's name is 1 to {max} of a-z, 0-9, '-', '_' and '.', the first a letter or \
+         digit: {:?}",
+        right.as_deref().unwrap_or("acme")
+    )]
+    PartnerName {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The longest name, in bytes.
+        max: usize,
+        /// What was probably meant.
+        right: Option<String>,
+    },
+    /// Not a node, a group, a partner or everyone.
+    #[error(
+        "`{key}` names {value:?}; name nodes (\"desk\"), groups (\"group:operators\"), partners (\"partner:acme\") or \
+         \"*\", names of 1 to {max} of a-z, 0-9, '-', '_' and '.'"
     )]
     Recipient {
         /// The key.
@@ -324,6 +344,54 @@ pub enum Mistake {
         value: String,
         /// The longest name, in bytes.
         max: usize,
+    },
+    /// Not the id of a node.
+    #[error("`{key}` names {value:?}; a node id is 64 hexadecimal digits: `sgc status` there shows it")]
+    NodeId {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// Not a length of time, or out of bounds.
+    #[error(
+        "`{key}` is {value:?}; it takes a number with s, min, h or d, from \"{}\" to \"{}\"",
+        duration_text(*min),
+        duration_text(*max)
+    )]
+    Duration {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The shortest.
+        min: Duration,
+        /// The longest.
+        max: Duration,
+    },
+    /// A number out of bounds.
+    #[error("`{key}` is {value}; it takes {what} from {min} to {max}")]
+    Number {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: i64,
+        /// What is counted, such as `"a number of bytes"`.
+        what: &'static str,
+        /// The least.
+        min: u64,
+        /// The greatest.
+        max: u64,
+    },
+    /// Not a token; the text is not repeated.
+    #[error(
+        "`{key}` is no token: {fault}; ask the topic's owner for a new one, or name the file that holds it"
+    )]
+    Token {
+        /// The key.
+        key: &'static str,
+        /// What is wrong with it.
+        fault: TokenError,
     },
     /// Not a ROS domain id.
     #[error("`{key}` is {value}; a ROS domain id is a number from 0 to {max}")]
@@ -452,6 +520,46 @@ pub enum Mistake {
         /// This node.
         name: String,
     },
+    /// A partner that no table describes.
+    #[error(
+        "`{key}` names partner {partner:?}, which no [[partner]] describes{}: add [[partner]] with name = {partner:?} \
+         and ca = \"FILE\"",
+        nearest.as_ref().map(|nearest| format!(" (did you mean {nearest:?}?)")).unwrap_or_default()
+    )]
+    UnknownPartner {
+        /// The key.
+        key: &'static str,
+        /// The partner.
+        partner: String,
+        /// What it may have been meant to be.
+        nearest: Option<String>,
+    },
+    /// The same partner twice.
+    #[error(
+        "`{key}` is {name:?}, which {other} describes already: make it one [[partner]] and join the nodes"
+    )]
+    PartnerTwice {
+        /// The key.
+        key: &'static str,
+        /// The partner.
+        name: String,
+        /// The first.
+        other: String,
+    },
+    /// A token, and what it says already.
+    #[error("`{key}` stands beside `token`, which says it already: take `{key}` out")]
+    TokenAndMore {
+        /// The key beside it.
+        key: &'static str,
+    },
+    /// The same token twice.
+    #[error("`{key}` is the one that {other} has already: take one of them out")]
+    TokenTwice {
+        /// The key.
+        key: &'static str,
+        /// The first use.
+        other: String,
+    },
     /// Neither dials nor listens.
     #[error(
         "neither {dial} nor {listen} is given, so this node connects to nobody: name a router \
@@ -476,6 +584,32 @@ pub enum Mistake {
         other_value: String,
         /// What to do.
         right: &'static str,
+    },
+
+    // Other files.
+    /// A file that cannot be used as what it is named for.
+    #[error("`{key}` is {}: {reason}; it must be {expected}", path.display())]
+    File {
+        /// The key that names it.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+        /// What the key takes.
+        expected: &'static str,
+    },
+    /// Others than the owner may read a file of secrets.
+    #[error("`{key}` is {}: its mode {mode:04o} lets others at {what}; `chmod 600 {}`", path.display(), path.display())]
+    FileExposed {
+        /// The key that names it.
+        key: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+        /// The secret in it.
+        what: &'static str,
     },
 
     // The identity.

@@ -10,7 +10,9 @@ use std::sync::Arc;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::draft::{Draft, Located, RosDraft, ShareDraft, UseDraft, Words};
+use super::draft::{
+    AuditDraft, Draft, Located, PartnerDraft, RosDraft, RotationDraft, ShareDraft, UseDraft, Words,
+};
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
 
@@ -79,6 +81,9 @@ impl FileReader<'_> {
         let router = self.single(&top, "router", Table::Router);
         let admin = self.single(&top, "admin", Table::Admin);
         let ros = self.single(&top, "ros", Table::Ros);
+        let authority = self.single(&top, "authority", Table::Authority);
+        let rotation = self.single(&top, "rotation", Table::Rotation);
+        let audit = self.single(&top, "audit", Table::Audit);
         let mut draft = Draft {
             origin: Origin::File { file: self.file.clone(), line: None },
             words: WORDS,
@@ -105,6 +110,31 @@ impl FileReader<'_> {
             admin_socket: self
                 .string(admin.as_ref(), "socket", "a string, such as \"/run/sgc/arm-1.sock\"")
                 .map(|socket| socket.map(PathBuf::from)),
+            state: self
+                .string(node.as_ref(), "state", "a string, such as \"/var/lib/sgc/arm-1\"")
+                .map(|state| state.map(PathBuf::from)),
+            trust: self.flat_strings(
+                node.as_ref(),
+                "trust",
+                "an array of strings, such as [\"acme-ca.pem\"]",
+            ),
+            authority: self.authority(authority.as_ref()),
+            rotation: RotationDraft {
+                every: self.string(rotation.as_ref(), "every", "a string, such as \"1h\""),
+                messages: self.integer(rotation.as_ref(), "messages", "a number, such as 16777216"),
+            },
+            audit: AuditDraft {
+                file: self
+                    .string(audit.as_ref(), "file", "a string, such as \"/var/log/sgc/arm-1.audit\"")
+                    .map(|file| file.map(PathBuf::from)),
+                max_bytes: self.integer(audit.as_ref(), "max_bytes", "a number, such as 16777216"),
+                off: self.boolean(audit.as_ref(), "off", "true or false"),
+            },
+            partners: self
+                .repeated(&top, "partner", Table::Partner)
+                .iter()
+                .map(|partner| self.partner(partner))
+                .collect(),
         };
         draft.attempted = std::mem::take(&mut self.attempted);
         draft
@@ -148,6 +178,11 @@ impl FileReader<'_> {
         ShareDraft {
             topic: self.string(share, "topic", "a string, such as \"/camera/image\""),
             to: self.strings(share, "to", "an array of strings, such as [\"desk\", \"group:operators\"]"),
+            publish: self.strings(
+                share,
+                "publish",
+                "an array of strings, such as [\"desk\", \"group:operators\"]",
+            ),
             type_name: self.string(share, "type", "a string, such as \"sensor_msgs/msg/Image\""),
             priority: self.string(share, "priority", "a string, such as \"realtime\""),
             suite: self.string(share, "suite", "a string, such as \"group\""),
@@ -161,13 +196,46 @@ impl FileReader<'_> {
     }
 
     fn one_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
-        self.check_required(one, "from", "\"arm-1\"");
-        self.check_required(one, "topic", "\"/camera/image\"");
+        // A token says whose topic it is, and which.
+        if !one.entries.contains_key("token") && !one.meant.contains(&"token") {
+            self.check_required(one, "from", "\"arm-1\"");
+            self.check_required(one, "topic", "\"/camera/image\"");
+        }
         let one = Some(one);
         UseDraft {
+            token: self.string(one, "token", "a string, such as \"arm-1-pose.token\""),
             from: self.string(one, "from", "a string, such as \"arm-1\""),
             topic: self.string(one, "topic", "a string, such as \"/camera/image\""),
             type_name: self.string(one, "type", "a string, such as \"sensor_msgs/msg/Image\""),
+        }
+    }
+
+    fn authority(&mut self, authority: Option<&Section<'_, '_>>) -> Option<Located<PathBuf>> {
+        self.check_required(authority?, "fleet", "\"lab.fleet\"");
+        let fleet = self.string(authority, "fleet", "a string, such as \"lab.fleet\"");
+        fleet.map(|fleet| fleet.map(PathBuf::from))
+    }
+
+    fn partner(&mut self, partner: &Section<'_, '_>) -> PartnerDraft {
+        const NODE: &str = "the node id of one node, or an array of such strings";
+        self.check_required(partner, "name", "\"acme\"");
+        self.check_required(partner, "ca", "\"acme-ca.pem\"");
+        let is_one = partner.entries.get("node").is_some_and(|node| node.get_ref().is_str());
+        let partner = Some(partner);
+        let node = match is_one {
+            true => self.string(partner, "node", NODE).map(|one| Located {
+                key: one.key,
+                origin: one.origin.clone(),
+                value: vec![one],
+            }),
+            false => self.strings(partner, "node", NODE),
+        };
+        PartnerDraft {
+            name: self.string(partner, "name", "a string, such as \"acme\""),
+            ca: self
+                .string(partner, "ca", "a string, such as \"acme-ca.pem\"")
+                .map(|ca| ca.map(PathBuf::from)),
+            node,
         }
     }
 
@@ -197,7 +265,7 @@ impl FileReader<'_> {
         key: &'static str,
         table: Table,
     ) -> Vec<Section<'s, 't>> {
-        const EXPECTED: &str = "tables: [[share]] or [[use]], and the keys below";
+        const EXPECTED: &str = "tables: [[share]], [[use]] or [[partner]], and the keys below";
         let Some(value) = top.entries.get(key) else { return Vec::new() };
         let mut sections = Vec::new();
         match value.get_ref() {

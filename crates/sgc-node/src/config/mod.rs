@@ -12,6 +12,7 @@ mod args;
 mod draft;
 mod error;
 mod file;
+mod files;
 mod names;
 mod resolve;
 mod ros_env;
@@ -19,18 +20,21 @@ mod schema;
 
 use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use sgc_transport::{LinkUrl, ListenAddr};
-use sgc_trust::{NodeName, Suite};
-use sgc_wire::Class;
+use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
+use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
-pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX};
-pub use resolve::{LISTEN_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, USES_MAX};
+pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration};
+pub use resolve::{
+    LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES,
+    TRUST_MAX, USES_MAX, suite_default,
+};
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
 pub use schema::Table;
 
@@ -41,7 +45,7 @@ pub const CONFIG_BYTES_MAX: u64 = 4 * 1024 * 1024;
 pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
 
 /// A node's configuration, valid in itself.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Config {
     /// The name that the identity must have, if the user said one.
     pub node_name: Option<NodeName>,
@@ -57,6 +61,20 @@ pub struct Config {
     pub shares: Vec<ShareConfig>,
     /// What this node wants, each topic of an owner once, none of them shared.
     pub uses: Vec<UseConfig>,
+    /// What partners of other fleets handed to this node.
+    pub tokens: Vec<TokenSource>,
+    /// Other fleets, or some of their nodes, that shares may name.
+    pub partners: Vec<PartnerConfig>,
+    /// Files with more CAs whose nodes may link to this one.
+    pub trust: Vec<PathBuf>,
+    /// The fleet file, if this node is its fleet's authority.
+    pub authority: Option<PathBuf>,
+    /// Where this node keeps what it has to remember, if not in its usual place.
+    pub state: Option<PathBuf>,
+    /// When topics get new keys.
+    pub rotation: RotationConfig,
+    /// Who was granted and refused what, as it is kept.
+    pub audit: AuditConfig,
     /// Where the status socket goes, if not in its usual place.
     pub admin_socket: Option<PathBuf>,
 }
@@ -97,6 +115,8 @@ pub struct ShareConfig {
     pub type_name: Option<String>,
     /// Who may subscribe; never empty, no one twice.
     pub to: Vec<Recipient>,
+    /// Who may publish besides this node; no one twice.
+    pub publish: Vec<Recipient>,
     /// What overtakes it.
     pub priority: Class,
     /// How its payloads are sealed.
@@ -134,6 +154,77 @@ pub struct UseConfig {
     pub type_name: Option<String>,
 }
 
+/// Where a token is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TokenSource {
+    /// In a file of its own, for its owner alone.
+    File(PathBuf),
+    /// In the configuration.
+    Text(Box<ShareToken>),
+}
+
+/// Another fleet.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PartnerConfig {
+    /// What shares call it.
+    pub name: FleetName,
+    /// The file with its CA certificate, PEM.
+    pub ca: PathBuf,
+    /// The nodes that are meant; all of that CA if there are none.
+    pub nodes: Vec<NodeId>,
+}
+
+/// When a topic gets a new key besides when somebody loses the right to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RotationConfig {
+    /// After this time; [`RotationConfig::EVERY_MIN`] to [`RotationConfig::EVERY_MAX`].
+    pub every: Duration,
+    /// After this many messages of one source; [`RotationConfig::MESSAGES_MIN`] to
+    /// [`RotationConfig::MESSAGES_MAX`].
+    pub messages: u64,
+}
+
+impl RotationConfig {
+    /// Each rotation costs a grant for each sink.
+    pub const EVERY_MIN: Duration = Duration::from_secs(10);
+    /// A key that is older is none that rotates.
+    pub const EVERY_MAX: Duration = Duration::from_secs(30 * 86_400);
+    /// Each rotation costs a grant for each sink.
+    pub const MESSAGES_MIN: u64 = 1024;
+    /// Within what AES-GCM may seal under one key (NIST SP 800-38D, 8.3).
+    pub const MESSAGES_MAX: u64 = 1 << 32;
+}
+
+impl Default for RotationConfig {
+    fn default() -> Self {
+        Self { every: Duration::from_secs(3600), messages: 1 << 24 }
+    }
+}
+
+/// The audit log.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AuditConfig {
+    /// The file; none is `audit.jsonl` in the state directory.
+    pub file: Option<PathBuf>,
+    /// How large it becomes before it is put aside, bytes; one that was put aside is kept.
+    pub max_bytes: u64,
+    /// Nothing is written.
+    pub off: bool,
+}
+
+impl AuditConfig {
+    /// Some hundred records.
+    pub const MAX_BYTES_MIN: u64 = 64 << 10;
+    /// Twice as much is on the disk.
+    pub const MAX_BYTES_MAX: u64 = 1 << 40;
+}
+
+impl Default for AuditConfig {
+    fn default() -> Self {
+        Self { file: None, max_bytes: 16 << 20, off: false }
+    }
+}
+
 impl DiscoveryRange {
     /// Whether static peers count for anything.
     fn asks_peers(self) -> bool {
@@ -154,6 +245,11 @@ impl Config {
     }
 }
 
+/// Checks a message type that stands outside of a configuration, and gives it as `pkg/msg/Name`.
+pub fn message_type(value: &str) -> Result<String, Mistake> {
+    names::message_type("--type", value)
+}
+
 /// Reads and resolves a file, and checks that the identity file is there, readable, and its owner's alone.
 ///
 /// Relative paths in it are taken from its directory.
@@ -164,14 +260,13 @@ pub fn load(path: &Path, env: Environment<'_>) -> Result<Config, ConfigErrors> {
         ConfigErrors::from(ConfigError::new(origin, mistake))
     })?;
     let base_dir = path.parent().unwrap_or(Path::new(""));
-    resolve_text(&text, &file_name, base_dir, env, Some(&check_identity_file))
+    resolve_text(&text, &file_name, base_dir, env, Some(&files::FILES))
 }
 
 /// Resolves the command line as [`Config::from_args`] does, and checks the identity file as [`load`] does.
 pub fn load_args(args: &ArgsConfig, env: Environment<'_>) -> Result<Config, ConfigErrors> {
     let (draft, errors) = args::read(args);
-    resolve::resolve(&draft, errors, Path::new(""), env, Some(&check_identity_file))
-        .map_err(ConfigErrors::new)
+    resolve::resolve(&draft, errors, Path::new(""), env, Some(&files::FILES)).map_err(ConfigErrors::new)
 }
 
 /// Resolves the text of a file that errors call `file_name`, without looking at any file.
@@ -189,11 +284,11 @@ fn resolve_text(
     file_name: &str,
     base_dir: &Path,
     env: Environment<'_>,
-    identity_check: Option<resolve::IdentityCheck<'_>>,
+    checks: Option<&resolve::FileChecks>,
 ) -> Result<Config, ConfigErrors> {
     match file::read(text, file_name) {
         (Some(draft), errors) => {
-            resolve::resolve(&draft, errors, base_dir, env, identity_check).map_err(ConfigErrors::new)
+            resolve::resolve(&draft, errors, base_dir, env, checks).map_err(ConfigErrors::new)
         }
         (None, errors) => Err(ConfigErrors::new(errors)),
     }
@@ -213,27 +308,4 @@ fn read_limited(path: &Path) -> Result<String, Mistake> {
         let line = 1 + valid.iter().filter(|byte| **byte == b'\n').count();
         Mistake::Unreadable { reason: format!("line {line} is not UTF-8 text") }
     })
-}
-
-fn check_identity_file(file: &resolve::IdentityFile<'_>) -> Result<(), Mistake> {
-    const PERMISSION_BITS: u32 = 0o7777;
-    const OTHERS_BITS: u32 = 0o077;
-    let (path, key) = (file.path, file.key);
-    let unreadable = |reason: String| Mistake::IdentityUnreadable { key, path: path.to_owned(), reason };
-    let metadata = fs::metadata(path).map_err(|error| {
-        if error.kind() == io::ErrorKind::NotFound {
-            let node = file.node_name.map_or("NODE".to_owned(), ToString::to_string);
-            Mistake::IdentityMissing { key, implied: file.implied, path: path.to_owned(), node }
-        } else {
-            unreadable(error.to_string())
-        }
-    })?;
-    if !metadata.is_file() {
-        return Err(unreadable("not a file".to_owned()));
-    }
-    let mode = metadata.permissions().mode() & PERMISSION_BITS;
-    if mode & OTHERS_BITS != 0 {
-        return Err(Mistake::IdentityExposed { key, path: path.to_owned(), mode });
-    }
-    fs::File::open(path).map(drop).map_err(|error| unreadable(error.to_string()))
 }

@@ -4,9 +4,11 @@
 //! has to do with other settings is the business of `resolve`.
 
 use std::net::IpAddr;
+use std::time::Duration;
 
 use sgc_transport::{LinkUrl, ListenAddr, UrlError};
-use sgc_trust::{GroupName, LABEL_BYTES_MAX, NodeName};
+use sgc_trust::{FleetName, GroupName, LABEL_BYTES_MAX, NodeName};
+use sgc_wire::NodeId;
 
 use super::error::{Mistake, TopicRule};
 
@@ -19,7 +21,7 @@ pub const PEER_BYTES_MAX: usize = 255;
 
 const HOST_BYTES_MAX: usize = 253;
 
-/// Who may subscribe to a share.
+/// Who may subscribe to a share, or publish on it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Recipient {
     /// `"*"`: every member of the fleet.
@@ -28,6 +30,8 @@ pub enum Recipient {
     Group(GroupName),
     /// `"desk"`: one node.
     Node(NodeName),
+    /// `"partner:acme"`: the nodes that the `[[partner]]` of that name stands for.
+    Partner(FleetName),
 }
 
 impl std::fmt::Display for Recipient {
@@ -36,6 +40,7 @@ impl std::fmt::Display for Recipient {
             Self::Everyone => f.write_str("*"),
             Self::Group(group) => write!(f, "group:{group}"),
             Self::Node(node) => write!(f, "{node}"),
+            Self::Partner(partner) => write!(f, "partner:{partner}"),
         }
     }
 }
@@ -147,12 +152,57 @@ pub(super) fn node(key: &'static str, value: &str) -> Result<NodeName, Mistake> 
     })
 }
 
-/// Checks one entry of `to`.
+/// Checks the name of a partner.
+pub(super) fn partner(key: &'static str, value: &str) -> Result<FleetName, Mistake> {
+    value.parse().map_err(|_| {
+        let right = repaired_label(value);
+        Mistake::PartnerName { key, value: value.to_owned(), max: LABEL_BYTES_MAX, right }
+    })
+}
+
+/// Checks a node id.
+pub(super) fn node_id(key: &'static str, value: &str) -> Result<NodeId, Mistake> {
+    value.parse().map_err(|_| Mistake::NodeId { key, value: value.to_owned() })
+}
+
+/// Checks a length of time, `NUMBER` and `s`, `min`, `h` or `d`, within bounds.
+pub(super) fn duration(
+    key: &'static str,
+    value: &str,
+    (min, max): (Duration, Duration),
+) -> Result<Duration, Mistake> {
+    let duration = parse_duration(value).filter(|d| (min..=max).contains(d));
+    duration.ok_or_else(|| Mistake::Duration { key, value: value.to_owned(), min, max })
+}
+
+/// A length of time as the configuration has it: `90s`, `15min`, `1h`, `30d`.
+pub fn parse_duration(text: &str) -> Option<Duration> {
+    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
+    let unit = match unit.trim_start() {
+        "s" => 1,
+        "m" | "min" => 60,
+        "h" => 3600,
+        "d" => 86_400,
+        _ => return None,
+    };
+    number.parse::<u64>().ok()?.checked_mul(unit).map(Duration::from_secs)
+}
+
+/// A length of time in the largest unit that divides it.
+pub(super) fn duration_text(duration: Duration) -> String {
+    let seconds = duration.as_secs();
+    let units = [(86_400, "d"), (3600, "h"), (60, "min")];
+    let unit = units.into_iter().find(|(unit, _)| seconds.is_multiple_of(*unit) && seconds > 0);
+    unit.map_or_else(|| format!("{seconds}s"), |(unit, text)| format!("{}{text}", seconds / unit))
+}
+
+/// Checks one entry of `to` or `publish`.
 pub(super) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mistake> {
     let recipient = match value.split_once(':') {
         None if value == "*" => Some(Recipient::Everyone),
         None => value.parse().ok().map(Recipient::Node),
         Some(("group", group)) => group.parse().ok().map(Recipient::Group),
+        Some(("partner", partner)) => partner.parse().ok().map(Recipient::Partner),
         Some(_) => None,
     };
     recipient.ok_or_else(|| Mistake::Recipient { key, value: value.to_owned(), max: LABEL_BYTES_MAX })

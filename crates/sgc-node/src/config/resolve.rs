@@ -6,14 +6,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use sgc_trust::{NodeName, Suite};
+use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
 use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX};
 
-use super::draft::{Draft, Located, RosDraft, ShareDraft, UseDraft, Words};
+use super::draft::{Draft, Located, PartnerDraft, RosDraft, ShareDraft, UseDraft, Words};
 use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
 use super::schema::nearest;
-use super::{Config, Environment, ShareConfig, ShareMetadata, UseConfig, ros_env};
+use super::{
+    AuditConfig, Config, Environment, PartnerConfig, RotationConfig, ShareConfig, ShareMetadata, TokenSource,
+    UseConfig, ros_env,
+};
 
 /// Shares of one node.
 pub const SHARES_MAX: usize = 1024;
@@ -25,13 +28,26 @@ pub const RECIPIENTS_MAX: usize = 1024;
 pub const ROUTERS_MAX: usize = 16;
 /// Addresses that one node listens at.
 pub const LISTEN_MAX: usize = 16;
+/// Partners of one node.
+pub const PARTNERS_MAX: usize = 32;
+/// Files with more CAs that one node trusts.
+pub const TRUST_MAX: usize = 16;
 /// Path of a Unix socket: `sun_path` less its terminator.
 pub const SOCKET_PATH_BYTES_MAX: usize = 107;
 
-const SUITE_DEFAULT: Suite = Suite::Group;
 const PRIORITIES: [&str; 3] = ["realtime", "default", "bulk"];
-const SUITES: [&str; 1] = ["group"];
-const SUITES_PLANNED: [&str; 2] = ["standard", "paper"];
+/// How suites are called, in the order of their ids from 1.
+pub const SUITES: [&str; 8] = [
+    "group",
+    "group-chacha",
+    "standard",
+    "standard-chacha",
+    "paper",
+    "paper-3072",
+    "paper-chacha",
+    "paper-3072-chacha",
+];
+const SUITE_DEFAULT: &str = "standard";
 
 /// An identity file and what an error about it needs to know.
 pub(super) struct IdentityFile<'i> {
@@ -42,8 +58,13 @@ pub(super) struct IdentityFile<'i> {
     pub(super) node_name: Option<&'i NodeName>,
 }
 
-/// A check of the identity file; an argument because it looks at the file system.
-pub(super) type IdentityCheck<'c> = &'c dyn Fn(&IdentityFile<'_>) -> Result<(), Mistake>;
+/// Checks of the files that a configuration names; an argument because they look at the file system.
+pub(super) struct FileChecks {
+    pub(super) identity: fn(&IdentityFile<'_>) -> Result<(), Mistake>,
+    pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) token: fn(&'static str, &Path) -> Result<ShareToken, Mistake>,
+    pub(super) fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
+}
 
 /// Judges a draft whose reader found `errors` already. Relative paths are taken from `base_dir`.
 pub(super) fn resolve(
@@ -51,11 +72,11 @@ pub(super) fn resolve(
     errors: Vec<ConfigError>,
     base_dir: &Path,
     env: Environment<'_>,
-    identity_check: Option<IdentityCheck<'_>>,
+    checks: Option<&FileChecks>,
 ) -> Result<Config, Vec<ConfigError>> {
-    let mut resolver = Resolver { words: draft.words, errors };
+    let mut resolver = Resolver { words: draft.words, errors, base_dir, checks };
     let node_name = draft.name.as_ref().and_then(|name| resolver.keep(name, names::node));
-    let identity = resolver.identity(draft, node_name.as_ref(), base_dir, identity_check);
+    let identity = resolver.identity(draft, node_name.as_ref());
     let routers = resolver.addresses(&draft.routers, names::router, ROUTERS_MAX);
     let listen = resolver.addresses(&draft.listen, names::listen, LISTEN_MAX);
     let attempted = |key| draft.attempted.contains(key);
@@ -69,23 +90,46 @@ pub(super) fn resolve(
         let nothing = RosDraft::default();
         ros_env::resolve(draft.ros.as_ref().unwrap_or(&nothing), env, &mut resolver.errors)
     });
+    let partners = resolver.partners(draft);
     let shares = resolver.shares(draft, node_name.as_ref());
     let uses = resolver.uses(draft, node_name.as_ref());
-    let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket, base_dir));
+    let tokens = resolver.tokens(draft);
+    let trust = resolver.trust(&draft.trust);
+    let authority = draft.authority.as_ref().and_then(|fleet| resolver.fleet(fleet));
+    let state = draft.state.as_ref().and_then(|state| resolver.path(state, "\"/var/lib/sgc/arm-1\""));
+    let rotation = resolver.rotation(draft);
+    let audit = resolver.audit(draft);
+    let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket));
     match identity {
-        Some(identity) if resolver.errors.is_empty() => {
-            Ok(Config { node_name, identity, routers, listen, ros, shares, uses, admin_socket })
-        }
+        Some(identity) if resolver.errors.is_empty() => Ok(Config {
+            node_name,
+            identity,
+            routers,
+            listen,
+            ros,
+            shares,
+            uses,
+            tokens,
+            partners,
+            trust,
+            authority,
+            state,
+            rotation,
+            audit,
+            admin_socket,
+        }),
         _ => Err(resolver.errors),
     }
 }
 
-struct Resolver {
+struct Resolver<'r> {
     words: Words,
     errors: Vec<ConfigError>,
+    base_dir: &'r Path,
+    checks: Option<&'r FileChecks>,
 }
 
-impl Resolver {
+impl Resolver<'_> {
     fn record(&mut self, origin: &Origin, mistake: Mistake) {
         self.errors.push(ConfigError::new(origin.clone(), mistake));
     }
@@ -105,13 +149,8 @@ impl Resolver {
         }
     }
 
-    fn identity(
-        &mut self,
-        draft: &Draft,
-        node_name: Option<&NodeName>,
-        base_dir: &Path,
-        check: Option<IdentityCheck<'_>>,
-    ) -> Option<PathBuf> {
+    fn identity(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Option<PathBuf> {
+        let base_dir = self.base_dir;
         const EXAMPLE: &str = "\"arm-1.identity\"";
         let (path, origin, implied) = match (&draft.identity, &draft.name) {
             (Some(identity), _) if identity.value.as_os_str().is_empty() => {
@@ -130,7 +169,7 @@ impl Resolver {
             }
         };
         let file = IdentityFile { path: &path, key: self.words.identity, implied, node_name };
-        if let Some(Err(mistake)) = check.map(|check| check(&file)) {
+        if let Some(Err(mistake)) = self.checks.map(|checks| (checks.identity)(&file)) {
             self.record(origin, mistake);
         }
         Some(path)
@@ -177,7 +216,7 @@ impl Resolver {
                     first.insert(&written.value, written);
                 }
             }
-            valid.extend(self.share(share, topic, node_name));
+            valid.extend(self.share(share, topic, node_name, &draft.partners));
         }
         valid
     }
@@ -187,8 +226,15 @@ impl Resolver {
         share: &ShareDraft,
         topic: Option<String>,
         node_name: Option<&NodeName>,
+        partners: &[PartnerDraft],
     ) -> Option<ShareConfig> {
-        let to = share.to.as_ref().map(|to| self.recipients(to, node_name));
+        let to = share.to.as_ref().map(|to| {
+            if to.value.is_empty() {
+                self.record(&to.origin, Mistake::NobodyMay { key: to.key });
+            }
+            self.recipients(to, node_name, partners)
+        });
+        let publish = share.publish.as_ref().map(|publish| self.recipients(publish, node_name, partners));
         let type_name = share.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
         let priority = share.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
         let suite = share.suite.as_ref().and_then(|name| self.keep(name, suite));
@@ -203,9 +249,10 @@ impl Resolver {
         Some(ShareConfig {
             topic: topic?,
             to: to?,
+            publish: publish.unwrap_or_default(),
             type_name,
             priority: priority.unwrap_or_default(),
-            suite: suite.unwrap_or(SUITE_DEFAULT),
+            suite: suite.unwrap_or_else(suite_default),
             metadata,
         })
     }
@@ -214,10 +261,8 @@ impl Resolver {
         &mut self,
         to: &Located<Vec<Located<String>>>,
         node_name: Option<&NodeName>,
+        partners: &[PartnerDraft],
     ) -> Vec<Recipient> {
-        if to.value.is_empty() {
-            self.record(&to.origin, Mistake::NobodyMay { key: to.key });
-        }
         if to.value.len() > RECIPIENTS_MAX {
             let (key, count) = (to.key, to.value.len());
             self.record(&to.origin, Mistake::TooManyEntries { key, count, max: RECIPIENTS_MAX });
@@ -226,13 +271,17 @@ impl Resolver {
         let mut valid = Vec::new();
         for one in to.value.iter().take(RECIPIENTS_MAX) {
             let Some(recipient) = self.keep(one, names::recipient) else { continue };
+            if let Recipient::Partner(partner) = &recipient {
+                self.check_partner(one, partner, partners);
+            }
             if seen.insert(recipient.clone()) {
                 valid.push(recipient);
             } else {
                 self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
             }
         }
-        let other = valid.iter().find(|recipient| **recipient != Recipient::Everyone);
+        // Everyone is every member of this fleet: partners stand beside it.
+        let other = valid.iter().find(|r| !matches!(r, Recipient::Everyone | Recipient::Partner(_)));
         if let Some(other) = other.filter(|_| seen.contains(&Recipient::Everyone)) {
             let other = other.to_string();
             self.record(&to.origin, Mistake::EveryoneAndMore { key: to.key, other });
@@ -243,6 +292,167 @@ impl Resolver {
             self.record(&to.origin, Mistake::OnlyItself { key: to.key, name: name.to_string() });
         }
         valid
+    }
+
+    fn check_partner(&mut self, one: &Located<String>, partner: &FleetName, known: &[PartnerDraft]) {
+        let names: Vec<&str> =
+            known.iter().filter_map(|p| p.name.as_ref()).map(|name| name.value.as_str()).collect();
+        // A partner without a name has its own error, and may be this one.
+        if !names.contains(&partner.as_str()) && names.len() == known.len() {
+            let nearest = nearest(partner.as_str(), &names).map(str::to_owned);
+            let partner = partner.to_string();
+            self.record(&one.origin, Mistake::UnknownPartner { key: one.key, partner, nearest });
+        }
+    }
+
+    fn partners(&mut self, draft: &Draft) -> Vec<PartnerConfig> {
+        self.check_count(&draft.origin, "[[partner]]", draft.partners.len(), PARTNERS_MAX);
+        let mut first: BTreeMap<FleetName, &Located<String>> = BTreeMap::new();
+        let mut valid = Vec::new();
+        for partner in draft.partners.iter().take(PARTNERS_MAX) {
+            let name = partner.name.as_ref().and_then(|name| self.keep(name, names::partner));
+            if let (Some(name), Some(written)) = (&name, &partner.name) {
+                if let Some(other) = first.get(name) {
+                    let (key, name, other) = (written.key, name.to_string(), other.reference());
+                    self.record(&written.origin, Mistake::PartnerTwice { key, name, other });
+                } else {
+                    first.insert(name.clone(), written);
+                }
+            }
+            let ca = partner.ca.as_ref().and_then(|ca| self.ca_file(ca));
+            let nodes = match &partner.node {
+                Some(written) if written.value.is_empty() => {
+                    let example = "node = \"64 hexadecimal digits\", or leave it out to mean all of that CA";
+                    self.record(&written.origin, Mistake::Empty { key: written.key, example });
+                    Vec::new()
+                }
+                Some(written) => self.addresses(&written.value, names::node_id, RECIPIENTS_MAX),
+                None => Vec::new(),
+            };
+            valid.extend(name.zip(ca).map(|(name, ca)| PartnerConfig { name, ca, nodes }));
+        }
+        valid
+    }
+
+    fn trust(&mut self, written: &[Located<String>]) -> Vec<PathBuf> {
+        if let Some(first) = written.get(TRUST_MAX) {
+            let (key, count) = (first.key, written.len());
+            self.record(&first.origin, Mistake::TooManyEntries { key, count, max: TRUST_MAX });
+        }
+        let mut valid: Vec<PathBuf> = Vec::new();
+        for one in written.iter().take(TRUST_MAX) {
+            let Some(path) = self.ca_file(&one.clone().map(PathBuf::from)) else { continue };
+            if valid.contains(&path) {
+                self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
+            } else {
+                valid.push(path);
+            }
+        }
+        valid
+    }
+
+    fn ca_file(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+        let path = self.path(written, "\"acme-ca.pem\"")?;
+        if let Some(Err(mistake)) = self.checks.map(|checks| (checks.ca)(written.key, &path)) {
+            self.record(&written.origin, mistake);
+        }
+        Some(path)
+    }
+
+    fn fleet(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+        let path = self.path(written, "\"lab.fleet\"")?;
+        if let Some(Err(mistake)) = self.checks.map(|checks| (checks.fleet)(written.key, &path)) {
+            self.record(&written.origin, mistake);
+        }
+        Some(path)
+    }
+
+    fn path(&mut self, written: &Located<PathBuf>, example: &'static str) -> Option<PathBuf> {
+        if written.value.as_os_str().is_empty() {
+            self.record(&written.origin, Mistake::Empty { key: written.key, example });
+            return None;
+        }
+        Some(self.base_dir.join(&written.value))
+    }
+
+    fn rotation(&mut self, draft: &Draft) -> RotationConfig {
+        let bounds = (RotationConfig::EVERY_MIN, RotationConfig::EVERY_MAX);
+        let written = &draft.rotation;
+        let every = written
+            .every
+            .as_ref()
+            .and_then(|every| self.keep(every, |key, value| names::duration(key, value, bounds)));
+        let bounds = (RotationConfig::MESSAGES_MIN, RotationConfig::MESSAGES_MAX);
+        let messages = written.messages.as_ref().and_then(|n| self.number(n, "a number of messages", bounds));
+        let default = RotationConfig::default();
+        RotationConfig {
+            every: every.unwrap_or(default.every),
+            messages: messages.unwrap_or(default.messages),
+        }
+    }
+
+    fn audit(&mut self, draft: &Draft) -> AuditConfig {
+        let written = &draft.audit;
+        let file = written.file.as_ref().and_then(|f| self.path(f, "\"/var/log/sgc/arm-1.audit\""));
+        let bounds = (AuditConfig::MAX_BYTES_MIN, AuditConfig::MAX_BYTES_MAX);
+        let max_bytes = written.max_bytes.as_ref().and_then(|n| self.number(n, "a number of bytes", bounds));
+        let off = written.off.as_ref().is_some_and(|off| off.value);
+        let other = [written.file.as_ref().map(|f| (f.key, &f.origin))]
+            .into_iter()
+            .chain([written.max_bytes.as_ref().map(|n| (n.key, &n.origin))])
+            .flatten()
+            .next();
+        if let Some((other, origin)) = other.filter(|_| off) {
+            let right = "take one of them out";
+            let other_value = "given".to_owned();
+            self.record(
+                origin,
+                Mistake::Contradiction { key: "off", value: "true", other, other_value, right },
+            );
+        }
+        AuditConfig { file, max_bytes: max_bytes.unwrap_or(AuditConfig::default().max_bytes), off }
+    }
+
+    fn number(&mut self, written: &Located<i64>, what: &'static str, (min, max): (u64, u64)) -> Option<u64> {
+        let value = written.value;
+        let valid = u64::try_from(value).ok().filter(|n| (min..=max).contains(n));
+        if valid.is_none() {
+            let key = written.key;
+            self.record(&written.origin, Mistake::Number { key, value, what, min, max });
+        }
+        valid
+    }
+
+    fn tokens(&mut self, draft: &Draft) -> Vec<TokenSource> {
+        let mut first: Vec<(TokenSource, &Located<String>)> = Vec::new();
+        for one in &draft.uses {
+            let Some(written) = &one.token else { continue };
+            for beside in [&one.from, &one.topic, &one.type_name].into_iter().flatten() {
+                self.record(&beside.origin, Mistake::TokenAndMore { key: beside.key });
+            }
+            let Some(source) = self.token(written) else { continue };
+            if let Some((_, other)) = first.iter().find(|(known, _)| *known == source) {
+                let other = other.reference();
+                self.record(&written.origin, Mistake::TokenTwice { key: written.key, other });
+            } else {
+                first.push((source, written));
+            }
+        }
+        first.into_iter().map(|(source, _)| source).collect()
+    }
+
+    fn token(&mut self, written: &Located<String>) -> Option<TokenSource> {
+        if written.value.trim_start().starts_with(TOKEN_PREFIX) {
+            let token = self.keep(written, |key, text| {
+                ShareToken::parse(text).map_err(|fault| Mistake::Token { key, fault })
+            })?;
+            return Some(TokenSource::Text(Box::new(token)));
+        }
+        let path = self.path(&written.clone().map(PathBuf::from), "\"arm-1-pose.token\"")?;
+        if let Some(Err(mistake)) = self.checks.map(|checks| (checks.token)(written.key, &path)) {
+            self.record(&written.origin, mistake);
+        }
+        Some(TokenSource::File(path))
     }
 
     fn metadata(&mut self, text: Option<&Located<String>>) -> String {
@@ -265,7 +475,7 @@ impl Resolver {
             .collect();
         let mut first: BTreeMap<(NodeName, String), &Located<String>> = BTreeMap::new();
         let mut valid = Vec::new();
-        for one in draft.uses.iter().take(USES_MAX) {
+        for one in draft.uses.iter().take(USES_MAX).filter(|one| one.token.is_none()) {
             let resolved = self.one_use(one, node_name);
             if let (Some(resolved), Some(written)) = (&resolved, &one.topic) {
                 let (key, topic) = (written.key, resolved.topic.clone());
@@ -298,9 +508,9 @@ impl Resolver {
         Some(UseConfig { from: from?, topic: topic?, type_name })
     }
 
-    fn socket(&mut self, socket: &Located<PathBuf>, base_dir: &Path) -> Option<PathBuf> {
+    fn socket(&mut self, socket: &Located<PathBuf>) -> Option<PathBuf> {
         const EXAMPLE: &str = "\"/run/sgc/arm-1.sock\"";
-        let path = base_dir.join(&socket.value);
+        let path = self.base_dir.join(&socket.value);
         let (bytes, max) = (path.as_os_str().len(), SOCKET_PATH_BYTES_MAX);
         if socket.value.as_os_str().is_empty() {
             self.record(&socket.origin, Mistake::Empty { key: socket.key, example: EXAMPLE });
@@ -320,17 +530,27 @@ fn priority_class(key: &'static str, value: &str) -> Result<Class, Mistake> {
     }
 }
 
+/// The suite of shares that do not say one.
+pub fn suite_default() -> Suite {
+    suite_named(SUITE_DEFAULT).unwrap_or(Suite::Group)
+}
+
+/// The one place where suites have names.
+fn suite_named(name: &str) -> Option<Suite> {
+    let index = SUITES.iter().position(|known| *known == name)?;
+    Suite::from_id(u8::try_from(index + 1).ok()?)
+}
+
 fn suite(key: &'static str, value: &str) -> Result<Suite, Mistake> {
-    match value {
-        "group" => Ok(Suite::Group),
-        _ if SUITES_PLANNED.contains(&value) => Err(Mistake::PlannedValue {
+    suite_named(value).ok_or_else(|| match SUITES.contains(&value) {
+        true => Mistake::PlannedValue {
             key,
             value: value.to_owned(),
             what: "this suite is",
             instead: "use \"group\"",
-        }),
-        _ => Err(unknown_word(key, value, &SUITES)),
-    }
+        },
+        false => unknown_word(key, value, &SUITES),
+    })
 }
 
 fn unknown_word(key: &'static str, value: &str, known: &'static [&'static str]) -> Mistake {

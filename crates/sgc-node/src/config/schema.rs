@@ -20,12 +20,31 @@ pub enum Table {
     Router,
     /// `[admin]`
     Admin,
+    /// `[authority]`
+    Authority,
+    /// `[rotation]`
+    Rotation,
+    /// `[audit]`
+    Audit,
+    /// `[[partner]]`
+    Partner,
 }
 
 impl Table {
     /// All of them, in the order in which the reference lists them.
-    pub const ALL: [Self; 7] =
-        [Self::Top, Self::Node, Self::Ros, Self::Share, Self::Use, Self::Router, Self::Admin];
+    pub const ALL: [Self; 11] = [
+        Self::Top,
+        Self::Node,
+        Self::Ros,
+        Self::Share,
+        Self::Use,
+        Self::Partner,
+        Self::Router,
+        Self::Authority,
+        Self::Rotation,
+        Self::Audit,
+        Self::Admin,
+    ];
 
     /// How the table is written, brackets included.
     pub fn header(self) -> &'static str {
@@ -37,18 +56,35 @@ impl Table {
             Self::Use => "[[use]]",
             Self::Router => "[router]",
             Self::Admin => "[admin]",
+            Self::Authority => "[authority]",
+            Self::Rotation => "[rotation]",
+            Self::Audit => "[audit]",
+            Self::Partner => "[[partner]]",
         }
     }
 
     /// The keys that this version implements.
     pub fn keys(self) -> &'static [&'static str] {
         match self {
-            Self::Top => &["identity", "node", "ros", "share", "use", "router", "admin"],
-            Self::Node => &["name", "routers", "identity"],
+            Self::Top => &[
+                "identity",
+                "node",
+                "ros",
+                "share",
+                "use",
+                "partner",
+                "router",
+                "authority",
+                "rotation",
+                "audit",
+                "admin",
+            ],
+            Self::Node => &["name", "routers", "identity", "state", "trust"],
             Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers"],
             Self::Share => &[
                 "topic",
                 "to",
+                "publish",
                 "type",
                 "priority",
                 "suite",
@@ -59,9 +95,13 @@ impl Table {
                 "unique",
                 "node",
             ],
-            Self::Use => &["from", "topic", "type"],
+            Self::Use => &["from", "topic", "type", "token"],
             Self::Router => &["listen"],
             Self::Admin => &["socket"],
+            Self::Authority => &["fleet"],
+            Self::Rotation => &["every", "messages"],
+            Self::Audit => &["file", "max_bytes", "off"],
+            Self::Partner => &["name", "ca", "node"],
         }
     }
 
@@ -69,7 +109,14 @@ impl Table {
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
             Self::Top => &["gateway", "profile"],
-            Self::Node | Self::Ros | Self::Router | Self::Admin => &[],
+            Self::Node
+            | Self::Ros
+            | Self::Router
+            | Self::Admin
+            | Self::Authority
+            | Self::Rotation
+            | Self::Audit
+            | Self::Partner => &[],
             Self::Share => &[
                 "service",
                 "action",

@@ -35,8 +35,8 @@ fn provider_with(kx_groups: Vec<&'static dyn SupportedKxGroup>) -> Arc<CryptoPro
 
 /// A node that does not require post-quantum key exchange still has it, second: so a fleet can be switched node by node,
 /// and one that has not been reached yet is not locked out by those that have.
-fn provider(options: &LinkOptions) -> &'static Arc<CryptoProvider> {
-    if options.post_quantum { &POST_QUANTUM } else { &CLASSICAL }
+fn provider(post_quantum: bool) -> &'static Arc<CryptoProvider> {
+    if post_quantum { &POST_QUANTUM } else { &CLASSICAL }
 }
 
 /// Everything that belongs to neither side's handshake.
@@ -66,10 +66,12 @@ pub(super) fn server(
     options: &LinkOptions,
     transport: &Arc<TransportConfig>,
 ) -> (quinn::ServerConfig, Arc<Findings>) {
-    let provider = provider(options);
-    let (verifier, findings) = PeerVerifier::new(credentials, provider);
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
     let presenter = Presenter {
-        key: credentials.identity().certified_key(),
+        key: identity.certified_key(),
         accepted: provider.kx_groups.iter().map(|g| g.name()).collect(),
         findings: Arc::clone(&findings),
     };
@@ -112,9 +114,11 @@ pub(super) fn client(
     options: &LinkOptions,
     transport: &Arc<TransportConfig>,
 ) -> (quinn::ClientConfig, Arc<Findings>) {
-    let provider = provider(options);
-    let (verifier, findings) = PeerVerifier::new(credentials, provider);
-    let key = credentials.identity().certified_key();
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
+    let key = identity.certified_key();
     let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(provider))
         .with_protocol_versions(&[&rustls::version::TLS13])
         .expect("the provider has cipher suites of TLS 1.3")

@@ -372,7 +372,7 @@ fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) 
     }
     match error {
         ConnectionError::TransportError(_) if findings.lacks_key_exchange() => {
-            Refusal::KeyExchange { post_quantum: options.post_quantum }
+            Refusal::KeyExchange { post_quantum: findings.post_quantum }
         }
         ConnectionError::TransportError(e) => match u64::from(e.code) {
             ALERT_CERTIFICATE_REQUIRED => Refusal::Certificate(CertError::NoCertificate),

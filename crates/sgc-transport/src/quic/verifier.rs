@@ -27,6 +27,8 @@ use crate::credentials::CredentialStore;
 pub(super) struct Findings {
     /// Empty as long as no certificate came.
     verdict: OnceLock<Result<VerifiedPeer, CertError>>,
+    /// Whether only post-quantum key exchanges are accepted.
+    pub(super) post_quantum: bool,
     /// Whether a dialer's groups hold one that is accepted here; empty as long as it offered none.
     offers_group: OnceLock<bool>,
 }
@@ -53,8 +55,10 @@ impl PeerVerifier {
     pub(super) fn new(
         credentials: &CredentialStore,
         provider: &CryptoProvider,
+        post_quantum: bool,
     ) -> (Arc<Self>, Arc<Findings>) {
-        let (credentials, findings) = (credentials.clone(), Arc::<Findings>::default());
+        let (credentials, findings) =
+            (credentials.clone(), Arc::new(Findings { post_quantum, ..Findings::default() }));
         let algorithms = provider.signature_verification_algorithms;
         (Arc::new(Self { credentials, algorithms, findings: Arc::clone(&findings) }), findings)
     }

@@ -36,7 +36,7 @@ pub fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
 pub fn enroll_at(fleet: &Fleet, node: &str, now: UnixMillis) -> Arc<Identity> {
     let valid = Duration::from_secs(3600);
     let request = EnrollRequest { valid, ..EnrollRequest::new(node.parse().unwrap(), now) };
-    Arc::new(fleet.enroll(&request, &mut ChaCha20Rng::seed_from_u64(node.len() as u64)).unwrap())
+    Arc::new(fleet.issue(&request, &mut ChaCha20Rng::seed_from_u64(node.len() as u64)).unwrap())
 }
 
 /// Whatever hangs fails.

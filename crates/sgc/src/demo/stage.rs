@@ -75,7 +75,7 @@ impl Stage {
         let text = format!(
             "# The router: it passes packets on and can read none of them.\n\
              identity = \"{CLOUD}.identity\"\n\n\
-             [node]\nname = \"{CLOUD}\"\n\n\
+             [node]\nname = \"{CLOUD}\"\nstate = \"{CLOUD}.state\"\n\n\
              [router]\nlisten = [\"{listen}\"]\n\n\
              [admin]\nsocket = \"{CLOUD}.sock\"\n"
         );
@@ -87,7 +87,7 @@ impl Stage {
         let (node, far) = (role.name(), role.other().name());
         let mut text = format!(
             "identity = \"{node}.identity\"\n\n\
-             [node]\nname = \"{node}\"\nrouters = [\"{router}\"]\n\n\
+             [node]\nname = \"{node}\"\nstate = \"{node}.state\"\nrouters = [\"{router}\"]\n\n\
              [ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n\n\
              [admin]\nsocket = \"{node}.sock\"\n"
         );
@@ -123,6 +123,7 @@ impl Stage {
             topic: topic.ros_name().to_owned(),
             type_name: Some(topic.type_name().to_owned()),
             to: Vec::new(),
+            publish: Vec::new(),
             priority: Class::default(),
             suite: Suite::Group,
             metadata: ShareMetadata::default(),
@@ -168,7 +169,7 @@ fn identity_file(node: &str) -> String {
 fn enroll(fleet: &Fleet, node: &str, router: bool) -> Result<Identity, CliError> {
     let request = EnrollRequest { router, ..EnrollRequest::new(node.parse()?, fleet::unix_now()) };
     fleet
-        .enroll(&request, &mut fleet::system_rng()?)
+        .issue(&request, &mut fleet::system_rng()?)
         .map_err(|source| CliError::Fleet { path: FLEET.into(), source })
 }
 

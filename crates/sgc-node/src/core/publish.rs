@@ -1,0 +1,117 @@
+//! Publishing on names that other nodes own, and what others publish on ours.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use sgc_endpoint::{Source, SourceConfig, Wish};
+use sgc_ros::RosNetwork;
+use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
+use tracing::warn;
+
+use super::{Core, now};
+use crate::sinks::LocalSink;
+use crate::sources::{LocalShare, SourceMap, SourceSlot};
+
+/// How long a publisher goes on under the old key of a topic that is not its own: the owner gives the others as long
+/// to get the new one.
+const REKEY_WAIT: Duration = Duration::from_secs(1);
+
+/// What this node publishes under another's name.
+pub(super) struct Publishing {
+    id: SourceId,
+    class: Class,
+    reliable: bool,
+    /// What the source was made with, or rekeyed to; `None` until the owner granted it.
+    grant: Option<TopicGrant>,
+    /// The key of the next epoch, and when it begins.
+    next: Option<(Instant, TopicGrant)>,
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// Asks the owner of `name` to let this node publish under it.
+    pub(super) fn publish_under(
+        &mut self,
+        name: Name,
+        owner: NodeId,
+        suite: u8,
+        class: Class,
+        reliable: bool,
+    ) {
+        let Some(message_key) = self.message_key(suite) else {
+            warn!(suite, "a topic's suite is not in this build; this node cannot publish on it");
+            return;
+        };
+        let id = self.endpoint.new_source_id();
+        let share = LocalShare::new(name, self.data.clone(), self.alive.clone(), self.epoch_messages_max);
+        self.shares.insert(name, Arc::new(share));
+        self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
+        let offer = SourceOffer { source: id, key: message_key.public().clone() };
+        self.endpoint.join(now(), name, owner, Wish::Publish(offer));
+    }
+
+    /// The owner lets this node publish, or begins a new epoch; false if this node does not publish under `name`.
+    pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> bool {
+        let Some(publishing) = self.publishing.get_mut(&name) else { return false };
+        match &publishing.grant {
+            Some(known) if (known.epoch, &known.key) == (grant.epoch, &grant.key) => {}
+            Some(known) if known.epoch < grant.epoch => {
+                publishing.next = Some((now.instant + REKEY_WAIT, grant.clone()));
+            }
+            // The owner started anew: another key, under which numbers begin again.
+            Some(_) | None => {
+                publishing.grant = Some(grant.clone());
+                publishing.next = None;
+                let (id, class, reliable) = (publishing.id, publishing.class, publishing.reliable);
+                let config =
+                    SourceConfig { name, id, class, reliable, history_depth: 0, history_bytes_max: 0 };
+                let key = self.message_key(grant.suite);
+                let source = key.and_then(|key| Source::new(config, grant, key));
+                if let (Some(source), Some(share)) = (source, self.shares.get(&name)) {
+                    let shared = Some(SourceSlot::new(source, false, reliable));
+                    share.set_map(SourceMap { shared, ..SourceMap::default() });
+                }
+            }
+        }
+        true
+    }
+
+    /// Publishes under the keys whose time has come.
+    pub(super) fn rekey_due(&mut self, now: Now) {
+        for (name, publishing) in &mut self.publishing {
+            let due = publishing.next.take_if(|(at, _)| *at <= now.instant);
+            if let (Some((_, grant)), Some(share)) = (due, self.shares.get(name)) {
+                share.rekey(grant.clone());
+                publishing.grant = Some(grant);
+            }
+        }
+    }
+
+    pub(super) fn rekey_deadline(&self) -> Option<Instant> {
+        self.publishing.values().filter_map(|p| p.next.as_ref().map(|(at, _)| *at)).min()
+    }
+
+    pub(super) fn stop_publishing(&mut self, name: &Name) {
+        if self.publishing.remove(name).is_some()
+            && let Some(share) = self.shares.remove(name)
+        {
+            share.close();
+        }
+    }
+
+    /// Key and publishers of a share of ours on which others may publish.
+    pub(super) fn own_grant(&mut self, name: Name, grant: TopicGrant) {
+        let own: Vec<_> = self.shares.get(&name).iter().flat_map(|s| s.map().ids()).collect();
+        let others = grant.sources.iter().any(|s| !own.contains(&s.source));
+        let sink = self
+            .sinks
+            .entry(name)
+            .or_insert_with(|| Arc::new(LocalSink::new(name, false, self.requests.clone())))
+            .clone();
+        // What this node publishes itself does not come back to it: it is nobody's sink but its own.
+        sink.grant(SinkId([0; 16]), grant, &self.data);
+        self.retire_due.insert(name, now().instant + super::EPOCH_GRACE);
+        if let Some(routes) = &mut self.routes {
+            routes.handle_publishers(&name, others);
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! Trust that changes while the node runs: its own credentials, those of members if it is the authority, and
+//! revocations.
+
+use std::sync::Arc;
+
+use sgc_ros::RosNetwork;
+use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
+use sgc_wire::{Credentials, RefuseReason, SinkId};
+use tracing::{info, warn};
+
+use super::{Core, CoreEvent, now};
+use crate::audit::{AuditEvent, AuditRecord};
+use crate::authority;
+use crate::credentials::{renew_at, renewed};
+
+impl<N: RosNetwork> Core<N> {
+    /// Asks the authority for what this node needs, if its identity names one.
+    pub(super) fn ask_renewal(&mut self) {
+        let now = now();
+        if self.endpoint.renew(now, self.identity.csr().into()) {
+            self.renew_due = Some(renew_at(&self.identity, now));
+        }
+    }
+
+    /// Looks a member up in the fleet's file, where that may block.
+    pub(super) fn answer_renewal(&self, sink: SinkId, peer: VerifiedPeer, csr: bytes::Bytes) {
+        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let answer = authority::answer(&file, &peer, &csr, now());
+            let _ = events.blocking_send(CoreEvent::RenewalReady { sink, answer });
+        });
+    }
+
+    /// Gives a member what the fleet's file says.
+    pub(super) fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
+        let peer = self.endpoint.renewing().find(|(id, ..)| *id == sink).map(|(_, peer, _)| peer.node_id);
+        if let Some(peer) = peer {
+            let record = |event| AuditRecord::new(event).peer(&peer);
+            match &answer {
+                Ok(credentials) if credentials.chain.is_empty() => {}
+                Ok(_) => self.audit.write(record(AuditEvent::Renewed)),
+                Err(reason) => self.audit.write(record(AuditEvent::Refused).reason(reason)),
+            }
+        }
+        self.endpoint.answer_renewal(now(), sink, answer);
+    }
+
+    /// Answers every member once more: the fleet's file may have changed.
+    pub(super) fn answer_renewals(&self) {
+        let asked: Vec<_> = self.endpoint.renewing().map(|(s, p, csr)| (s, p.clone(), csr.clone())).collect();
+        for (sink, peer, csr) in asked {
+            self.answer_renewal(sink, peer, csr);
+        }
+    }
+
+    pub(super) fn take_credentials(&mut self, credentials: Credentials) {
+        match renewed(&self.identity, credentials) {
+            Ok(None) => {}
+            Ok(Some(identity)) => {
+                let identity = Arc::new(identity);
+                info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
+                let until = format!("this node's own, until {}", identity.not_after());
+                self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
+                self.keeper.identity(identity.clone());
+                self.set_identity(identity);
+            }
+            Err(why) => {
+                warn!(%why, "credentials from the fleet's authority are not usable");
+                self.control_drops.count("credentials_unusable");
+            }
+        }
+    }
+
+    /// Is this from here on: with another certificate, or other secrets for names made later.
+    pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
+        let now = now();
+        self.identity = identity.clone();
+        self.renew_due = Some(renew_at(&identity, now));
+        if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
+            routes.set_secret(newest.secret.clone());
+        }
+        self.credentials.set_identity(identity.clone());
+        self.endpoint.set_identity(now, identity);
+        self.redial.send_replace(());
+    }
+
+    /// Believes others from here on, everywhere.
+    pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        let lists = anchors.crls().count();
+        self.audit.write(AuditRecord::new(AuditEvent::Crl).reason(format!("{lists} lists are in force")));
+        self.keeper.anchors(anchors.clone());
+        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
+        self.endpoint.set_anchors(now(), anchors);
+    }
+}

@@ -1,0 +1,188 @@
+//! Who may join a share: from what the user wrote to a [`Policy`], and back to the words that admit somebody.
+//!
+//! It decides nothing: the policy does, at the owner, when a join arrives. [`explain`] asks the same policy.
+
+use std::fmt::Write as _;
+
+use sgc_ros::ShareRule;
+use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
+use sgc_wire::{GroupTag, Metadata, NodeId, Role};
+
+use crate::config::{Recipient, ShareConfig};
+use crate::partners::Partners;
+
+/// Who is asked about: what a certificate proves of its node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Subject {
+    /// The node.
+    pub node: NodeId,
+    /// The CA that vouches for it.
+    pub ca: CaFingerprint,
+    /// Its groups, sorted.
+    pub groups: Vec<GroupTag>,
+}
+
+impl From<&VerifiedPeer> for Subject {
+    fn from(peer: &VerifiedPeer) -> Self {
+        Self { node: peer.node_id, ca: peer.ca, groups: peer.groups.to_vec() }
+    }
+}
+
+/// What becomes of a request, and why.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Verdict {
+    /// It is granted.
+    pub permitted: bool,
+    /// The entry that admits, or why none does.
+    pub because: String,
+}
+
+/// The policy of a share.
+pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Policy {
+    let all = |recipients: &[Recipient]| {
+        let mut all = Grantees::default();
+        recipients.iter().for_each(|recipient| add(&mut all, recipient, identity, partners));
+        all
+    };
+    let mut policy = Policy { subscribe: all(&share.to), publish: all(&share.publish) };
+    for grant in tokens_of(share, partners) {
+        match grant.node {
+            Some(node) => drop(policy.subscribe.nodes.insert(node)),
+            None => drop(policy.subscribe.fleets.insert(grant.ca)),
+        }
+    }
+    policy
+}
+
+/// What the machine needs to know of a share.
+pub fn share_rule(share: &ShareConfig, identity: &Identity, partners: &Partners) -> ShareRule {
+    ShareRule {
+        metadata: metadata(share, identity.node_name().as_str()),
+        policy: policy(share, identity, partners),
+        suite: share.suite,
+        class: share.priority,
+    }
+}
+
+/// What the name of a share of `owner` follows from.
+pub fn metadata(share: &ShareConfig, owner: &str) -> Metadata {
+    let extra = share.metadata.clone();
+    let type_name = share.type_name.clone().unwrap_or_default();
+    Metadata {
+        node: extra.node,
+        author: extra.author,
+        maintainer: extra.maintainer,
+        interface: extra.interface,
+        description: extra.description,
+        unique: extra.unique,
+        ..Metadata::topic(owner, &share.topic, &type_name)
+    }
+}
+
+/// Whether `subject` may join a share as `role`, and which entry says so.
+pub fn explain(
+    share: &ShareConfig,
+    identity: &Identity,
+    partners: &Partners,
+    subject: &Subject,
+    role: Role,
+) -> Verdict {
+    let finds = |set: &Grantees| set.find_parts(&subject.node, &subject.ca, &subject.groups).is_some();
+    if subject.node == identity.node_id() {
+        return Verdict { permitted: true, because: "it is the owner".to_owned() };
+    }
+    let policy = policy(share, identity, partners);
+    let (key, entries, set) = match role {
+        Role::Subscribe => ("to", &share.to, &policy.subscribe),
+        Role::Publish => ("publish", &share.publish, &policy.publish),
+    };
+    let permitted = finds(set);
+    let admits = |recipient: &&Recipient| {
+        let mut only = Grantees::default();
+        add(&mut only, recipient, identity, partners);
+        finds(&only)
+    };
+    if let Some(recipient) = entries.iter().find(admits) {
+        let because = format!("`{key}` names \"{recipient}\": {}", what_admits(recipient, partners));
+        return Verdict { permitted, because };
+    }
+    let token = tokens_of(share, partners).find(|grant| match grant.node {
+        Some(node) => node == subject.node,
+        None => grant.ca == subject.ca,
+    });
+    if let Some(grant) = token.filter(|_| role == Role::Subscribe) {
+        return Verdict { permitted, because: format!("token {} was given for it", grant.id) };
+    }
+    Verdict { permitted, because: why_not(share, identity, partners, subject, key, entries) }
+}
+
+fn tokens_of<'p>(
+    share: &'p ShareConfig,
+    partners: &'p Partners,
+) -> impl Iterator<Item = &'p crate::partners::TokenGrant> {
+    partners.tokens.iter().filter(|grant| {
+        grant.topic == share.topic && share.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
+    })
+}
+
+fn add(set: &mut Grantees, recipient: &Recipient, identity: &Identity, partners: &Partners) {
+    let own = identity.as_peer().ca;
+    match recipient {
+        Recipient::Everyone => {
+            set.fleets.insert(own);
+        }
+        Recipient::Node(node) => set.nodes.extend(identity.node_id_of(node.as_str())),
+        Recipient::Group(group) => {
+            let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
+            set.groups.extend(tag.map(|tag| (own, tag)));
+        }
+        Recipient::Partner(name) => match partners.configured.get(name) {
+            Some(partner) if partner.nodes.is_empty() => set.fleets.extend(&partner.cas),
+            Some(partner) => set.nodes.extend(&partner.nodes),
+            None => {}
+        },
+    }
+}
+
+fn what_admits(recipient: &Recipient, partners: &Partners) -> &'static str {
+    match recipient {
+        Recipient::Everyone => "it is a member of this fleet",
+        Recipient::Node(_) => "that is this node",
+        Recipient::Group(_) => "its certificate puts it into that group",
+        Recipient::Partner(name) => match partners.configured.get(name) {
+            Some(partner) if partner.nodes.is_empty() => "its certificate is of that partner's CA",
+            _ => "its node id is listed in that [[partner]]",
+        },
+    }
+}
+
+fn why_not(
+    share: &ShareConfig,
+    identity: &Identity,
+    partners: &Partners,
+    subject: &Subject,
+    key: &str,
+    entries: &[Recipient],
+) -> String {
+    if entries.is_empty() {
+        return format!("`{key}` of {} names nobody", share.topic);
+    }
+    let list: Vec<_> = entries.iter().map(|entry| format!("\"{entry}\"")).collect();
+    let mut text = format!("`{key}` of {} names {}, and it is none of them", share.topic, list.join(", "));
+    let is_partner = partners.configured.iter().find(|(_, p)| p.cas.contains(&subject.ca));
+    if subject.ca == identity.as_peer().ca {
+        let groups = subject.groups.len();
+        let _ = write!(
+            text,
+            " (a member of this fleet, in {groups} group{})",
+            if groups == 1 { "" } else { "s" }
+        );
+    } else if let Some((name, partner)) = is_partner {
+        let listed = partner.nodes.is_empty() || partner.nodes.contains(&subject.node);
+        let not = if listed { "" } else { ", but not one of the nodes listed there" };
+        let _ = write!(text, " (a node of partner \"{name}\"{not})");
+    } else {
+        text.push_str(" (a node of another fleet that no [[partner]] describes)");
+    }
+    text
+}

@@ -1,0 +1,201 @@
+//! What a configuration and the files that it names come to at one moment: rules for the route machine, more CAs,
+//! more routers. The same at start and at reload.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{self, Read};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use sgc_ros::{Direction, ShareRule, UseRule};
+use sgc_transport::LinkUrl;
+use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
+use sgc_wire::{NodeId, UnixMillis};
+
+use crate::audit::PeerNames;
+use crate::config::{Config, Recipient, TokenSource, UseConfig};
+use crate::partners::{PartnerError, Partners};
+use crate::policy;
+
+/// Most routers that tokens may add.
+const TOKEN_ROUTERS_MAX: usize = 16;
+
+/// Everything that follows from a configuration and may change at run time.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Rules {
+    pub(crate) shares: Vec<ShareRule>,
+    pub(crate) uses: Vec<UseRule>,
+    pub(crate) partners: Partners,
+    /// Routers of tokens that the configuration does not name.
+    pub(crate) routers: Vec<LinkUrl>,
+    pub(crate) names: PeerNames,
+    /// What is wrong and stops nothing.
+    pub(crate) warnings: Vec<String>,
+}
+
+impl Rules {
+    /// Reads what `config` names and what the state directory holds.
+    pub(crate) fn load(
+        config: &Config,
+        identity: &Identity,
+        state: Option<&Path>,
+        now: UnixMillis,
+    ) -> Result<Self, RulesError> {
+        let mut rules = Self { partners: Partners::load(config, state, now)?, ..Self::default() };
+        let mut names = BTreeSet::new();
+        for source in &config.tokens {
+            let token = match source {
+                TokenSource::File(path) => read_token(path)?,
+                TokenSource::Text(token) => ShareToken::clone(token),
+            };
+            if !names.insert(token.name()) {
+                return Err(RulesError::TokenTwice { topic: token.metadata.ros_name.clone() });
+            }
+            rules.add_token(config, identity, token, now)?;
+        }
+        let partners = &rules.partners;
+        rules.shares = config.shares.iter().map(|s| policy::share_rule(s, identity, partners)).collect();
+        let of_fleet = config.uses.iter().filter_map(|u| use_rule(u, identity));
+        rules.uses.splice(0..0, of_fleet);
+        rules.names = peer_names(config, identity, &rules);
+        for grant in &rules.partners.tokens {
+            let is_shared = |s: &crate::config::ShareConfig| {
+                s.topic == grant.topic && s.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
+            };
+            if !config.shares.iter().any(is_shared) {
+                rules.warnings.push(format!(
+                    "token {} is for {} [{}], which is not shared any more: sgc share-token --withdraw {}",
+                    grant.id, grant.topic, grant.type_name, grant.id
+                ));
+            }
+        }
+        Ok(rules)
+    }
+
+    fn add_token(
+        &mut self,
+        config: &Config,
+        identity: &Identity,
+        token: ShareToken,
+        now: UnixMillis,
+    ) -> Result<(), RulesError> {
+        let topic = token.metadata.ros_name.clone();
+        if token.owner == identity.node_id() {
+            return Err(RulesError::OwnToken { topic });
+        }
+        if config.shares.iter().any(|share| share.topic == topic) {
+            return Err(RulesError::SharedAndUsed { topic });
+        }
+        if token.expires < now {
+            let (owner, expires) = (&token.owner_name, token.expires);
+            self.warnings
+                .push(format!("the token for {topic} ended at {expires}: ask {owner} for a new one"));
+            return Ok(());
+        }
+        for url in &token.routers {
+            match url.parse::<LinkUrl>() {
+                Ok(url) if config.routers.contains(&url) || self.routers.contains(&url) => {}
+                Ok(url) if self.routers.len() < TOKEN_ROUTERS_MAX => self.routers.push(url),
+                Ok(_) => {}
+                Err(_) => {
+                    self.warnings.push(format!("the token for {topic} names a router that cannot be dialled"))
+                }
+            }
+        }
+        self.partners.trust(vec![token.ca.clone()]);
+        self.uses.push(UseRule {
+            direction: Direction::Bring,
+            owner: token.owner,
+            owner_name: token.owner_name.to_string(),
+            topic,
+            type_name: Some(token.metadata.type_name.clone()),
+            token: Some((token.name(), token.metadata)),
+        });
+        Ok(())
+    }
+}
+
+/// Reads a token, which must be its owner's alone.
+pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
+    let failed = |source| RulesError::TokenFile { path: path.to_owned(), source };
+    let file = fs::File::open(path).map_err(failed)?;
+    let mode = file.metadata().map_err(failed)?.permissions().mode() & 0o7777;
+    if mode & 0o077 != 0 {
+        return Err(failed(io::Error::other(format!("its mode {mode:04o} lets others at it; chmod 600 it"))));
+    }
+    let mut text = zeroize::Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX + 2));
+    file.take(TOKEN_TEXT_BYTES_MAX as u64 + 2).read_to_string(&mut text).map_err(failed)?;
+    ShareToken::parse(&text).map_err(|source| RulesError::Token { path: path.to_owned(), source })
+}
+
+fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
+    Some(UseRule {
+        direction: Direction::Bring,
+        owner: identity.node_id_of(rule.from.as_str())?,
+        owner_name: rule.from.to_string(),
+        topic: rule.topic.clone(),
+        type_name: rule.type_name.clone(),
+        token: None,
+    })
+}
+
+/// What the configuration calls peers.
+fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames {
+    let mut names = PeerNames::new();
+    for (partner, resolved) in config.partners.iter().zip(rules.partners.configured.values()) {
+        let name = |node: &NodeId| (*node, format!("partner:{}", partner.name));
+        names.extend(resolved.nodes.iter().map(name));
+    }
+    names.extend(rules.uses.iter().map(|rule| (rule.owner, rule.owner_name.clone())));
+    let named = config.shares.iter().flat_map(|s| s.to.iter().chain(&s.publish));
+    for recipient in named {
+        if let Recipient::Node(node) = recipient {
+            names.extend(identity.node_id_of(node.as_str()).map(|id| (id, node.to_string())));
+        }
+    }
+    names
+}
+
+/// Why a configuration that is valid in itself cannot be carried out.
+#[derive(Debug, thiserror::Error)]
+pub enum RulesError {
+    /// Partners.
+    #[error(transparent)]
+    Partner(#[from] PartnerError),
+    /// A token cannot be read.
+    #[error("token {}: {source}", path.display())]
+    TokenFile {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A token is none.
+    #[error("token {}: {source}", path.display())]
+    Token {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: TokenError,
+    },
+    /// Two tokens for the same.
+    #[error("two tokens for {topic} of the same owner: take one [[use]] out")]
+    TokenTwice {
+        /// The topic.
+        topic: String,
+    },
+    /// A token of this node.
+    #[error("the token for {topic} is this node's own: it is for a partner")]
+    OwnToken {
+        /// The topic.
+        topic: String,
+    },
+    /// What would come back.
+    #[error(
+        "a token brings {topic} here, which a [[share]] shares: it would be shared again, in a loop; keep one"
+    )]
+    SharedAndUsed {
+        /// The topic.
+        topic: String,
+    },
+}

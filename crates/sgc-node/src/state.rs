@@ -1,0 +1,126 @@
+//! The state directory: what a node has to remember from one run to the next, for its user alone.
+//!
+//! It knows where the directory is and how files in it are replaced; what they hold is the business of those who
+//! write them.
+
+use std::fs;
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+
+use crate::config::Config;
+
+const LOCK_FILE: &str = "lock";
+const OTHERS_BITS: u32 = 0o077;
+
+/// Where a node with this name keeps its state: as configured, or in the user's state directory. `None` where the
+/// user has none.
+pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
+    let named = |variable: &str| std::env::var_os(variable).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let usual = || {
+        let base = named("XDG_STATE_HOME").filter(|dir| dir.is_absolute());
+        base.or_else(|| Some(named("HOME")?.join(".local/state")))
+    };
+    config.state.clone().or_else(|| Some(usual()?.join("sgc").join(node)))
+}
+
+/// Makes the directory if it is not there, 0700, and checks that it is this user's alone.
+pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
+    let failed = |source| StateError::Directory { path: dir.to_owned(), source };
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
+    let metadata = fs::metadata(dir).map_err(failed)?;
+    let mode = metadata.permissions().mode() & 0o7777;
+    if mode & OTHERS_BITS != 0 {
+        return Err(StateError::Exposed { path: dir.to_owned(), mode });
+    }
+    if metadata.uid() != rustix::process::geteuid().as_raw() {
+        return Err(StateError::NotOurs { path: dir.to_owned() });
+    }
+    Ok(())
+}
+
+/// Replaces a file whole or not at all: 0600, on the disk before it has its name.
+pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
+    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let temporary = dir.join(format!(".{name}.{}", std::process::id()));
+    let _ = fs::remove_file(&temporary);
+    let mut options = fs::OpenOptions::new();
+    let mut file = options.write(true).create_new(true).mode(0o600).open(&temporary)?;
+    let written = file
+        .write_all(content)
+        .and_then(|()| file.sync_all())
+        .and_then(|()| fs::rename(&temporary, path))
+        .and_then(|()| fs::File::open(dir)?.sync_all());
+    if written.is_err() {
+        let _ = fs::remove_file(&temporary);
+    }
+    written
+}
+
+/// Reads a file of at most `max` bytes that is no symbolic link; `None` if there is none.
+pub(crate) fn read(path: &Path, max: u64) -> io::Result<Option<Vec<u8>>> {
+    let flags = OFlags::NOFOLLOW.bits() as i32;
+    let file = match fs::OpenOptions::new().read(true).custom_flags(flags).open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    let mut content = Vec::new();
+    file.take(max + 1).read_to_end(&mut content)?;
+    if content.len() as u64 > max {
+        return Err(io::Error::other(format!("it has more than {max} bytes")));
+    }
+    Ok(Some(content))
+}
+
+/// Held while files of the directory are read and replaced, so that two programs do not undo each other's work.
+#[derive(Debug)]
+pub(crate) struct StateLock {
+    _file: fs::File,
+}
+
+impl StateLock {
+    /// Waits for it.
+    pub(crate) fn take(dir: &Path) -> io::Result<Self> {
+        let mut options = fs::OpenOptions::new();
+        let flags = OFlags::NOFOLLOW.bits() as i32;
+        let options = options.write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
+        let file = options.open(dir.join(LOCK_FILE))?;
+        flock(&file, FlockOperation::LockExclusive)?;
+        Ok(Self { _file: file })
+    }
+}
+
+/// What is wrong with a state directory.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    /// The user has no place for it.
+    #[error(
+        "there is no place for this node's state: neither XDG_STATE_HOME nor HOME is set; set `state` in [node]"
+    )]
+    Nowhere,
+    /// It cannot be made or read.
+    #[error("state directory {}: {source}", path.display())]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Others may look into it.
+    #[error("state directory {}: its mode {mode:04o} lets others in; chmod 700 it", path.display())]
+    Exposed {
+        /// The directory.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// It is another user's.
+    #[error("state directory {}: it belongs to another user; name another with `state` in [node]", path.display())]
+    NotOurs {
+        /// The directory.
+        path: PathBuf,
+    },
+}

@@ -1,0 +1,55 @@
+//! Token routes: names that are joined at once, and that the grant describes.
+//!
+//! From the first grant on they are use routes like others.
+
+use rand_core::RngCore;
+use sgc_trust::name_of;
+use sgc_wire::{CatalogueEntry, Name};
+
+use super::{Command, Problem, Routes, TokenJoin, UseRoute};
+
+impl<R: RngCore> Routes<R> {
+    /// What a token's name stands for, as its owner says with the grant: a catalogue of one entry.
+    pub(super) fn handle_described(&mut self, name: Name, entry: CatalogueEntry) {
+        let Some(token) = self.tokens.get_mut(&name) else { return };
+        token.refused = None;
+        let index = token.rule;
+        let rule = &self.use_rules[index];
+        let expected = rule.token.as_ref().map(|(_, metadata)| metadata);
+        if name_of(&rule.owner, &entry.blind) != name || expected != Some(&entry.metadata) {
+            let problem = Problem::TokenEntry { topic: rule.topic.clone(), owner: rule.owner_name.clone() };
+            self.report(problem);
+            return self.close_use(name);
+        }
+        let (owner, transient_local) = (rule.owner, entry.qos.is_transient_local());
+        if token.transient_local != transient_local {
+            // Another durability is another kind of sink: start over, now that it is known.
+            token.transient_local = transient_local;
+            self.close_use(name);
+            self.commands.push_back(Command::Leave { name });
+            self.commands.push_back(Command::Join { name, owner, transient_local, describe: true });
+            return;
+        }
+        if let Some(route) = self.uses.get_mut(&name) {
+            route.entry = entry;
+            return;
+        }
+        self.uses.insert(name, UseRoute::new(index, entry));
+        for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
+            self.check_local(&endpoint);
+        }
+    }
+
+    /// Joins the names of those tokens that are not joined.
+    pub(super) fn join_tokens(&mut self) {
+        for (index, rule) in self.use_rules.iter().enumerate() {
+            let Some((name, _)) = &rule.token else { continue };
+            if self.tokens.contains_key(name) {
+                continue;
+            }
+            self.tokens.insert(*name, TokenJoin { rule: index, transient_local: false, refused: None });
+            let (name, owner) = (*name, rule.owner);
+            self.commands.push_back(Command::Join { name, owner, transient_local: false, describe: true });
+        }
+    }
+}

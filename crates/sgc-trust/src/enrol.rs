@@ -1,0 +1,240 @@
+//! How a fleet takes nodes in and renews them, with keys of its making or of theirs.
+//!
+//! The roster is entered here; who is taken out of it, and all else about a fleet, is in `fleet.rs`.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use bytes::Bytes;
+use rand_core::CryptoRng;
+use rcgen::PublicKeyData;
+use rustls_pki_types::CertificateDer;
+use sgc_wire::{Credentials, Pseudonym, UnixMillis};
+
+use crate::fleet::{Fleet, LEAF_VALIDITY_DEFAULT};
+use crate::fleet_error::FleetError;
+use crate::identity::Identity;
+use crate::issue::{Leaf, RequestedKey};
+use crate::key::Key;
+use crate::label::{GroupName, NodeName};
+use crate::member::Membership;
+use crate::roster::{IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
+use crate::verify::GROUPS_MAX;
+use crate::x509::{Validity, serial_of};
+
+impl Fleet {
+    /// Makes an identity with a new key, and enters its node in the roster.
+    pub fn enroll(
+        &mut self,
+        request: &EnrollRequest,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Identity, FleetError> {
+        let key = Key::generate(rng);
+        let member = self.enroll_key(&key, request, rng)?;
+        Identity::join(member, key.pkcs8(), rng).map_err(FleetError::making)
+    }
+
+    /// The same for a node that made its key itself: `csr` (PKCS #10, DER) shows that it has it. Nothing but the key
+    /// is taken from it.
+    pub fn enroll_csr(
+        &mut self,
+        csr: &[u8],
+        request: &EnrollRequest,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        self.enroll_key(&RequestedKey::of(csr)?, request, rng)
+    }
+
+    /// Makes an identity of which the roster knows nothing, so that it cannot be revoked or renewed: for fleets that
+    /// last as long as a demonstration or a test.
+    pub fn issue(&self, request: &EnrollRequest, rng: &mut impl CryptoRng) -> Result<Identity, FleetError> {
+        let key = Key::generate(rng);
+        let member = self.member(&key, request, rng)?;
+        Identity::join(member, key.pkcs8(), rng).map_err(FleetError::making)
+    }
+
+    /// An identity with a new key for a node of the roster, in its groups and with its role.
+    pub fn renew(
+        &mut self,
+        node: &NodeName,
+        valid: Duration,
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Identity, FleetError> {
+        let request = self.standing_request(node, valid, now)?;
+        self.enroll(&request, rng)
+    }
+
+    /// The same for a node that keeps the key with which it signed `csr`.
+    pub fn renew_member(
+        &mut self,
+        csr: &[u8],
+        node: &NodeName,
+        valid: Duration,
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        let request = self.standing_request(node, valid, now)?;
+        self.enroll_csr(csr, &request, rng)
+    }
+
+    /// Fresh certificates and the secrets in use for the node of the roster that certificates call `pseudonym`, for
+    /// the key that signed `csr`. Who asks has to be that node: the caller checks it.
+    pub fn renew_csr(
+        &mut self,
+        csr: &[u8],
+        pseudonym: &Pseudonym,
+        valid: Duration,
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Credentials, FleetError> {
+        let known = self.node_by_pseudonym(pseudonym).map(|n| n.name.clone());
+        let node = known.ok_or_else(|| FleetError::UnknownNode { node: pseudonym.short() })?;
+        let member = self.renew_member(csr, &node, valid, now, rng)?;
+        let chain = member.chain.iter().map(|c| Bytes::copy_from_slice(c)).collect();
+        self.credentials_for(&node, chain)
+    }
+
+    /// Enters a certificate in the roster that was made before there was one, so that it can be revoked.
+    pub fn adopt(
+        &mut self,
+        node: NodeName,
+        chain: &[CertificateDer<'_>],
+        now: UnixMillis,
+    ) -> Result<(), FleetError> {
+        let leaf = chain.first().ok_or(FleetError::Adopt("there is no certificate"))?;
+        let begin = Validity::of(leaf).ok_or(FleetError::Adopt("it cannot be read"))?.not_before;
+        let peer = self
+            .anchors
+            .verify(chain, begin)
+            .map_err(|_| FleetError::Adopt("the CA of this fleet did not make it"))?;
+        if peer.pseudonym != self.secret.pseudonym(node.as_str()) {
+            return Err(FleetError::Adopt("it is that of a node of another name"));
+        }
+        self.begin_roster_if_none(now)?;
+        let entry = self.roster.nodes.entry(node.clone()).or_insert_with(|| RosterNode {
+            name: node,
+            groups: Vec::new(),
+            router: false,
+            may_route: peer.may_route,
+            revoked: None,
+            certificates: Vec::new(),
+        });
+        let certificate =
+            IssuedCertificate { serial: peer.cert.serial.clone(), not_after: peer.not_after, revoked: None };
+        if !entry.certificates.iter().any(|c| c.serial == certificate.serial) {
+            entry.certificates.push(certificate);
+        }
+        self.sign_roster()
+    }
+
+    fn enroll_key(
+        &mut self,
+        key: &impl PublicKeyData,
+        request: &EnrollRequest,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        self.begin_roster_if_none(request.now)?;
+        self.roster.prune(request.now);
+        match self.roster.nodes.get(&request.node) {
+            Some(RosterNode { revoked: Some(at), .. }) if !request.again => {
+                return Err(FleetError::NodeRevoked { node: request.node.clone(), at: *at });
+            }
+            Some(node) if node.certificates.len() >= NODE_CERTIFICATES_MAX => {
+                return Err(FleetError::TooManyCertificates { node: request.node.clone() });
+            }
+            None if self.roster.nodes.len() >= ROSTER_NODES_MAX => return Err(FleetError::TooManyNodes),
+            _ => {}
+        }
+        let member = self.member(key, request, rng)?;
+        let leaf = member.chain.first().ok_or(FleetError::CaName)?;
+        let made = Validity::of(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
+        let (Validity { not_after, .. }, serial) = made;
+        let mut certificates =
+            self.roster.nodes.remove(&request.node).map(|n| n.certificates).unwrap_or_default();
+        certificates.push(IssuedCertificate { serial: serial.into(), not_after, revoked: None });
+        let node = RosterNode {
+            name: request.node.clone(),
+            groups: request.groups.iter().cloned().collect::<BTreeSet<_>>().into_iter().collect(),
+            router: request.router,
+            may_route: request.router || request.may_route,
+            revoked: None,
+            certificates,
+        };
+        self.roster.nodes.insert(request.node.clone(), node);
+        self.sign_roster()?;
+        Ok(member)
+    }
+
+    /// Everything but the key, for this key.
+    fn member(
+        &self,
+        key: &impl PublicKeyData,
+        request: &EnrollRequest,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        self.check_ca_holds(request.now)?;
+        if request.groups.len() > GROUPS_MAX {
+            return Err(FleetError::TooManyGroups { groups: request.groups.len() });
+        }
+        let groups: BTreeSet<_> = request.groups.iter().collect();
+        let leaf = Leaf {
+            pseudonym: self.secret.pseudonym(request.node.as_str()),
+            groups: groups.into_iter().map(|g| self.secret.group_tag(g.as_str())).collect(),
+            may_route: request.router || request.may_route,
+            valid: request.valid,
+            now: request.now,
+        };
+        let certificate = leaf.sign(key, &self.certificate, &self.key, self.validity, rng)?;
+        let is_member = !request.router;
+        Ok(Membership {
+            node: request.node.clone(),
+            fleet: self.name.clone(),
+            chain: vec![certificate],
+            anchors: self.anchors.clone(),
+            secret: is_member.then(|| self.secret.clone()),
+            naming: if is_member { self.naming.clone() } else { Vec::new() },
+            authority: self.roster.authority.as_ref().map(|a| self.node_id_of(a)),
+            post_quantum: self.roster.post_quantum,
+        })
+    }
+
+    fn standing_request(
+        &self,
+        node: &NodeName,
+        valid: Duration,
+        now: UnixMillis,
+    ) -> Result<EnrollRequest, FleetError> {
+        let node = self.active_node(node)?;
+        let (groups, router, may_route) = (node.groups.clone(), node.router, node.may_route);
+        Ok(EnrollRequest { groups, router, may_route, valid, ..EnrollRequest::new(node.name.clone(), now) })
+    }
+}
+
+/// What is asked of [`Fleet::enroll`].
+#[derive(Clone, Debug)]
+pub struct EnrollRequest {
+    /// For which node.
+    pub node: NodeName,
+    /// The groups it is to be in, at most [`GROUPS_MAX`].
+    pub groups: Vec<GroupName>,
+    /// For a node that only routes: its identity lacks the fleet secret, so that it can derive no name and open
+    /// no payload. Its certificate lets it carry others' names.
+    pub router: bool,
+    /// For a member whose certificate lets it carry others' names as well.
+    pub may_route: bool,
+    /// True if a node that was revoked may be one again.
+    pub again: bool,
+    /// How long the certificate is to hold; never longer than the CA.
+    pub valid: Duration,
+    /// The time.
+    pub now: UnixMillis,
+}
+
+impl EnrollRequest {
+    /// A node in no group, for [`LEAF_VALIDITY_DEFAULT`].
+    pub fn new(node: NodeName, now: UnixMillis) -> Self {
+        let (groups, valid) = (Vec::new(), LEAF_VALIDITY_DEFAULT);
+        Self { node, groups, router: false, may_route: false, again: false, valid, now }
+    }
+}

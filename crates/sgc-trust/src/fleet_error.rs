@@ -1,0 +1,143 @@
+//! Everything that can be wrong with a fleet or with what is asked of it: one variant per cause.
+
+use std::fmt;
+
+use sgc_wire::{DecodeError, SECRET_GENERATIONS_MAX, UnixMillis};
+
+use crate::fleet::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK, ROSTER_BYTES_MAX};
+use crate::label::{LabelError, NodeName};
+use crate::pem::PemError;
+use crate::roster::{NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX};
+use crate::secret::{NAMING_BLOCK, SECRET_BLOCK, SECRET_BYTES};
+use crate::verify::{AnchorError, GROUPS_MAX};
+
+/// Why a fleet cannot be made, read, or enrol a node.
+#[derive(Debug, thiserror::Error)]
+pub enum FleetError {
+    /// The file is not a sequence of blocks.
+    #[error("this is not a fleet file")]
+    File(#[source] PemError),
+    /// A block that this version does not know.
+    #[error("block \"{0}\" does not belong into a fleet file")]
+    UnknownBlock(String),
+    /// A block occurs twice.
+    #[error("block \"{0}\" occurs twice in the fleet file")]
+    Repeated(&'static str),
+    /// A block is missing.
+    #[error("block \"{0}\" is missing from the fleet file")]
+    Missing(&'static str),
+    /// The block that names the fleet is broken.
+    #[error("block \"{FLEET_BLOCK}\" is broken")]
+    About(#[source] DecodeError),
+    /// The fleet's name is none.
+    #[error("block \"{FLEET_BLOCK}\" holds an illegal name")]
+    Name(#[source] LabelError),
+    /// The CA certificate is broken.
+    #[error("block \"{CERTIFICATE_BLOCK}\" is broken")]
+    Certificate(#[source] AnchorError),
+    /// The CA key is broken.
+    #[error(
+        "block \"{KEY_BLOCK}\" is no key in PKCS #8 that is P-256, P-384, Ed25519 or RSA of 2048 bits and more"
+    )]
+    Key,
+    /// The key is not that of the certificate.
+    #[error("the key and the certificate in the fleet file do not belong together")]
+    KeyMismatch,
+    /// The secret has a wrong length.
+    #[error("block \"{SECRET_BLOCK}\" does not hold {SECRET_BYTES} bytes")]
+    Secret,
+    /// A naming secret is broken, not the one that the roster names, or one too many.
+    #[error("the blocks \"{NAMING_BLOCK}\" are not those that the roster names")]
+    NamingSecret,
+    /// The roster cannot be read.
+    #[error("block \"{ROSTER_BLOCK}\" is broken")]
+    Roster(#[source] DecodeError),
+    /// The roster is not as the CA signed it.
+    #[error(
+        "block \"{ROSTER_BLOCK}\" was altered: its signature is not the CA's; restore the file from a copy"
+    )]
+    RosterSignature,
+    /// The roster would be longer than what is read.
+    #[error("the roster would have {bytes} bytes, at most {ROSTER_BYTES_MAX} are kept: make a second fleet")]
+    RosterFull {
+        /// Its length.
+        bytes: usize,
+    },
+    /// The fleet has too many nodes.
+    #[error("a fleet has at most {ROSTER_NODES_MAX} nodes: make a second one")]
+    TooManyNodes,
+    /// A node has too many certificates that hold.
+    #[error(
+        "node {node} has {NODE_CERTIFICATES_MAX} certificates that hold, more are not made: renew more seldom"
+    )]
+    TooManyCertificates {
+        /// Which.
+        node: NodeName,
+    },
+    /// No such node.
+    #[error("the fleet's roster has no node {node}: see `sgc fleet list`")]
+    UnknownNode {
+        /// Which was asked for.
+        node: String,
+    },
+    /// The node is revoked.
+    #[error("node {node} was revoked at {at}: `sgc fleet enroll {node} --again` makes it a node anew")]
+    NodeRevoked {
+        /// Which.
+        node: NodeName,
+        /// Since when.
+        at: UnixMillis,
+    },
+    /// A request for a certificate that cannot be used.
+    #[error("the request for a certificate cannot be used: {0}")]
+    Request(&'static str),
+    /// A certificate that cannot be entered in the roster.
+    #[error("the certificate cannot be entered in the roster: {0}")]
+    Adopt(&'static str),
+    /// No more generations.
+    #[error("{SECRET_GENERATIONS_MAX} generations of the secret are in use: retire old ones first")]
+    TooManyGenerations,
+    /// The generation in use cannot go.
+    #[error("generation {newest} is the newest of the secret and stays: rotate first")]
+    NewestGeneration {
+        /// Its number.
+        newest: u32,
+    },
+    /// A CA's name that cannot be repeated in certificates.
+    #[error(
+        "the name of this CA cannot be written by SGC (a component occurs twice, or is of a rare kind): keep the key \
+         where it is and have the CA sign what `sgc fleet request` makes"
+    )]
+    CaName,
+    /// A certificate that is no CA's.
+    #[error("this certificate is not that of a CA that may sign certificates and revocation lists: {0}")]
+    NotACa(&'static str),
+    /// The CA is over.
+    #[error(
+        "the fleet's CA expired at {not_after} and the clock here says {now}: create a new fleet, or set the clock"
+    )]
+    CaExpired {
+        /// Its end.
+        not_after: UnixMillis,
+        /// The time of the request.
+        now: UnixMillis,
+    },
+    /// Too many groups are asked for.
+    #[error("a node is in at most {GROUPS_MAX} groups, {groups} are asked for")]
+    TooManyGroups {
+        /// How many.
+        groups: usize,
+    },
+    /// The time, or the time plus the validity, is no date that certificates can hold.
+    #[error("a certificate cannot be valid until {0}: is the clock right?")]
+    Time(UnixMillis),
+    /// The certificate could not be made.
+    #[error("the certificate could not be made: {0}")]
+    Making(String),
+}
+
+impl FleetError {
+    pub(crate) fn making(error: impl fmt::Display) -> Self {
+        Self::Making(error.to_string())
+    }
+}

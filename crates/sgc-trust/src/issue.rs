@@ -1,0 +1,297 @@
+//! Makes what a CA signs: certificates of nodes, revocation lists; and reads requests for certificates.
+//!
+//! It keeps nothing and decides nothing: who gets what is [`crate::Fleet`]'s to know.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use aws_lc_rs::digest;
+use rand_core::CryptoRng;
+use rcgen::string::{BmpString, Ia5String, PrintableString, TeletexString, UniversalString};
+use rcgen::{
+    BasicConstraints, CertificateParams, CertificateRevocationListParams, DistinguishedName, DnType, DnValue,
+    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyUsagePurpose, PublicKeyData, RevokedCertParams,
+    SanType, SerialNumber,
+};
+use rustls_pki_types::CertificateDer;
+use sgc_wire::{CSR_BYTES_MAX, GroupTag, Pseudonym, UnixMillis};
+use zeroize::Zeroizing;
+
+use crate::fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY};
+use crate::fleet_error::FleetError;
+use crate::key::Key;
+use crate::member::KEY_BLOCK;
+use crate::pem;
+use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, NODE_URI, ROUTER_URI};
+use crate::x509::{CaFields, RequestFields, Validity};
+
+/// The year 9000: what certificates can say ends a little later.
+const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
+
+/// In whole seconds, as certificates count. A macro since the type of the result belongs to a crate (`time`) that
+/// is not a dependency of this one.
+macro_rules! date_time {
+    ($millis:expr) => {
+        rcgen::date_time_ymd(1970, 1, 1) + Duration::from_secs($millis.secs())
+    };
+}
+
+/// A certificate that takes revocation is known by this; big-endian, without leading zeros.
+pub(crate) type Serial = Arc<[u8]>;
+
+/// What a node's certificate is to say.
+pub(crate) struct Leaf {
+    pub(crate) pseudonym: Pseudonym,
+    pub(crate) groups: Vec<GroupTag>,
+    pub(crate) may_route: bool,
+    pub(crate) valid: Duration,
+    pub(crate) now: UnixMillis,
+}
+
+impl Leaf {
+    fn params(&self) -> Result<CertificateParams, FleetError> {
+        let mut params = CertificateParams::default();
+        params.distinguished_name = common_name(&self.pseudonym.to_string());
+        params.subject_alt_names = sans(&self.pseudonym, &self.groups, self.may_route)?;
+        params.is_ca = IsCa::ExplicitNoCa;
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.extended_key_usages =
+            vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
+        params.use_authority_key_identifier_extension = true;
+        Ok(params)
+    }
+
+    /// A certificate for `key`, and its serial number.
+    pub(crate) fn sign(
+        &self,
+        key: &impl PublicKeyData,
+        ca: &CertificateDer<'_>,
+        ca_key: &Key,
+        validity: Validity,
+        rng: &mut impl CryptoRng,
+    ) -> Result<CertificateDer<'static>, FleetError> {
+        let mut params = self.params()?;
+        params.serial_number = Some(serial(rng));
+        // Not before the CA and not past it: a certificate that outlives its CA is a surprise for later.
+        params.not_before = date_time!(before(self.now, CLOCK_SKEW).max(validity.not_before));
+        params.not_after = date_time!(after(self.now, self.valid)?.min(validity.not_after));
+        let issuer = issuer_params(ca)?;
+        let certificate = params.signed_by(key, &Issuer::from_params(&issuer, ca_key));
+        Ok(certificate.map_err(FleetError::making)?.into())
+    }
+}
+
+/// A certificate of `key` for a new fleet. Its subject is made from its key: two CAs never share one, so that a
+/// certificate of another fleet is told apart from a forged one, and nothing is said of the fleet.
+pub(crate) fn self_signed_ca(
+    key: &Key,
+    now: UnixMillis,
+    rng: &mut impl CryptoRng,
+) -> Result<CertificateDer<'static>, FleetError> {
+    let fingerprint = digest::digest(&digest::SHA256, &key.subject_public_key_info());
+    let mut params = CertificateParams::default();
+    params.distinguished_name = common_name(&format!("sgc fleet CA {}", hex(&fingerprint.as_ref()[..4])));
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(1));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    let not_after = after(now, CA_VALIDITY)?;
+    params.not_before = date_time!(before(now, CLOCK_SKEW));
+    params.not_after = date_time!(not_after);
+    params.serial_number = Some(serial(rng));
+    Ok(params.self_signed(key).map_err(FleetError::making)?.into())
+}
+
+/// A revocation list, DER.
+pub(crate) fn revocation_list(
+    ca: &CertificateDer<'_>,
+    ca_key: &Key,
+    revoked: &[(Serial, UnixMillis)],
+    number: u64,
+    now: UnixMillis,
+) -> Result<Vec<u8>, FleetError> {
+    let entry = |(serial, at): &(Serial, UnixMillis)| RevokedCertParams {
+        serial_number: SerialNumber::from_slice(serial),
+        revocation_time: date_time!(*at),
+        reason_code: None,
+        invalidity_date: None,
+    };
+    let next_update = after(now, CRL_VALIDITY)?;
+    let issuer = issuer_params(ca)?;
+    let params = CertificateRevocationListParams {
+        this_update: date_time!(now),
+        next_update: date_time!(next_update),
+        crl_number: SerialNumber::from(number),
+        issuing_distribution_point: None,
+        revoked_certs: revoked.iter().map(entry).collect(),
+        key_identifier_method: issuer.key_identifier_method.clone(),
+    };
+    let list = params.signed_by(&Issuer::from_params(&issuer, ca_key)).map_err(FleetError::making)?;
+    Ok(list.der().to_vec())
+}
+
+/// A request for a certificate that names this node, DER (PKCS #10), signed by its key.
+pub(crate) fn signing_request(
+    key: &Key,
+    pseudonym: Option<&Pseudonym>,
+    groups: &[GroupTag],
+    may_route: bool,
+) -> Option<Vec<u8>> {
+    let mut params = CertificateParams::default();
+    params.distinguished_name = DistinguishedName::new();
+    if let Some(pseudonym) = pseudonym {
+        params.distinguished_name = common_name(&pseudonym.to_string());
+        params.subject_alt_names = sans(pseudonym, groups, may_route).ok()?;
+    }
+    Some(params.serialize_request(key).ok()?.der().to_vec())
+}
+
+/// A key that its node makes for itself, and the request for a certificate that goes to the fleet, or to another CA.
+pub struct KeyRequest {
+    key: Key,
+    csr: Vec<u8>,
+}
+
+impl KeyRequest {
+    /// A new P-256 key. With a pseudonym the request names the node, so that a CA that knows nothing of SGC only has
+    /// to copy its subject alternative names.
+    pub fn generate(pseudonym: Option<&Pseudonym>, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
+        let key = Key::generate(rng);
+        let csr = signing_request(&key, pseudonym, &[], false);
+        let csr = csr.ok_or_else(|| FleetError::Making("its key cannot sign it".into()))?;
+        Ok(Self { key, csr })
+    }
+
+    /// The private key as text, for a file that only its owner may read.
+    pub fn key_text(&self) -> Zeroizing<String> {
+        let comment = "# Private key of an SGC node. KEEP IT SECRET and where it is.\n";
+        pem::write(comment, &[(KEY_BLOCK, self.key.pkcs8())])
+    }
+
+    /// The request (PKCS #10) as text. It is no secret.
+    pub fn csr_text(&self) -> String {
+        String::clone(&pem::write("", &[("CERTIFICATE REQUEST", &self.csr)]))
+    }
+}
+
+/// The key that a request asks a certificate for. Nothing else is read of it: what a certificate says is for the CA
+/// to know.
+pub(crate) struct RequestedKey {
+    algorithm: &'static rcgen::SignatureAlgorithm,
+    key: Vec<u8>,
+}
+
+impl RequestedKey {
+    /// Of a request that this key signed.
+    pub(crate) fn of(request: &[u8]) -> Result<Self, FleetError> {
+        const ECDSA: [&rcgen::SignatureAlgorithm; 2] =
+            [&rcgen::PKCS_ECDSA_P256_SHA256, &rcgen::PKCS_ECDSA_P384_SHA384];
+        if request.len() > CSR_BYTES_MAX {
+            return Err(FleetError::Request("it is too long"));
+        }
+        let fields = RequestFields::of(request).ok_or(FleetError::Request("it is not PKCS #10 in DER"))?;
+        let (key_algorithm, key) = fields.key;
+        let used = CHAIN_ALGORITHMS
+            .iter()
+            .filter(|a| a.signature_alg_id().as_ref() == fields.algorithm)
+            .find(|a| a.public_key_alg_id().as_ref() == key_algorithm)
+            .ok_or(FleetError::Request("its key is not P-256, P-384, Ed25519 or RSA"))?;
+        used.verify_signature(key, fields.info, fields.signature)
+            .map_err(|_| FleetError::Request("its key did not sign it"))?;
+        let id = used.public_key_alg_id();
+        let algorithm = if id == webpki::aws_lc_rs::ED25519.public_key_alg_id() {
+            &rcgen::PKCS_ED25519
+        } else if id == webpki::aws_lc_rs::ECDSA_P256_SHA256.public_key_alg_id() {
+            ECDSA[0]
+        } else if id == webpki::aws_lc_rs::ECDSA_P384_SHA384.public_key_alg_id() {
+            ECDSA[1]
+        } else {
+            &rcgen::PKCS_RSA_SHA256
+        };
+        Ok(Self { algorithm, key: key.to_vec() })
+    }
+}
+
+impl PublicKeyData for RequestedKey {
+    fn der_bytes(&self) -> &[u8] {
+        &self.key
+    }
+
+    fn algorithm(&self) -> &'static rcgen::SignatureAlgorithm {
+        self.algorithm
+    }
+}
+
+/// What certificates and lists take over from the certificate of their CA.
+fn issuer_params(ca: &CertificateDer<'_>) -> Result<CertificateParams, FleetError> {
+    let fields = CaFields::of(ca).ok_or(FleetError::CaName)?;
+    let mut params = CertificateParams::default();
+    params.distinguished_name = DistinguishedName::new();
+    for (id, tag, value) in fields.name {
+        let kind = DnType::CustomDnType(id);
+        if params.distinguished_name.get(&kind).is_some() {
+            return Err(FleetError::CaName);
+        }
+        params.distinguished_name.push(kind, dn_value(tag, value).ok_or(FleetError::CaName)?);
+    }
+    params.key_usages = Vec::new();
+    params.key_identifier_method =
+        fields.key_id.map_or(KeyIdMethod::Sha256, |id| KeyIdMethod::PreSpecified(id.to_vec()));
+    Ok(params)
+}
+
+fn dn_value(tag: u8, value: &[u8]) -> Option<DnValue> {
+    let text = || std::str::from_utf8(value).ok();
+    Some(match tag {
+        0x0c => DnValue::Utf8String(text()?.to_owned()),
+        0x13 => DnValue::PrintableString(PrintableString::try_from(text()?).ok()?),
+        0x14 => DnValue::TeletexString(TeletexString::try_from(text()?).ok()?),
+        0x16 => DnValue::Ia5String(Ia5String::try_from(text()?).ok()?),
+        0x1c => DnValue::UniversalString(UniversalString::from_utf32be(value.to_vec()).ok()?),
+        0x1e => DnValue::BmpString(BmpString::from_utf16be(value.to_vec()).ok()?),
+        _ => return None,
+    })
+}
+
+fn sans(pseudonym: &Pseudonym, groups: &[GroupTag], may_route: bool) -> Result<Vec<SanType>, FleetError> {
+    let uri = |text: String| Ok(SanType::URI(text.try_into().map_err(FleetError::making)?));
+    let mut names = vec![uri(format!("{NODE_URI}{pseudonym}"))?];
+    for group in groups {
+        names.push(uri(format!("{GROUP_URI}{group}"))?);
+    }
+    if may_route {
+        names.push(uri(ROUTER_URI.to_owned())?);
+    }
+    Ok(names)
+}
+
+fn common_name(name: &str) -> DistinguishedName {
+    let mut out = DistinguishedName::new();
+    out.push(DnType::CommonName, name);
+    out
+}
+
+/// 126 random bits, positive and of a fixed length as RFC 5280, 4.1.2.2 wants it.
+fn serial(rng: &mut impl CryptoRng) -> SerialNumber {
+    let mut bytes = [0; 16];
+    rng.fill_bytes(&mut bytes);
+    bytes[0] = (bytes[0] & 0x3f) | 0x40;
+    SerialNumber::from_slice(&bytes)
+}
+
+fn before(now: UnixMillis, by: Duration) -> UnixMillis {
+    UnixMillis(now.0.saturating_sub(by.as_millis() as u64))
+}
+
+fn after(now: UnixMillis, by: Duration) -> Result<UnixMillis, FleetError> {
+    let by = u64::try_from(by.as_millis()).unwrap_or(u64::MAX);
+    let then = UnixMillis(now.0.saturating_add(by));
+    if then > TIME_MAX { Err(FleetError::Time(then)) } else { Ok(then) }
+}
+
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    use fmt::Write as _;
+    bytes.iter().fold(String::new(), |mut out, byte| {
+        let _ = write!(out, "{byte:02x}");
+        out
+    })
+}

@@ -1,0 +1,217 @@
+//! Share tokens: one interface of an owner, for a partner whose nodes belong to another fleet.
+//!
+//! A token holds what a member of the fleet would derive: whose the interface is, what it is, and its topic secret,
+//! which leads to its name and to no other. It admits nobody by itself: the owner's policy names the partner's CA.
+//! Text and bytes are those of `docs/spec/trust.md`. Where tokens are kept is the business of the node.
+
+use std::fmt;
+
+use aws_lc_rs::digest;
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use rustls_pki_types::CertificateDer;
+use sgc_wire::{
+    CERT_BYTES_MAX, Decode as _, DecodeError, Encode as _, Kind, Metadata, Name, NodeId, Reader, UnixMillis,
+    Writer,
+};
+use zeroize::Zeroizing;
+
+use crate::label::LABEL_BYTES_MAX;
+use crate::{AnchorError, CaFingerprint, NodeName, TopicSecret, TrustAnchors, name_of};
+
+/// What the text of a token begins with; the number is the version.
+pub const TOKEN_PREFIX: &str = "sgc-token-1:";
+/// Most routers that one token names.
+pub const TOKEN_ROUTERS_MAX: usize = 16;
+/// Longest text of a token, bytes: one with every field at its bound fits.
+pub const TOKEN_TEXT_BYTES_MAX: usize = 28 * 1024;
+
+/// What tokens of any version begin with.
+const ANY_PREFIX: &str = "sgc-token-";
+const VERSION: u8 = 1;
+const ROUTER_BYTES_MAX: usize = 300;
+const CHECKSUM_BYTES: usize = 4;
+const CHECKSUM_DOMAIN: &[u8] = b"sgc token v1";
+
+/// One interface, handed to a partner. Compared in constant time where it is secret; Debug shows nothing secret.
+#[derive(Clone, PartialEq, Eq)]
+pub struct ShareToken {
+    /// Whose interface it is.
+    pub owner: NodeId,
+    /// The owner's name in its fleet, for people; also in the metadata.
+    pub owner_name: NodeName,
+    /// The CA of the owner's fleet, which the partner has to trust to reach the owner.
+    pub ca: CertificateDer<'static>,
+    /// What the interface is; a topic with a type.
+    pub metadata: Metadata,
+    /// What the name follows from.
+    pub secret: TopicSecret,
+    /// Routers at which the owner can be reached, as URLs; hints, not checked here.
+    pub routers: Vec<String>,
+    /// Last moment at which the owner admits the partner.
+    pub expires: UnixMillis,
+}
+
+impl ShareToken {
+    /// Reads a token; white space around it does not count.
+    pub fn parse(text: &str) -> Result<Self, TokenError> {
+        let text = text.trim();
+        if text.len() > TOKEN_TEXT_BYTES_MAX {
+            return Err(TokenError::TooLong { bytes: text.len() });
+        }
+        let Some(base64) = text.strip_prefix(TOKEN_PREFIX) else {
+            return Err(match text.starts_with(ANY_PREFIX) {
+                true => TokenError::Version,
+                false => TokenError::Prefix,
+            });
+        };
+        let bytes = URL_SAFE_NO_PAD.decode(base64).map(Zeroizing::new).map_err(|_| TokenError::NotBase64)?;
+        let (content, found) = bytes
+            .len()
+            .checked_sub(CHECKSUM_BYTES)
+            .and_then(|at| bytes.split_at_checked(at))
+            .ok_or(TokenError::Checksum)?;
+        if found != checksum(content) {
+            return Err(TokenError::Checksum);
+        }
+        Self::decode(content)
+    }
+
+    /// The text of the token. It is a secret: whoever holds it can derive the name.
+    pub fn to_text(&self) -> Zeroizing<String> {
+        let mut content = Zeroizing::new(self.encode());
+        let sum = checksum(&content);
+        content.extend_from_slice(&sum);
+        let mut text = Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX));
+        text.push_str(TOKEN_PREFIX);
+        URL_SAFE_NO_PAD.encode_string(content.as_slice(), &mut text);
+        text
+    }
+
+    /// The name of the interface.
+    pub fn name(&self) -> Name {
+        name_of(&self.owner, &self.secret.blind())
+    }
+
+    /// The CA of the owner's fleet.
+    pub fn ca_fingerprint(&self) -> Result<CaFingerprint, TokenError> {
+        let anchors = TrustAnchors::new([self.ca.clone()]).map_err(TokenError::Ca)?;
+        anchors.fingerprints().next().ok_or(TokenError::Ca(AnchorError::None))
+    }
+
+    fn encode(&self) -> Vec<u8> {
+        // Capacity up front: a vector that grows leaves copies of the secret behind.
+        let mut head = Writer::default();
+        head.u8(VERSION);
+        self.owner.encode(&mut head);
+        head.str(self.owner_name.as_str());
+        head.bytes(&self.ca);
+        self.metadata.encode(&mut head);
+        let mut tail = Writer::default();
+        tail.list(&self.routers, |w, url| w.str(url));
+        self.expires.encode(&mut tail);
+        let (head, tail) = (head.into_vec(), tail.into_vec());
+        let mut content =
+            Vec::with_capacity(head.len() + self.secret.expose().len() + tail.len() + CHECKSUM_BYTES);
+        content.extend_from_slice(&head);
+        content.extend_from_slice(self.secret.expose());
+        content.extend_from_slice(&tail);
+        content
+    }
+
+    fn decode(content: &[u8]) -> Result<Self, TokenError> {
+        let mut r = Reader::new(content);
+        if r.u8()? != VERSION {
+            return Err(TokenError::Version);
+        }
+        let owner = NodeId::decode(&mut r)?;
+        let owner_name = r.str("owner name", LABEL_BYTES_MAX)?;
+        let ca = CertificateDer::from(r.bytes("CA certificate", CERT_BYTES_MAX)?.to_vec());
+        let metadata = Metadata::decode(&mut r)?;
+        let secret = TopicSecret::from_bytes(r.array("topic secret")?);
+        let routers = r.list("routers", TOKEN_ROUTERS_MAX, |r| r.str("router", ROUTER_BYTES_MAX))?;
+        let expires = UnixMillis::decode(&mut r)?;
+        r.finish()?;
+        let owner_name: NodeName = owner_name.parse().map_err(|_| TokenError::Owner)?;
+        let token = Self { owner, owner_name, ca, metadata, secret, routers, expires };
+        token.check()?;
+        Ok(token)
+    }
+
+    /// Whether the fields are those of a token; what is refused when read must not be written.
+    pub fn check(&self) -> Result<(), TokenError> {
+        let Metadata { kind, owner, ros_name, type_name, .. } = &self.metadata;
+        if owner != self.owner_name.as_str() {
+            return Err(TokenError::Owner);
+        }
+        if *kind != Kind::Topic || ros_name.is_empty() || type_name.is_empty() {
+            return Err(TokenError::Interface);
+        }
+        let long = self.routers.iter().find(|url| url.len() > ROUTER_BYTES_MAX);
+        if self.routers.len() > TOKEN_ROUTERS_MAX || long.is_some() {
+            return Err(TokenError::Routers);
+        }
+        self.ca_fingerprint().map(drop)
+    }
+}
+
+impl fmt::Debug for ShareToken {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ShareToken")
+            .field("owner", &self.owner)
+            .field("owner_name", &self.owner_name)
+            .field("metadata", &self.metadata)
+            .field("routers", &self.routers)
+            .field("expires", &self.expires)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Guards against a token that was cut or mistyped, not against one that was forged: what a forged one leads to is
+/// for the owner to refuse.
+fn checksum(content: &[u8]) -> [u8; CHECKSUM_BYTES] {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(CHECKSUM_DOMAIN);
+    context.update(content);
+    let mut out = [0; CHECKSUM_BYTES];
+    out.iter_mut().zip(context.finish().as_ref()).for_each(|(out, byte)| *out = *byte);
+    out
+}
+
+/// Why a text is no token. None of them repeats the text, which may be one but for a letter.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TokenError {
+    /// Too long.
+    #[error("it has {bytes} bytes, a token has at most {TOKEN_TEXT_BYTES_MAX}")]
+    TooLong {
+        /// Its length.
+        bytes: usize,
+    },
+    /// Something else altogether.
+    #[error("it is no token: one begins with \"{TOKEN_PREFIX}\"")]
+    Prefix,
+    /// Of a version that is not known here.
+    #[error("its version is not known here: \"{TOKEN_PREFIX}\" is")]
+    Version,
+    /// Characters that tokens do not have.
+    #[error("it was cut or mistyped: behind \"{TOKEN_PREFIX}\" are letters, digits, '-' and '_' only")]
+    NotBase64,
+    /// Cut or mistyped.
+    #[error("it was cut or mistyped: its checksum is wrong")]
+    Checksum,
+    /// Bytes that are not the fields of a token.
+    #[error("its content cannot be read: {0}")]
+    Malformed(#[from] DecodeError),
+    /// No valid name of an owner, or two.
+    #[error("it names its owner wrongly")]
+    Owner,
+    /// Not a topic with a type.
+    #[error("it stands for no topic with a type")]
+    Interface,
+    /// The CA certificate is none.
+    #[error("its CA certificate is of no use: {0}")]
+    Ca(AnchorError),
+    /// Too many routers, or too long.
+    #[error("it names more than {TOKEN_ROUTERS_MAX} routers, or one of more than {ROUTER_BYTES_MAX} bytes")]
+    Routers,
+}

@@ -1,0 +1,142 @@
+//! Golden vectors of sealing and signing in every suite. `scripts/trust-vectors.py` made them with another
+//! implementation, and checks the same file.
+
+use sgc_trust::{Batch, BatchVerifier, MessageKey, OpenError, SourceKey, Suite, TAG_BYTES, opened_bytes};
+use sgc_wire::{
+    Decode, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader, SecretBytes, SinkId, SourceId,
+    TopicGrant,
+};
+
+const NAME: Name = Name([0xaa; 32]);
+const SOURCE: SourceId = SourceId([0xbb; 16]);
+const SINK: SinkId = SinkId([0xcc; 16]);
+
+struct Vector {
+    suite: Suite,
+    /// PKCS #8 and what is announced.
+    key: Option<(Vec<u8>, Vec<u8>)>,
+    headers: Vec<PacketHeader>,
+    payloads: Vec<Vec<u8>>,
+}
+
+fn vectors() -> Vec<Vector> {
+    let all: serde_json::Value =
+        serde_json::from_str(include_str!("vectors/sealing.json")).expect("the file is JSON");
+    let list = |v: &serde_json::Value| v.as_array().expect("a list").iter().map(hex).collect::<Vec<_>>();
+    let vector = |v: &serde_json::Value| Vector {
+        suite: v["suite"].as_str().expect("a name").parse().expect("a suite"),
+        key: v["key"].as_str().map(|kind| {
+            let key = &all["keys"][kind];
+            (hex(&key["pkcs8"]), hex(&key["public"]))
+        }),
+        headers: list(&v["headers"]).iter().map(|h| PacketHeader::from_slice(h).expect("a header")).collect(),
+        payloads: list(&v["payloads"]),
+    };
+    let vectors: Vec<_> = all["suites"].as_array().expect("a list").iter().map(vector).collect();
+    assert_eq!(vectors.iter().map(|v| v.suite).collect::<Vec<_>>(), Suite::ALL);
+    vectors
+}
+
+fn hex(text: &serde_json::Value) -> Vec<u8> {
+    let digits = text.as_str().expect("text");
+    let byte = |n| u8::from_str_radix(&digits[n..n + 2], 16).expect("hexadecimal digits");
+    (0..digits.len()).step_by(2).map(byte).collect()
+}
+
+fn key(suite: Suite, header: &PacketHeader) -> SourceKey {
+    let key = SecretBytes::new(std::array::from_fn(|i| i as u8));
+    let grant = TopicGrant { epoch: 7, suite: suite.id(), key, sources: Vec::new(), entry: None };
+    let key = match header.to {
+        Some(sink) => SourceKey::derive_addressed(&grant, &NAME, &SOURCE, &sink),
+        None => SourceKey::derive(&grant, &NAME, &SOURCE),
+    };
+    key.expect("all suites are in every build")
+}
+
+/// What the fragment and the message head of a vector are.
+fn plain(header: &PacketHeader) -> (Vec<u8>, MessageHead) {
+    let start = usize::from(header.index) * usize::from(header.grid);
+    let byte = |i: usize| ((i as u64 * 7 + header.seq) % 251) as u8;
+    let fragment = (start..start + header.fragment_bytes()).map(byte).collect();
+    let head = match header.to {
+        Some(_) => MessageHead { kind: MessageKind::Synced, source_timestamp_ns: 0 },
+        None => MessageHead { kind: MessageKind::Write, source_timestamp_ns: 1_795_391_999_000_000_000 },
+    };
+    (fragment, head)
+}
+
+/// The packets of a vector as this build makes them.
+fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
+    let (mut batch, mut out) = (Batch::default(), Vec::new());
+    for header in &vector.headers {
+        let (fragment, head) = plain(header);
+        let sealed = key(vector.suite, header).seal(header, &head, &fragment);
+        batch.push(header, &sealed);
+        out.push(sealed);
+    }
+    if let Some((pkcs8, public)) = &vector.key {
+        let key = MessageKey::from_pkcs8(vector.suite, pkcs8).expect("a key of the suite");
+        assert_eq!(key.public(), public);
+        let signed = batch.sign(&key);
+        out.iter_mut().enumerate().for_each(|(n, payload)| signed.put_trailer(n, payload));
+    }
+    out
+}
+
+#[test]
+fn what_is_sealed_is_as_the_vectors_say() {
+    for vector in vectors() {
+        assert!(vector.headers.last().is_some_and(|h| h.to == Some(SINK)));
+        let random = matches!(vector.suite.name().split('-').next(), Some("paper"));
+        for ((header, ours), theirs) in vector.headers.iter().zip(payloads(&vector)).zip(&vector.payloads) {
+            // RSASSA-PSS is random: all but the signature, whose length is that of the modulus.
+            let signature = if !random {
+                0
+            } else if vector.suite.name().contains("3072") {
+                384
+            } else {
+                256
+            };
+            let fixed = ours.len() - signature;
+            assert_eq!(ours.len(), theirs.len(), "{}", vector.suite);
+            assert_eq!(ours[..fixed], theirs[..fixed], "{}, packet {}", vector.suite, header.seq);
+        }
+    }
+}
+
+#[test]
+fn the_vectors_open_and_verify() {
+    for vector in vectors() {
+        let mut verifier = vector
+            .key
+            .as_ref()
+            .map(|(_, public)| BatchVerifier::new(vector.suite, public).expect("a key of the suite"));
+        for (header, payload) in vector.headers.iter().zip(&vector.payloads) {
+            let mut out = vec![0; opened_bytes(header)];
+            assert_eq!(key(vector.suite, header).open(header, payload, &mut out), Ok(()));
+            let (fragment, head) = plain(header);
+            assert_eq!(out[..fragment.len()], fragment);
+            if header.index == 0 {
+                assert_eq!(MessageHead::from_slice(&out[fragment.len()..]), Ok(head));
+            }
+            let Some(verifier) = &mut verifier else { continue };
+            assert_eq!(verifier.verify(header, payload), Ok(()));
+            let other = PacketHeader { seq: header.seq + 1, ..header.clone() };
+            assert_eq!(verifier.verify(&other, payload), Err(OpenError::Signature));
+            let mut altered = payload.clone();
+            altered[header.fragment_bytes() + MESSAGE_HEAD_BYTES + TAG_BYTES - 20] ^= 1;
+            assert!(verifier.verify(header, &altered).is_err());
+        }
+    }
+}
+
+/// Not a test: prints what `scripts/trust-vectors.py --take` takes, so that the other side verifies what this one signs.
+#[test]
+#[ignore = "prints"]
+fn packets_signed_with_rsa() {
+    for vector in vectors().iter().filter(|v| v.suite.name().starts_with("paper")) {
+        let hex = |p: &Vec<u8>| p.iter().map(|b| format!("{b:02x}")).collect::<String>();
+        let payloads: Vec<_> = payloads(vector).iter().map(hex).collect();
+        println!("\nvector {} {}", vector.suite, payloads.join(" "));
+    }
+}

@@ -1,0 +1,207 @@
+//! `sgc audit`: shows who was granted, refused and cut off by a node of this machine.
+//!
+//! It reads the log that the node writes; the node need not run. What is in a log came from elsewhere: nothing of it
+//! reaches the terminal that could steer it.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use sgc_node::audit::{self, AuditEvent, AuditRecord};
+use sgc_node::config::{self, Config};
+
+use crate::error::CliError;
+use crate::fleet::unix_now;
+use crate::{output, run, status};
+
+const FILE_NAME: &str = "audit.jsonl";
+const NODE_CHARS: usize = 8;
+
+/// Show who was granted, refused and cut off, who linked, and what was changed.
+#[derive(Debug, Args)]
+pub(crate) struct AuditArgs {
+    /// The node's configuration; without it, the one node that has a log in the usual place
+    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["node", "file"])]
+    config: Option<PathBuf>,
+    /// The node's name, if its log is in the usual place
+    #[arg(long, value_name = "NAME", conflicts_with = "file")]
+    node: Option<String>,
+    /// The log
+    #[arg(long, value_name = "FILE")]
+    file: Option<PathBuf>,
+    /// Only this topic
+    #[arg(long, value_name = "/TOPIC")]
+    topic: Option<String>,
+    /// Only this peer: what the node's configuration calls it, or how its node id begins
+    #[arg(long, value_name = "PEER")]
+    peer: Option<String>,
+    /// Only this event, such as refused; may be repeated
+    #[arg(long = "event", value_name = "EVENT", value_parser = event)]
+    events: Vec<String>,
+    /// Only the last of it, such as 90s, 15min, 1h, 7d
+    #[arg(long, value_name = "TIME", value_parser = time)]
+    since: Option<Duration>,
+    /// Print lines of JSON, as in the log
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs `sgc audit`.
+pub(crate) fn audit(args: &AuditArgs) -> Result<(), CliError> {
+    let path = path(args)?;
+    let from = args
+        .since
+        .map_or(0, |since| unix_now().0.saturating_sub(u64::try_from(since.as_millis()).unwrap_or(u64::MAX)));
+    let mut found = Vec::new();
+    let malformed = audit::read(&path, |record| {
+        if record.unix_ms >= from && args.wants(&record) {
+            found.push(record);
+        }
+    });
+    let malformed = malformed.map_err(|error| CliError::NoAudit {
+        path: path.clone(),
+        reason: match error.kind() {
+            std::io::ErrorKind::NotFound => "there is no such file".to_owned(),
+            _ => error.to_string(),
+        },
+    })?;
+    if args.json {
+        for record in &found {
+            let line = serde_json::to_string(record).map_err(|error| CliError::Output(error.into()))?;
+            output::line(harmless(&line))?;
+        }
+    } else if found.is_empty() {
+        output::line("nothing found")?;
+    } else {
+        let head = ["time", "event", "topic", "peer", "why"].map(str::to_owned).to_vec();
+        let rows: Vec<_> = std::iter::once(head).chain(found.iter().map(row)).collect();
+        for line in output::columns(&rows) {
+            output::line(line)?;
+        }
+    }
+    if malformed > 0 {
+        let lines = if malformed == 1 { "1 line is".to_owned() } else { format!("{malformed} lines are") };
+        output::diagnostic(&format!(
+            "sgc: {}: {lines} not readable, as a killed node leaves it",
+            path.display()
+        ));
+    }
+    Ok(())
+}
+
+impl AuditArgs {
+    fn wants(&self, record: &AuditRecord) -> bool {
+        let is_peer = |wanted: &String| {
+            let begins = |id: &String| !wanted.is_empty() && id.starts_with(wanted.as_str());
+            record.peer_name.as_ref() == Some(wanted) || record.peer.as_ref().is_some_and(begins)
+        };
+        self.topic.as_ref().is_none_or(|topic| record.topic.as_ref() == Some(topic))
+            && self.peer.as_ref().is_none_or(is_peer)
+            && (self.events.is_empty() || self.events.contains(&record.event))
+    }
+}
+
+fn path(args: &AuditArgs) -> Result<PathBuf, CliError> {
+    let usual = |node: &str| sgc_node::state_dir(&Config::default(), node);
+    if let Some(file) = &args.file {
+        return Ok(file.clone());
+    }
+    if let Some(path) = &args.config {
+        let config = config::load(path, &run::environment)
+            .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
+        let state = sgc_node::state_dir(&config, &status::node_name(&config)?);
+        let path = audit::audit_path(config.audit.file.as_deref(), state.as_deref());
+        return path.filter(|_| !config.audit.off).ok_or_else(|| CliError::Cannot {
+            reason: "this node keeps no audit log: [audit] is off, or there is no state directory".to_owned(),
+        });
+    }
+    if let Some(node) = &args.node {
+        let dir = usual(node).ok_or(sgc_node::StateError::Nowhere)?;
+        return Ok(dir.join(FILE_NAME));
+    }
+    let dir = usual("node").ok_or(sgc_node::StateError::Nowhere)?;
+    only_log(dir.parent().unwrap_or(Path::new("/")))
+}
+
+fn only_log(dir: &Path) -> Result<PathBuf, CliError> {
+    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
+    let mut found: Vec<_> = entries.map(|e| e.path().join(FILE_NAME)).filter(|path| path.is_file()).collect();
+    found.sort();
+    let reason = match found.len() {
+        1 => return Ok(found.swap_remove(0)),
+        0 => format!("no node has a log in {}; name one with -c or --file", dir.display()),
+        _ => {
+            let nodes: Vec<_> = found
+                .iter()
+                .filter_map(|path| Some(path.parent()?.file_name()?.to_string_lossy().into_owned()))
+                .collect();
+            format!("which node? Name one with --node: {}", nodes.join(", "))
+        }
+    };
+    Err(CliError::Cannot { reason })
+}
+
+fn row(record: &AuditRecord) -> Vec<String> {
+    let short = || record.peer.as_ref().map(|peer| peer.chars().take(NODE_CHARS).collect());
+    let mut why = Vec::new();
+    why.extend(record.reason.clone());
+    why.extend(record.by.as_ref().map(|by| format!("by {by}")));
+    why.extend(record.epoch.map(|epoch| format!("epoch {epoch}")));
+    why.extend(record.remote.as_ref().map(|remote| format!("at {remote}")));
+    why.extend(record.lost.map(|lost| format!("{lost} records were lost")));
+    let cells = [
+        Some(record.time.clone()),
+        Some(record.event.clone()),
+        record.topic.clone().or_else(|| record.name.as_ref().map(|n| n.chars().take(NODE_CHARS).collect())),
+        record.peer_name.clone().or_else(short),
+        Some(why.join(", ")),
+    ];
+    cells.into_iter().map(|cell| plain(&cell.unwrap_or_default())).collect()
+}
+
+/// Without what a terminal could take as a command, and without what turns the direction of text.
+fn plain(text: &str) -> String {
+    text.chars().filter(|c| !is_harmful(*c)).collect()
+}
+
+/// JSON that is the same to a program, and nothing to a terminal.
+fn harmless(json: &str) -> String {
+    let escape = |c: char| match is_harmful(c) {
+        true => format!("\\u{:04x}", u32::from(c)),
+        false => c.to_string(),
+    };
+    json.chars().map(escape).collect()
+}
+
+fn is_harmful(c: char) -> bool {
+    c.is_control() || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+fn event(text: &str) -> Result<String, String> {
+    let known = AuditEvent::ALL.map(AuditEvent::label);
+    match known.contains(&text) {
+        true => Ok(text.to_owned()),
+        false => Err(format!("events are {}", known.join(", "))),
+    }
+}
+
+fn time(text: &str) -> Result<Duration, String> {
+    config::parse_duration(text).ok_or_else(|| "90s, 15min, 1h or 7d, for example".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_came_from_elsewhere_cannot_steer_a_terminal() {
+        let hostile = "a\u{1b}[2J\u{9b}31m\u{7f}\r\nb\u{202e}c";
+        assert_eq!(plain(hostile), "a[2J31mbc");
+        let json =
+            serde_json::to_string(&AuditRecord { event: hostile.into(), ..AuditRecord::default() }).unwrap();
+        let shown = harmless(&json);
+        assert!(!shown.chars().any(is_harmful), "{shown}");
+        let read: AuditRecord = serde_json::from_str(&shown).unwrap();
+        assert_eq!(read.event, hostile);
+    }
+}

@@ -1,0 +1,165 @@
+//! `sgc fleet create`, `import`, `set`: fleets as such.
+
+use std::path::{Path, PathBuf};
+
+use clap::{ArgAction, Args};
+use rustls_pki_types::CertificateDer;
+use sgc_trust::{Fleet, FleetName, NodeName, pem_contents};
+
+use super::{FLEET_EXTENSION, WhichFleet, fleet_option, system_rng, unix_now};
+use crate::error::CliError;
+use crate::files::{self, Existing};
+use crate::output;
+
+const KEPT: &str = "; a fleet is never overwritten: its nodes would no longer be known";
+
+/// Make a fleet: a certificate authority and a secret, in the file NAME.fleet.
+///
+/// Whoever holds the file can make nodes of the fleet. It is needed to enrol, renew and revoke nodes, not to run them:
+/// keep it off them, and keep a copy.
+#[derive(Debug, Args)]
+pub(super) struct CreateArgs {
+    /// Name of the fleet: a-z, 0-9, '-', '_' and '.'
+    name: String,
+    /// Where to write the file
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    dir: PathBuf,
+    #[command(flatten)]
+    traits: Traits,
+}
+
+/// Make a fleet around a CA that exists already.
+///
+/// The CA stays what it was; the file NAME.fleet holds its key besides the fleet's secret and roster. If its key must
+/// stay where it is, have the CA sign what `sgc fleet request` makes instead.
+#[derive(Debug, Args)]
+pub(super) struct ImportArgs {
+    /// Name of the fleet: a-z, 0-9, '-', '_' and '.'
+    name: String,
+    /// The CA's certificate, PEM
+    #[arg(long, value_name = "FILE")]
+    ca_cert: PathBuf,
+    /// The CA's private key, PEM (PKCS #8): P-256, P-384, Ed25519 or RSA
+    #[arg(long, value_name = "FILE")]
+    ca_key: PathBuf,
+    /// Where to write the file
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    dir: PathBuf,
+    #[command(flatten)]
+    traits: Traits,
+}
+
+/// Change what nodes of the fleet are told; each learns it when it is enrolled or renewed.
+#[derive(Debug, Args)]
+pub(super) struct SetArgs {
+    #[command(flatten)]
+    which: WhichFleet,
+    /// The node that renews certificates for the others
+    #[arg(long, value_name = "NODE", conflicts_with = "no_authority")]
+    authority: Option<String>,
+    /// No node renews certificates for the others
+    #[arg(long)]
+    no_authority: bool,
+    /// Whether links and grants resist quantum computers
+    #[arg(long, value_name = "true|false", action = ArgAction::Set)]
+    post_quantum: Option<bool>,
+}
+
+#[derive(Debug, Args)]
+struct Traits {
+    /// The node that is to renew certificates for the others
+    #[arg(long, value_name = "NODE")]
+    authority: Option<String>,
+    /// Make links and grants resist quantum computers
+    #[arg(long)]
+    post_quantum: bool,
+}
+
+pub(super) fn create(args: &CreateArgs) -> Result<(), CliError> {
+    let name: FleetName = args.name.parse()?;
+    let path = file_of(&name, &args.dir);
+    let fleet = Fleet::create(name, unix_now(), &mut system_rng()?)
+        .map_err(|source| CliError::Fleet { path: path.clone(), source })?;
+    finish(fleet, &args.traits, &path)
+}
+
+pub(super) fn import(args: &ImportArgs) -> Result<(), CliError> {
+    let name: FleetName = args.name.parse()?;
+    let path = file_of(&name, &args.dir);
+    let text = files::read_public(&args.ca_cert)?;
+    let pem = |path: &PathBuf| {
+        let path = path.clone();
+        move |source| CliError::Pem { path, source }
+    };
+    let certificate = pem_contents(&text, &["CERTIFICATE"]).map_err(pem(&args.ca_cert))?.into_iter().next();
+    let certificate = certificate.ok_or_else(|| CliError::NotInFile {
+        path: args.ca_cert.clone(),
+        what: "certificate in PEM",
+        hint: "it begins with -----BEGIN CERTIFICATE-----",
+    })?;
+    let text = files::read_secret(&args.ca_key, "the CA's private key")?;
+    let key = pem_contents(&text, &["PRIVATE KEY"]).map_err(pem(&args.ca_key))?.into_iter().next();
+    let key = key.ok_or_else(|| CliError::NotInFile {
+        path: args.ca_key.clone(),
+        what: "private key in PKCS #8",
+        hint: "`openssl pkcs8 -topk8 -nodes -in FILE` writes one",
+    })?;
+    let certificate = CertificateDer::from(certificate.to_vec());
+    let fleet = Fleet::import(name, certificate, &key, unix_now(), &mut system_rng()?)
+        .map_err(|source| CliError::Fleet { path: args.ca_cert.clone(), source })?;
+    finish(fleet, &args.traits, &path)
+}
+
+pub(super) fn set(args: &SetArgs) -> Result<(), CliError> {
+    let authority = args.authority.as_ref().map(|a| a.parse::<NodeName>()).transpose()?;
+    let mut file = args.which.open()?;
+    let now = unix_now();
+    if authority.is_some() || args.no_authority {
+        let done = file.fleet.set_authority(authority, now);
+        done.map_err(|e| file.error(e))?;
+    }
+    if let Some(on) = args.post_quantum {
+        let done = file.fleet.set_post_quantum(on, now);
+        done.map_err(|e| file.error(e))?;
+    }
+    file.save()?;
+    output::line(format!(
+        "{}: authority {}, post-quantum {}\nNodes learn it when they are enrolled or renewed.",
+        file.path.display(),
+        file.fleet.authority().map_or("none", NodeName::as_str),
+        if file.fleet.post_quantum() { "on" } else { "off" },
+    ))
+}
+
+fn file_of(name: &FleetName, dir: &Path) -> PathBuf {
+    let file = format!("{name}.{FLEET_EXTENSION}");
+    if dir == Path::new(".") { file.into() } else { dir.join(file) }
+}
+
+fn finish(mut fleet: Fleet, traits: &Traits, path: &Path) -> Result<(), CliError> {
+    let failed = |source| CliError::Fleet { path: path.to_owned(), source };
+    let authority = traits.authority.as_ref().map(|a| a.parse::<NodeName>()).transpose()?;
+    if authority.is_some() {
+        fleet.set_authority(authority, unix_now()).map_err(failed)?;
+    }
+    if traits.post_quantum {
+        fleet.set_post_quantum(true, unix_now()).map_err(failed)?;
+    }
+    files::write_secret(path, &fleet.to_text(), Existing::Keep(KEPT))?;
+    output::line(created_text(&fleet, path))
+}
+
+fn created_text(fleet: &Fleet, path: &Path) -> String {
+    let option = fleet_option(path);
+    format!(
+        "{}: fleet {}, its CA holds until {}\n\
+         Keep this file secret and keep a copy of it: whoever holds it can make nodes of the fleet.\n\n\
+         Next, an identity for each node, and one for the router:\n  \
+         sgc fleet enroll arm-1{option}\n  \
+         sgc fleet enroll desk --group operators{option}\n  \
+         sgc fleet enroll cloud --router{option}",
+        path.display(),
+        fleet.name(),
+        fleet.not_after(),
+    )
+}

@@ -1,0 +1,212 @@
+//! `sgc fleet enroll` and `renew`: identities, with keys made here or by the node.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use sgc_trust::{EnrollRequest, GroupName, Identity, LEAF_VALIDITY_DEFAULT, NodeName, pem_contents};
+use sgc_wire::UnixMillis;
+use zeroize::Zeroizing;
+
+use super::{DAY, WhichFleet, parse_span, system_rng, unix_now};
+use crate::error::CliError;
+use crate::files::{self, Existing};
+use crate::output;
+
+/// Make the identity of a node, in one file for that node.
+///
+/// The file holds the node's private key. Bring it to the node's machine and keep it there with mode 0600. A node that
+/// made its key itself (`sgc fleet request`) is answered with --csr: the answer holds no key.
+#[derive(Debug, Args)]
+pub(super) struct EnrollArgs {
+    /// Name of the node: a-z, 0-9, '-', '_' and '.'
+    node: String,
+    #[command(flatten)]
+    which: WhichFleet,
+    /// A group for the node to be in; may be repeated
+    #[arg(long = "group", value_name = "GROUP")]
+    groups: Vec<String>,
+    /// For a node that only routes: its identity lacks the fleet secret, so that it can read no payload
+    #[arg(long, conflicts_with = "may_route")]
+    router: bool,
+    /// Let a member route for others as well
+    #[arg(long)]
+    may_route: bool,
+    /// Make a node again of one that was revoked
+    #[arg(long)]
+    again: bool,
+    /// Answer this request, which the node made with `sgc fleet request`
+    #[arg(long, value_name = "FILE")]
+    csr: Option<PathBuf>,
+    #[command(flatten)]
+    made: Made,
+}
+
+/// Make a node's certificate anew, in its groups and with its role.
+///
+/// An identity that is here keeps its key. Without it, and without a request (--csr), the node gets a new key.
+#[derive(Debug, Args)]
+pub(super) struct RenewArgs {
+    /// Name of the node
+    node: String,
+    #[command(flatten)]
+    which: WhichFleet,
+    /// Answer this request, which the node made with `sgc fleet request`
+    #[arg(long, value_name = "FILE")]
+    csr: Option<PathBuf>,
+    #[command(flatten)]
+    made: Made,
+}
+
+#[derive(Debug, Args)]
+struct Made {
+    /// How long it is to hold, such as 90d or 12h [default: 90d]
+    #[arg(long, value_name = "TIME", value_parser = parse_span)]
+    valid: Option<Duration>,
+    /// The same in days
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), hide = true,
+          conflicts_with = "valid")]
+    days: Option<u32>,
+    /// Where to write it [default: NODE.identity, or NODE.answer]
+    #[arg(short, long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Replace a file that is there
+    #[arg(long)]
+    force: bool,
+}
+
+impl Made {
+    fn valid(&self) -> Duration {
+        self.valid.or(self.days.map(|days| DAY * days)).unwrap_or(LEAF_VALIDITY_DEFAULT)
+    }
+
+    fn path(&self, node: &NodeName, extension: &str) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| PathBuf::from(format!("{node}.{extension}")))
+    }
+
+    fn existing(&self) -> Existing {
+        match self.force {
+            true => Existing::Replace,
+            false => {
+                Existing::Keep("; --force replaces it (peers take the new one at once: same node, new key)")
+            }
+        }
+    }
+
+    /// Before the roster says that something was made, which then cannot be written.
+    fn check_free(&self, path: &Path) -> Result<(), CliError> {
+        match self.existing() {
+            Existing::Keep(hint) if files::exists(path) => {
+                Err(CliError::Exists { path: path.to_owned(), hint })
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
+    let node: NodeName = args.node.parse()?;
+    let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
+    let mut file = args.which.open()?;
+    let request = EnrollRequest {
+        groups,
+        router: args.router,
+        may_route: args.may_route,
+        again: args.again,
+        valid: args.made.valid(),
+        ..EnrollRequest::new(node, unix_now())
+    };
+    let rng = &mut system_rng()?;
+    if let Some(csr) = &args.csr {
+        let path = args.made.path(&request.node, "answer");
+        args.made.check_free(&path)?;
+        let member = file.fleet.enroll_csr(&read_csr(csr)?, &request, rng).map_err(|e| file.error(e))?;
+        file.save()?;
+        files::write_secret(&path, &member.to_text(), args.made.existing())?;
+        return output::line(answered_text(&request.node, &path));
+    }
+    let path = args.made.path(&request.node, "identity");
+    args.made.check_free(&path)?;
+    let identity = file.fleet.enroll(&request, rng).map_err(|e| file.error(e))?;
+    // The roster first: a certificate that it does not know cannot be revoked.
+    file.save()?;
+    files::write_secret(&path, &identity.to_text(), args.made.existing())?;
+    output::line(enrolled_text(&identity, &request, &path))
+}
+
+pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
+    let node: NodeName = args.node.parse()?;
+    let mut file = args.which.open()?;
+    let (valid, now, rng) = (args.made.valid(), unix_now(), &mut system_rng()?);
+    if let Some(csr) = &args.csr {
+        let path = args.made.path(&node, "answer");
+        args.made.check_free(&path)?;
+        let member = file.fleet.renew_member(&read_csr(csr)?, &node, valid, now, rng);
+        let member = member.map_err(|e| file.error(e))?;
+        file.save()?;
+        files::write_secret(&path, &member.to_text(), args.made.existing())?;
+        return output::line(answered_text(&node, &path));
+    }
+    let path = args.made.path(&node, "identity");
+    let old = if files::exists(&path) { Some(sgc_node::load_identity(&path)?) } else { None };
+    let new = match old.filter(|old| !args.made.force && old.node_id() == file.fleet.node_id_of(&node)) {
+        Some(old) => {
+            let member = file.fleet.renew_member(&old.csr(), &node, valid, now, rng);
+            let new = old.with_membership(member.map_err(|e| file.error(e))?);
+            new.map_err(|source| CliError::Identity { path: path.clone(), source })?
+        }
+        None => {
+            args.made.check_free(&path)?;
+            file.fleet.renew(&node, valid, now, rng).map_err(|e| file.error(e))?
+        }
+    };
+    file.save()?;
+    files::write_secret(&path, &new.to_text(), Existing::Replace)?;
+    output::line(renewed_text(&path, &node, new.not_after()))
+}
+
+fn read_csr(path: &Path) -> Result<Zeroizing<Vec<u8>>, CliError> {
+    let text = files::read_public(path)?;
+    let labels = ["CERTIFICATE REQUEST", "NEW CERTIFICATE REQUEST"];
+    let found =
+        pem_contents(&text, &labels).map_err(|source| CliError::Pem { path: path.to_owned(), source })?;
+    found.into_iter().next().ok_or_else(|| CliError::NotInFile {
+        path: path.to_owned(),
+        what: "request for a certificate",
+        hint: "on the node's machine, `sgc fleet request NODE` makes one",
+    })
+}
+
+fn answered_text(node: &NodeName, path: &Path) -> String {
+    let file = path.display();
+    format!(
+        "{file}: answer for {node}, without a private key\n\
+         It holds secrets of the fleet: bring it to the node's machine on a safe way. Then, there:\n  \
+         sgc fleet accept {file}"
+    )
+}
+
+fn renewed_text(path: &Path, node: &NodeName, not_after: UnixMillis) -> String {
+    format!("{}: node {node}, holds until {not_after}\nBring it to that node's machine.", path.display())
+}
+
+fn enrolled_text(identity: &Identity, request: &EnrollRequest, path: &Path) -> String {
+    let file = path.display();
+    let mut text = format!("{file}: ");
+    let _ = write!(text, "{} {}", if request.router { "router" } else { "node" }, request.node);
+    let _ = write!(text, " of fleet {}", identity.fleet_name());
+    if !request.groups.is_empty() {
+        let groups: Vec<_> = request.groups.iter().map(GroupName::as_str).collect();
+        let _ = write!(text, ", in {}", groups.join(", "));
+    }
+    let _ = writeln!(text, ", holds until {}", identity.not_after());
+    let _ = writeln!(text, "Bring it to that node's machine and keep it there, with mode 0600. Then, there:");
+    let command = if request.router {
+        format!("sgc router --identity {file} --listen quic://0.0.0.0:7447")
+    } else {
+        format!("sgc run --identity {file} --router quic://ROUTER --share /TOPIC --to NODE --use NODE:/TOPIC")
+    };
+    let _ = write!(text, "  {command}");
+    text
+}

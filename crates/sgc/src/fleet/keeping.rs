@@ -1,0 +1,273 @@
+//! `sgc fleet list`, `revoke`, `adopt`, `rotate-secret`, `retire-secret`: what a fleet's keeper does over the years.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use rustls_pki_types::CertificateDer;
+use serde::Serialize;
+use sgc_trust::{Fleet, GroupName, NodeName, RosterNode, pem_contents};
+use sgc_wire::UnixMillis;
+
+use super::{FleetFile, WhichFleet, system_rng, unix_now};
+use crate::error::CliError;
+use crate::files;
+use crate::output;
+
+const LIST_EXTENSION: &str = "crl";
+
+/// Show the nodes of a fleet: groups, role, until when their certificates hold, and who is revoked.
+#[derive(Debug, Args)]
+pub(super) struct ListArgs {
+    #[command(flatten)]
+    which: WhichFleet,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Revoke nodes: all of their certificates, for good.
+///
+/// Writes the revocation list of the fleet next to its file. Nodes that have it refuse the revoked ones at once and
+/// tell it to their neighbours. Without a node the list is written again.
+#[derive(Debug, Args)]
+pub(super) struct RevokeArgs {
+    /// Names of the nodes
+    nodes: Vec<String>,
+    #[command(flatten)]
+    which: WhichFleet,
+}
+
+/// Enter a certificate in the roster that was made before the fleet had one, so that it can be revoked.
+#[derive(Debug, Args)]
+pub(super) struct AdoptArgs {
+    /// Name of the node
+    node: String,
+    /// Its certificate, PEM
+    #[arg(long, value_name = "FILE")]
+    certificate: PathBuf,
+    #[command(flatten)]
+    which: WhichFleet,
+}
+
+/// Make a new generation of the secret that names are derived from.
+///
+/// Who has left the fleet can recognise names of shares that were made before, and none that are made later by nodes
+/// that have the new secret. Nodes get it when they are renewed.
+#[derive(Debug, Args)]
+pub(super) struct RotateArgs {
+    #[command(flatten)]
+    which: WhichFleet,
+}
+
+/// Take old generations of the naming secret out of use, once every node has a newer one.
+#[derive(Debug, Args)]
+pub(super) struct RetireArgs {
+    /// Generations before this one
+    #[arg(value_name = "GENERATION")]
+    before: u32,
+    #[command(flatten)]
+    which: WhichFleet,
+}
+
+#[derive(Serialize)]
+struct FleetJson<'a> {
+    fleet: &'a str,
+    expires: String,
+    authority: Option<&'a str>,
+    post_quantum: bool,
+    has_roster: bool,
+    revocation_list: u64,
+    secret_generations: Vec<GenerationJson>,
+    nodes: Vec<NodeJson<'a>>,
+}
+
+#[derive(Serialize)]
+struct GenerationJson {
+    number: u32,
+    created: String,
+}
+
+#[derive(Serialize)]
+struct NodeJson<'a> {
+    name: &'a str,
+    id: String,
+    groups: Vec<&'a str>,
+    role: &'static str,
+    expires: Option<String>,
+    revoked: Option<String>,
+    certificates: Vec<CertificateJson>,
+}
+
+#[derive(Serialize)]
+struct CertificateJson {
+    serial: String,
+    expires: String,
+    revoked: Option<String>,
+}
+
+pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
+    let (_, fleet) = args.which.read()?;
+    if args.json {
+        let json = serde_json::to_string_pretty(&json(&fleet));
+        let json = json.map_err(|e| CliError::System { what: "JSON", source: std::io::Error::other(e) })?;
+        return output::line(json);
+    }
+    output::line(table(&fleet, unix_now()))
+}
+
+pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
+    let nodes = args.nodes.iter().map(|n| n.parse()).collect::<Result<Vec<NodeName>, _>>()?;
+    let mut file = args.which.open()?;
+    let now = unix_now();
+    if !nodes.is_empty() {
+        let done = file.fleet.revoke(&nodes, now);
+        done.map_err(|e| file.error(e))?;
+        file.save()?;
+    }
+    let (path, list) = write_list(&file, now)?;
+    let mut text = String::new();
+    for node in &nodes {
+        text.push_str(&format!("{node}: revoked\n"));
+    }
+    text.push_str(&format!("{}: revocation list {}\n", path.display(), file.fleet.crl_number()));
+    let told = push_crl(&list);
+    if told.is_empty() {
+        text.push_str("Bring it to any node that runs: nodes tell it to each other.");
+    } else {
+        text.push_str(&format!("Told to {}: nodes tell it to each other.", told.join(", ")));
+    }
+    output::line(text)
+}
+
+pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
+    let node: NodeName = args.node.parse()?;
+    let path = &args.certificate;
+    let found = pem_contents(&files::read_public(path)?, &["CERTIFICATE"])
+        .map_err(|source| CliError::Pem { path: path.clone(), source })?;
+    let chain: Vec<_> = found.iter().map(|c| CertificateDer::from(c.to_vec())).collect();
+    let mut file = args.which.open()?;
+    let done = file.fleet.adopt(node.clone(), &chain, unix_now());
+    done.map_err(|source| CliError::Fleet { path: path.clone(), source })?;
+    file.save()?;
+    output::line(format!("{}: knows this certificate of {node} now", file.path.display()))
+}
+
+pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
+    let mut file = args.which.open()?;
+    let generation = file.fleet.rotate_secret(unix_now(), &mut system_rng()?);
+    let generation = generation.map_err(|e| file.error(e))?;
+    file.save()?;
+    output::line(format!(
+        "{}: generation {generation} of the naming secret\n\
+         Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
+         sgc fleet retire-secret {generation}",
+        file.path.display()
+    ))
+}
+
+pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
+    let mut file = args.which.open()?;
+    let done = file.fleet.retire_secrets(args.before);
+    done.map_err(|e| file.error(e))?;
+    file.save()?;
+    let left: Vec<_> = file.fleet.generations().iter().map(|g| g.number.to_string()).collect();
+    output::line(format!("{}: generations in use: {}", file.path.display(), left.join(", ")))
+}
+
+/// Hands a list to nodes that run here, and says which. There is no way yet.
+fn push_crl(_list: &[u8]) -> Vec<String> {
+    Vec::new()
+}
+
+fn write_list(file: &FleetFile, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
+    let list = file.fleet.revocation_list(now).map_err(|e| file.error(e))?;
+    let path = list_path(&file.path);
+    files::write_public(&path, &list)?;
+    Ok((path, list))
+}
+
+fn list_path(fleet: &Path) -> PathBuf {
+    fleet.with_extension(LIST_EXTENSION)
+}
+
+fn role(node: &RosterNode) -> &'static str {
+    match (node.router, node.may_route) {
+        (true, _) => "router",
+        (false, true) => "member, may route",
+        (false, false) => "member",
+    }
+}
+
+fn state(node: &RosterNode, now: UnixMillis) -> String {
+    match (node.revoked, node.expires()) {
+        (Some(at), _) => format!("revoked {at}"),
+        (None, Some(until)) if until < now => format!("expired {until}"),
+        (None, Some(until)) => format!("until {until}"),
+        (None, None) => "expired".to_owned(),
+    }
+}
+
+fn table(fleet: &Fleet, now: UnixMillis) -> String {
+    let heading = ["NODE", "ROLE", "CERTIFICATE", "GROUPS"].map(str::to_owned).to_vec();
+    let row = |node: &RosterNode| {
+        let groups: Vec<_> = node.groups.iter().map(GroupName::as_str).collect();
+        vec![node.name.to_string(), role(node).to_owned(), state(node, now), groups.join(", ")]
+    };
+    let rows: Vec<_> = std::iter::once(heading).chain(fleet.nodes().map(row)).collect();
+    let mut text = format!("fleet {}, its CA holds until {}", fleet.name(), fleet.not_after());
+    if let Some(authority) = fleet.authority() {
+        text.push_str(&format!(", renewed by {authority}"));
+    }
+    if fleet.post_quantum() {
+        text.push_str(", post-quantum");
+    }
+    text.push('\n');
+    if !fleet.has_roster() {
+        text.push_str(
+            "This file is from before fleets kept a roster: nodes enrolled with it are not known here. Enroll them \
+             again, or `sgc fleet adopt` their certificates.",
+        );
+        return text;
+    }
+    match fleet.nodes().len() {
+        0 => text.push_str("No nodes yet: sgc fleet enroll NODE"),
+        _ => text.push_str(&output::columns(&rows).join("\n")),
+    }
+    text
+}
+
+fn json(fleet: &Fleet) -> FleetJson<'_> {
+    let time = |t: UnixMillis| t.to_string();
+    let node = |node: &'_ RosterNode| {
+        let certificates = node.certificates.iter().map(|c| CertificateJson {
+            serial: c.serial.iter().map(|b| format!("{b:02x}")).collect(),
+            expires: time(c.not_after),
+            revoked: c.revoked.map(time),
+        });
+        (fleet.node_id_of(&node.name).to_string(), certificates.collect::<Vec<_>>())
+    };
+    let nodes = fleet.nodes().map(|n| {
+        let (id, certificates) = node(n);
+        NodeJson {
+            name: n.name.as_str(),
+            id,
+            groups: n.groups.iter().map(GroupName::as_str).collect(),
+            role: role(n),
+            expires: n.expires().map(time),
+            revoked: n.revoked.map(time),
+            certificates,
+        }
+    });
+    let generation =
+        |g: &sgc_trust::Generation| GenerationJson { number: g.number, created: time(g.created) };
+    FleetJson {
+        fleet: fleet.name().as_str(),
+        expires: time(fleet.not_after()),
+        authority: fleet.authority().map(NodeName::as_str),
+        post_quantum: fleet.post_quantum(),
+        has_roster: fleet.has_roster(),
+        revocation_list: fleet.crl_number(),
+        secret_generations: fleet.generations().iter().map(generation).collect(),
+        nodes: nodes.collect(),
+    }
+}

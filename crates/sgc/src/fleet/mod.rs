@@ -1,0 +1,177 @@
+//! `sgc fleet`: makes fleets, takes nodes in, renews them and takes them out.
+//!
+//! The files stay where they are written; bringing them to their machines is the user's. What is in them is the
+//! business of `sgc-trust`.
+
+mod create;
+mod enroll;
+mod keeping;
+mod own_key;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use clap::{Args, Subcommand};
+use rand_chacha::ChaCha20Rng;
+use rand_core::{OsRng, SeedableRng, TryRngCore};
+use sgc_trust::{Fleet, FleetError};
+use sgc_wire::UnixMillis;
+use zeroize::Zeroize;
+
+use crate::error::CliError;
+use crate::files::{self, Existing};
+
+const FLEET_EXTENSION: &str = "fleet";
+const DAY: Duration = Duration::from_secs(86_400);
+
+/// Make a fleet, and identities for its nodes; renew and revoke them.
+#[derive(Debug, Args)]
+pub(crate) struct FleetArgs {
+    #[command(subcommand)]
+    command: FleetCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum FleetCommand {
+    Create(create::CreateArgs),
+    Import(create::ImportArgs),
+    Enroll(enroll::EnrollArgs),
+    Request(own_key::RequestArgs),
+    Accept(own_key::AcceptArgs),
+    List(keeping::ListArgs),
+    Renew(enroll::RenewArgs),
+    Revoke(keeping::RevokeArgs),
+    Adopt(keeping::AdoptArgs),
+    RotateSecret(keeping::RotateArgs),
+    RetireSecret(keeping::RetireArgs),
+    Set(create::SetArgs),
+}
+
+/// Runs `sgc fleet`.
+pub(crate) fn fleet(args: FleetArgs) -> Result<(), CliError> {
+    match args.command {
+        FleetCommand::Create(args) => create::create(&args),
+        FleetCommand::Import(args) => create::import(&args),
+        FleetCommand::Enroll(args) => enroll::enroll(&args),
+        FleetCommand::Request(args) => own_key::request(&args),
+        FleetCommand::Accept(args) => own_key::accept(&args),
+        FleetCommand::List(args) => keeping::list(&args),
+        FleetCommand::Renew(args) => enroll::renew(&args),
+        FleetCommand::Revoke(args) => keeping::revoke(&args),
+        FleetCommand::Adopt(args) => keeping::adopt(&args),
+        FleetCommand::RotateSecret(args) => keeping::rotate(&args),
+        FleetCommand::RetireSecret(args) => keeping::retire(&args),
+        FleetCommand::Set(args) => create::set(&args),
+    }
+}
+
+/// Which fleet a command is about.
+#[derive(Debug, Args)]
+struct WhichFleet {
+    /// The fleet; without it, the one *.fleet file of this directory
+    #[arg(long, value_name = "FILE")]
+    fleet: Option<PathBuf>,
+}
+
+/// A fleet file that nobody else changes as long as this lives: two commands at once cannot lose what one of them
+/// wrote, least of all a revocation.
+struct FleetFile {
+    path: PathBuf,
+    fleet: Fleet,
+    _lock: File,
+}
+
+impl WhichFleet {
+    fn path(&self) -> Result<PathBuf, CliError> {
+        match &self.fleet {
+            Some(path) => Ok(path.clone()),
+            None => fleet_here(),
+        }
+    }
+
+    /// To be looked at.
+    fn read(&self) -> Result<(PathBuf, Fleet), CliError> {
+        let path = self.path()?;
+        let text = files::read_secret(&path, "the CA's private key")?;
+        let fleet = Fleet::parse(&text).map_err(|source| CliError::Fleet { path: path.clone(), source })?;
+        Ok((path, fleet))
+    }
+
+    /// To be changed.
+    fn open(&self) -> Result<FleetFile, CliError> {
+        let path = self.path()?;
+        let lock = files::lock(&path)?;
+        let (path, fleet) = Self { fleet: Some(path) }.read()?;
+        Ok(FleetFile { path, fleet, _lock: lock })
+    }
+}
+
+impl FleetFile {
+    fn error(&self, source: FleetError) -> CliError {
+        CliError::Fleet { path: self.path.clone(), source }
+    }
+
+    fn save(&self) -> Result<(), CliError> {
+        files::write_secret(&self.path, &self.fleet.to_text(), Existing::Replace)
+    }
+}
+
+/// A generator seeded by the system.
+pub(crate) fn system_rng() -> Result<ChaCha20Rng, CliError> {
+    let mut seed = [0; 32];
+    OsRng.try_fill_bytes(&mut seed).map_err(|e| CliError::System {
+        what: "the system gives no randomness",
+        source: std::io::Error::other(e.to_string()),
+    })?;
+    let rng = ChaCha20Rng::from_seed(seed);
+    seed.zeroize();
+    Ok(rng)
+}
+
+/// The time, for certificates.
+pub(crate) fn unix_now() -> UnixMillis {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    UnixMillis(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+}
+
+fn fleet_here() -> Result<PathBuf, CliError> {
+    let dir = Path::new(".");
+    let found = files::with_extension(dir, FLEET_EXTENSION)
+        .map_err(|source| CliError::Read { path: dir.to_owned(), source })?;
+    let name = |path: &PathBuf| path.strip_prefix(dir).unwrap_or(path).to_owned();
+    match &found[..] {
+        [] => Err(CliError::NoFleetHere),
+        [only] => Ok(name(only)),
+        several => {
+            let files = several.iter().map(|p| name(p).display().to_string()).collect();
+            Err(CliError::SeveralFleets { files })
+        }
+    }
+}
+
+/// `90d`, `12h`, `30m`.
+fn parse_span(text: &str) -> Result<Duration, String> {
+    let wrong = || "a time is a number with its unit: 90d, 12h or 30m".to_owned();
+    let unit = text.chars().next_back().ok_or_else(wrong)?;
+    let number: u32 = text.strip_suffix(unit).and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
+    let seconds = match unit {
+        'd' => 86_400,
+        'h' => 3600,
+        'm' => 60,
+        _ => return Err(wrong()),
+    };
+    if number == 0 {
+        Err("it has to be longer than nothing".into())
+    } else {
+        Ok(Duration::from_secs(seconds) * number)
+    }
+}
+
+/// `--fleet FILE`, as a hint repeats it, unless the fleet is found without it.
+fn fleet_option(path: &Path) -> String {
+    match path.parent() == Some(Path::new("")) {
+        true => String::new(),
+        false => format!(" --fleet {}", path.display()),
+    }
+}

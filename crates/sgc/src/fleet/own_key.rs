@@ -1,0 +1,176 @@
+//! `sgc fleet request` and `accept`: a node whose private key never leaves its machine.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use rustls_pki_types::CertificateDer;
+use sgc_trust::{FleetName, FleetSecret, Identity, Import, KeyRequest, Membership, NodeName, pem_contents};
+use zeroize::Zeroizing;
+
+use super::system_rng;
+use crate::error::CliError;
+use crate::files::{self, Existing};
+use crate::output;
+
+const KEY_KEPT: &str = "; a key is never overwritten: an identity may need it";
+
+/// On a node's machine: make its private key, and a request for a certificate.
+///
+/// The key is written to NODE.key and stays there; the request, NODE.csr, goes to the keeper of the fleet, who answers
+/// it with `sgc fleet enroll NODE --csr NODE.csr`.
+#[derive(Debug, Args)]
+pub(super) struct RequestArgs {
+    /// Name of the node: a-z, 0-9, '-', '_' and '.'
+    node: String,
+    /// For a CA that knows nothing of SGC: a file with the fleet's secret (a fleet file), so that the request names
+    /// the node as its certificate must
+    #[arg(long, value_name = "FILE")]
+    secret: Option<PathBuf>,
+    /// Where to write the two files
+    #[arg(long, value_name = "DIR", default_value = ".")]
+    dir: PathBuf,
+}
+
+/// On a node's machine: make its identity of its key and of the answer to its request.
+#[derive(Debug, Args)]
+pub(super) struct AcceptArgs {
+    /// The answer, from `sgc fleet enroll --csr`; or, with --ca, certificates of another CA, PEM
+    answer: PathBuf,
+    /// The node's private key [default: NODE.key]
+    #[arg(long, value_name = "FILE")]
+    key: Option<PathBuf>,
+    /// Certificates of the CAs to trust, PEM: the answer is then a certificate that an existing CA made for the
+    /// request
+    #[arg(long, value_name = "FILE", requires = "node", requires = "fleet_name")]
+    ca: Option<PathBuf>,
+    /// With --ca: the node's name
+    #[arg(long, value_name = "NODE", requires = "ca")]
+    node: Option<String>,
+    /// With --ca: the fleet's name, for people
+    #[arg(long, value_name = "NAME", requires = "ca")]
+    fleet_name: Option<String>,
+    /// With --ca: a file with the fleet's secret; without it the identity is a router's
+    #[arg(long, value_name = "FILE", requires = "ca")]
+    secret: Option<PathBuf>,
+    /// Where to write the identity [default: NODE.identity]
+    #[arg(short, long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Replace an identity that is there
+    #[arg(long)]
+    force: bool,
+}
+
+pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
+    let node: NodeName = args.node.parse()?;
+    let file = |extension: &str| {
+        let name = format!("{node}.{extension}");
+        if args.dir == Path::new(".") { PathBuf::from(name) } else { args.dir.join(name) }
+    };
+    let (key_path, csr_path) = (file("key"), file("csr"));
+    let pseudonym = match &args.secret {
+        Some(path) => Some(read_fleet_secret(path)?.pseudonym(node.as_str())),
+        None => None,
+    };
+    let made = KeyRequest::generate(pseudonym.as_ref(), &mut system_rng()?)
+        .map_err(|source| CliError::Fleet { path: key_path.clone(), source })?;
+    files::write_secret(&key_path, &made.key_text(), Existing::Keep(KEY_KEPT))?;
+    files::write_public(&csr_path, made.csr_text().as_bytes())?;
+    let (key, csr) = (key_path.display(), csr_path.display());
+    output::line(match pseudonym {
+        None => format!(
+            "{key}: the private key of {node}; it stays here\n\
+             {csr}: the request, no secret; where the fleet is kept:\n  \
+             sgc fleet enroll {node} --csr {csr}"
+        ),
+        Some(_) => format!(
+            "{key}: the private key of {node}; it stays here\n\
+             {csr}: the request, no secret. Have the CA sign it with its subject alternative names. Then, here:\n  \
+             sgc fleet accept CERTIFICATE --ca CA --node {node} --fleet-name NAME --secret FILE"
+        ),
+    })
+}
+
+pub(super) fn accept(args: &AcceptArgs) -> Result<(), CliError> {
+    let rng = &mut system_rng()?;
+    let broken = |source| CliError::Identity { path: args.answer.clone(), source };
+    let identity = match (&args.ca, &args.node, &args.fleet_name) {
+        (Some(ca), Some(node), Some(fleet)) => {
+            let (node, fleet): (NodeName, FleetName) = (node.parse()?, fleet.parse()?);
+            let import = Import {
+                key: read_key(&args.key_path(&node))?,
+                chain: read_certificates(&args.answer)?,
+                cas: read_certificates(ca)?,
+                secret: args.secret.as_deref().map(read_fleet_secret).transpose()?,
+                node,
+                fleet,
+            };
+            Identity::import(import, rng).map_err(broken)?
+        }
+        _ => {
+            let text = files::read_secret(&args.answer, "secrets of the fleet")?;
+            let member = Membership::parse(&text).map_err(broken)?;
+            let key = read_key(&args.key_path(member.node_name()))?;
+            Identity::join(member, &key, rng).map_err(broken)?
+        }
+    };
+    let node = identity.node_name();
+    let path = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("{node}.identity")));
+    let existing = match args.force {
+        true => Existing::Replace,
+        false => Existing::Keep("; --force replaces it"),
+    };
+    files::write_secret(&path, &identity.to_text(), existing)?;
+    let mut text = format!(
+        "{}: node {node} of fleet {}, holds until {}",
+        path.display(),
+        identity.fleet_name(),
+        identity.not_after()
+    );
+    for note in identity.transport_notes() {
+        text.push_str("\nNote: ");
+        text.push_str(note);
+    }
+    output::line(text)
+}
+
+impl AcceptArgs {
+    fn key_path(&self, node: &NodeName) -> PathBuf {
+        self.key.clone().unwrap_or_else(|| PathBuf::from(format!("{node}.key")))
+    }
+}
+
+fn contents(path: &Path, text: &str, label: &str) -> Result<Vec<Zeroizing<Vec<u8>>>, CliError> {
+    pem_contents(text, &[label]).map_err(|source| CliError::Pem { path: path.to_owned(), source })
+}
+
+fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CliError> {
+    let found = contents(path, &files::read_public(path)?, "CERTIFICATE")?;
+    match found.is_empty() {
+        false => Ok(found.iter().map(|c| CertificateDer::from(c.to_vec())).collect()),
+        true => Err(CliError::NotInFile {
+            path: path.to_owned(),
+            what: "certificate in PEM",
+            hint: "it begins with -----BEGIN CERTIFICATE-----",
+        }),
+    }
+}
+
+fn read_key(path: &Path) -> Result<Zeroizing<Vec<u8>>, CliError> {
+    let text = files::read_secret(path, "the node's private key")?;
+    contents(path, &text, "PRIVATE KEY")?.into_iter().next().ok_or_else(|| CliError::NotInFile {
+        path: path.to_owned(),
+        what: "private key in PKCS #8",
+        hint: "`openssl pkcs8 -topk8 -nodes -in FILE` writes one",
+    })
+}
+
+fn read_fleet_secret(path: &Path) -> Result<FleetSecret, CliError> {
+    let text = files::read_secret(path, "the fleet's secret")?;
+    let found = contents(path, &text, "SGC FLEET SECRET")?.into_iter().next();
+    let bytes = found.and_then(|b| <[u8; 32]>::try_from(&b[..]).ok().map(Zeroizing::new));
+    bytes.map(|b| FleetSecret::from_bytes(*b)).ok_or_else(|| CliError::NotInFile {
+        path: path.to_owned(),
+        what: "fleet secret",
+        hint: "a fleet file holds one (`sgc fleet create NAME`)",
+    })
+}

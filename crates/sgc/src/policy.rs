@@ -1,0 +1,186 @@
+//! `sgc policy`: who may join what, worked out from a configuration without a running node.
+//!
+//! The answer is that of the policy which the node would build.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand};
+use serde::Serialize;
+use sgc_node::config::{self, Config};
+use sgc_node::partners::Partners;
+use sgc_node::policy::{Subject, Verdict, explain};
+use sgc_trust::{GroupName, Identity, NodeName};
+use sgc_wire::Role;
+
+use crate::error::{CliError, EXIT_FAILURE};
+use crate::fleet::unix_now;
+use crate::{files, output, run};
+
+const CERTIFICATE_BYTES_MAX: u64 = 64 * 1024;
+
+/// Ask who may join what.
+#[derive(Debug, Args)]
+pub(crate) struct PolicyArgs {
+    #[command(subcommand)]
+    command: PolicyCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum PolicyCommand {
+    Test(TestArgs),
+}
+
+/// Say whether a node may subscribe to a topic, or publish on it, and why.
+///
+/// It works from the configuration alone. Exit code 0 is yes, 1 is no.
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("who").required(true))]
+struct TestArgs {
+    /// A node of this fleet, by name
+    #[arg(long, value_name = "NODE", group = "who")]
+    identity: Option<String>,
+    /// A group that the node is in: groups stand in certificates, so that a name alone says nothing of them; may be
+    /// repeated
+    #[arg(long = "group", value_name = "GROUP", requires = "identity")]
+    groups: Vec<String>,
+    /// A node, by its identity file
+    #[arg(long, value_name = "FILE", group = "who")]
+    identity_file: Option<PathBuf>,
+    /// A node of any fleet, by its certificate, PEM, leaf first
+    #[arg(long, value_name = "FILE", group = "who")]
+    certificate: Option<PathBuf>,
+    /// The topic
+    #[arg(long, value_name = "/TOPIC")]
+    topic: String,
+    /// Its type, where that matters
+    #[arg(long = "type", value_name = "TYPE")]
+    type_name: Option<String>,
+    /// May it publish? Without this: may it subscribe?
+    #[arg(long)]
+    publish: bool,
+    /// The owner's configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Print the answer as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct Answer {
+    permitted: bool,
+    who: String,
+    node_id: Option<String>,
+    topic: String,
+    role: &'static str,
+    because: String,
+}
+
+/// Runs `sgc policy`.
+pub(crate) fn policy(args: &PolicyArgs) -> Result<ExitCode, CliError> {
+    match &args.command {
+        PolicyCommand::Test(args) => test(args),
+    }
+}
+
+/// What there is of a node besides its configuration: identity and partners, as it would have them now.
+pub(crate) fn load(path: &Path) -> Result<(Config, Identity, Partners), CliError> {
+    let what = path.display().to_string();
+    let config = config::load(path, &run::environment)
+        .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
+    let identity =
+        sgc_node::check_identity(&config).map_err(|source| CliError::CheckIdentity { what, source })?;
+    let state = sgc_node::state_dir(&config, identity.node_name().as_str()).filter(|dir| dir.is_dir());
+    let partners = Partners::load(&config, state.as_deref(), unix_now())?;
+    Ok((config, identity, partners))
+}
+
+fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
+    let path = files::config_here(args.config.as_deref())?;
+    let (config, identity, partners) = load(&path)?;
+    let (who, subject) = subject(args, &config, &identity, &partners)?;
+    let (role, word) = match args.publish {
+        true => (Role::Publish, "publish on"),
+        false => (Role::Subscribe, "subscribe to"),
+    };
+    let verdict = match &subject {
+        Ok(subject) => verdict(args, &config, &identity, &partners, subject, role),
+        Err(because) => Verdict { permitted: false, because: because.clone() },
+    };
+    let answer = Answer {
+        permitted: verdict.permitted,
+        node_id: subject.ok().map(|subject| subject.node.to_string()),
+        topic: args.topic.clone(),
+        role: if args.publish { "publish" } else { "subscribe" },
+        because: verdict.because,
+        who,
+    };
+    if args.json {
+        let text = serde_json::to_string(&answer).map_err(|error| CliError::Output(error.into()))?;
+        output::line(text)?;
+    } else {
+        let (yes, not) = if answer.permitted { ("yes", "") } else { ("no", " not") };
+        output::line(format!("{yes}: {} may{not} {word} {}: {}", answer.who, answer.topic, answer.because))?;
+    }
+    Ok(if answer.permitted { ExitCode::SUCCESS } else { ExitCode::from(EXIT_FAILURE) })
+}
+
+fn verdict(
+    args: &TestArgs,
+    config: &Config,
+    identity: &Identity,
+    partners: &Partners,
+    subject: &Subject,
+    role: Role,
+) -> Verdict {
+    let no = |because: String| Verdict { permitted: false, because };
+    let Some(share) = config.shares.iter().find(|share| share.topic == args.topic) else {
+        return no(format!("{} does not share it", identity.node_name()));
+    };
+    match (&share.type_name, &args.type_name) {
+        (Some(shared), Some(asked)) if shared != asked => {
+            no(format!("{} shares it as {shared}, not as {asked}", identity.node_name()))
+        }
+        _ => explain(share, identity, partners, subject, role),
+    }
+}
+
+type Believed = Result<Subject, String>;
+
+/// What the node is called here, and what its certificate proves, if it proves anything.
+fn subject(
+    args: &TestArgs,
+    config: &Config,
+    identity: &Identity,
+    partners: &Partners,
+) -> Result<(String, Believed), CliError> {
+    let cannot = |reason: String| CliError::Cannot { reason };
+    if let Some(name) = &args.identity {
+        let name: NodeName = name.parse()?;
+        let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
+        let (Some(secret), Some(node)) = (identity.fleet_secret(), identity.node_id_of(name.as_str())) else {
+            return Err(CliError::RouterCannotName { path: config.identity.clone() });
+        };
+        let mut groups: Vec<_> = groups.iter().map(|group| secret.group_tag(group.as_str())).collect();
+        groups.sort_unstable();
+        return Ok((name.to_string(), Ok(Subject { node, ca: identity.as_peer().ca, groups })));
+    }
+    let (who, chain) = match (&args.identity_file, &args.certificate) {
+        (Some(path), _) => {
+            let other = sgc_node::load_identity(path)?;
+            (other.node_name().to_string(), other.chain().to_vec())
+        }
+        (None, Some(path)) => {
+            let pem = files::read_limited(path, CERTIFICATE_BYTES_MAX)?;
+            let chain = sgc_node::partners::chain(&pem)
+                .map_err(|error| cannot(format!("{}: {error}", path.display())))?;
+            (path.display().to_string(), chain)
+        }
+        (None, None) => return Err(cannot("name a node with --identity".to_owned())),
+    };
+    let anchors = partners.extend(identity).map_err(|error| cannot(format!("trusted CAs: {error}")))?;
+    let believed = anchors.verify(&chain, unix_now());
+    let subject = believed.map(|peer| Subject::from(&peer));
+    Ok((who, subject.map_err(|error| format!("its certificate is not believed: {error}"))))
+}

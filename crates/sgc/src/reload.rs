@@ -1,0 +1,101 @@
+//! `sgc reload`: has a running node read its configuration again.
+//!
+//! The node judges and carries out; this asks and shows what it says.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use serde::Deserialize;
+use sgc_node::admin::AdminRequest;
+
+use crate::error::CliError;
+use crate::{output, status};
+
+/// How long a node may take to read files and to change what it shares.
+const ANSWER_MAX: Duration = Duration::from_secs(30);
+
+/// Have a running node read its configuration again, without a restart.
+///
+/// The whole file is judged first: with a mistake in it nothing changes. Then only what differs is touched. SIGHUP does the
+/// same, and says it in the log.
+#[derive(Debug, Args)]
+pub(crate) struct ReloadArgs {
+    /// The node's configuration; without it, the one node that this user runs here
+    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
+    config: Option<PathBuf>,
+    /// The node's name, if its socket is in the usual place
+    #[arg(long, value_name = "NAME", conflicts_with = "socket")]
+    node: Option<String>,
+    /// The node's status socket
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// Print the answer as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a node says.
+#[derive(Debug, Deserialize)]
+enum Answer {
+    #[serde(rename = "ok")]
+    Done(serde_json::Value),
+    #[serde(rename = "error")]
+    Refused(String),
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Report {
+    changed: Vec<String>,
+    needs_restart: Vec<String>,
+    warnings: Vec<String>,
+}
+
+/// Runs `sgc reload`.
+pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
+    let named = args.node.as_deref().map(sgc_node::default_socket_path);
+    let socket = status::socket(args.config.as_deref(), named.as_deref().or(args.socket.as_deref()))?;
+    let report = ask(&socket)?;
+    if args.json {
+        return output::line(report);
+    }
+    for line in lines(report)? {
+        output::line(line)?;
+    }
+    Ok(())
+}
+
+/// Has the node at this socket read its configuration again, if one runs there; says what came of it.
+pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
+    match ask(socket) {
+        Ok(report) => lines(report),
+        Err(CliError::NoNode { .. }) => {
+            Ok(vec!["The node does not run; it counts from its next start.".to_owned()])
+        }
+        Err(error) => Err(error),
+    }
+}
+
+fn ask(socket: &Path) -> Result<serde_json::Value, CliError> {
+    let text = status::ask(socket, &AdminRequest::Reload, ANSWER_MAX)?;
+    match serde_json::from_str(&text) {
+        Ok(Answer::Done(report)) => Ok(report),
+        Ok(Answer::Refused(reason)) => Err(CliError::NodeRefused { path: socket.to_owned(), reason }),
+        Err(_) => Err(CliError::NotAStatus {
+            path: socket.to_owned(),
+            reason: "it does not know `reload`: it is of an earlier version; restart it".to_owned(),
+        }),
+    }
+}
+
+fn lines(report: serde_json::Value) -> Result<Vec<String>, CliError> {
+    let Report { changed, needs_restart, warnings } = serde_json::from_value(report).unwrap_or_default();
+    let mut lines = changed;
+    if lines.is_empty() && needs_restart.is_empty() {
+        lines.push("nothing changed".to_owned());
+    }
+    lines.extend(needs_restart);
+    lines.extend(warnings);
+    Ok(lines)
+}

@@ -1,0 +1,254 @@
+//! `sgc share-token`: hands one topic to a partner of another fleet, shows what was handed out, takes it back.
+//!
+//! It writes to the state directory, where the node finds it, and asks a running node to look there.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use clap::Args;
+use sgc_node::config::{self, Config, ShareConfig};
+use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
+use sgc_node::policy::metadata;
+use sgc_transport::LinkUrl;
+use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors};
+use sgc_wire::{NodeId, UnixMillis};
+
+use crate::error::CliError;
+use crate::fleet::unix_now;
+use crate::{files, output, policy, reload};
+
+const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
+
+/// Hand one topic to a partner of another fleet.
+///
+/// The token is printed once and not kept: bring it to the partner on a private way; there, `sgc use TOKEN` takes it. It
+/// works for nodes of the CA that it was made for, until it ends or is withdrawn.
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("what").required(true))]
+pub(crate) struct ShareTokenArgs {
+    /// The owner's configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// The topic, which the configuration has to share
+    #[arg(long, value_name = "/TOPIC", group = "what", requires = "to")]
+    topic: Option<String>,
+    /// Its type, if the configuration does not say it
+    #[arg(long = "type", value_name = "TYPE", requires = "topic")]
+    type_name: Option<String>,
+    /// For whom: the partner's CA certificate, PEM; with :NODE-ID behind it, that node alone
+    #[arg(long, value_name = "CA.pem[:NODE-ID]", requires = "topic")]
+    to: Option<String>,
+    /// How long it is to hold
+    #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]
+    valid: Duration,
+    /// A router at which the partner can reach this node; may be repeated [default: those of the configuration]
+    #[arg(long, value_name = "URL", requires = "topic")]
+    router: Vec<String>,
+    /// Show the tokens in force
+    #[arg(long, group = "what")]
+    list: bool,
+    /// Take this one back, by its number
+    #[arg(long, value_name = "ID", group = "what")]
+    withdraw: Option<u64>,
+}
+
+/// Runs `sgc share-token`.
+pub(crate) fn share_token(args: &ShareTokenArgs) -> Result<(), CliError> {
+    let path = files::config_here(args.config.as_deref())?;
+    let (config, identity, _) = policy::load(&path)?;
+    let node = identity.node_name().as_str();
+    let state = sgc_node::state_dir(&config, node).ok_or(sgc_node::StateError::Nowhere)?;
+    sgc_node::create_state_dir(&state)?;
+    if let Some(id) = args.withdraw {
+        let record = TokenRecords::change(&state, |records| records.withdraw(id))?;
+        output::line(format!("token {id} for {} [{}] is withdrawn", record.topic, record.type_name))?;
+        return reload_node(&config, node, |line: String| output::line(line));
+    }
+    match &args.topic {
+        Some(topic) => give(args, topic, &config, &identity, &state),
+        None => list(&state),
+    }
+}
+
+fn give(
+    args: &ShareTokenArgs,
+    topic: &str,
+    config: &Config,
+    identity: &Identity,
+    state: &Path,
+) -> Result<(), CliError> {
+    let cannot = |reason: String| CliError::Cannot { reason };
+    let share = share(args, topic, config)?;
+    let Some(secret) = naming_secret(identity) else {
+        return Err(CliError::RouterCannotName { path: config.identity.clone() });
+    };
+    let (ca, fingerprint, node) = recipient(args.to.as_deref().unwrap_or_default())?;
+    if fingerprint == identity.as_peer().ca.to_string() {
+        let why = "that is the CA of this fleet: its nodes need no token, name them in `to` of the [[share]]";
+        return Err(cannot(why.to_owned()));
+    }
+    let anchors = identity.anchors();
+    let own = anchors.certificates().zip(anchors.fingerprints()).find(|(_, ca)| *ca == identity.as_peer().ca);
+    let Some((own, _)) = own else { return Err(cannot("the identity has no CA".to_owned())) };
+    let now = unix_now();
+    let valid = u64::try_from(args.valid.as_millis()).unwrap_or(u64::MAX);
+    let metadata = metadata(&share, identity.node_name().as_str());
+    let token = ShareToken {
+        owner: identity.node_id(),
+        owner_name: identity.node_name().clone(),
+        ca: own.clone(),
+        secret: TopicSecret::derive(secret, &metadata),
+        metadata,
+        routers: routers(args, config)?,
+        expires: UnixMillis(now.0.saturating_add(valid)),
+    };
+    token.check()?;
+    let record = TokenRecord {
+        id: 0,
+        topic: share.topic.clone(),
+        type_name: share.type_name.unwrap_or_default(),
+        name: token.name().to_string(),
+        ca: fingerprint,
+        ca_pem: pem(&ca),
+        node: node.map(|node| node.to_string()),
+        created: now.0,
+        expires: token.expires.0,
+    };
+    // On the disk before it is printed: a token that the owner does not know of is of no use.
+    let id = TokenRecords::change(state, |records| records.add(record, now))?;
+    output::diagnostic(&format!(
+        "Token {id} for {topic}, until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
+         There: sgc use TOKEN. To take it back: sgc share-token --withdraw {id}",
+        token.expires
+    ));
+    let node = identity.node_name().as_str();
+    let told = reload_node(config, node, |line: String| {
+        output::diagnostic(&line);
+        Ok(())
+    });
+    output::line(token.to_text().as_str())?;
+    told
+}
+
+/// The share as the token is for it: with a type.
+fn share(args: &ShareTokenArgs, topic: &str, config: &Config) -> Result<ShareConfig, CliError> {
+    let cannot = |reason: String| CliError::Cannot { reason };
+    let Some(share) = config.shares.iter().find(|share| share.topic == topic) else {
+        return Err(cannot(format!("the configuration does not share {topic}: add a [[share]] for it")));
+    };
+    let mut share = share.clone();
+    let asked = match &args.type_name {
+        Some(name) => Some(config::message_type(name).map_err(|mistake| cannot(mistake.to_string()))?),
+        None => None,
+    };
+    match (&share.type_name, asked) {
+        (Some(known), Some(asked)) if *known != asked => {
+            let reason = format!(
+                "{topic} is shared as {known}, not as {asked}: leave --type out or change the [[share]]"
+            );
+            return Err(cannot(reason));
+        }
+        (None, None) => {
+            let reason = format!(
+                "the type of {topic} is part of its name and is not known here: add --type PACKAGE/msg/NAME, or `type` to \
+                 the [[share]]"
+            );
+            return Err(cannot(reason));
+        }
+        (None, asked) => share.type_name = asked,
+        _ => {}
+    }
+    Ok(share)
+}
+
+/// What names of new shares follow from.
+fn naming_secret(identity: &Identity) -> Option<&FleetSecret> {
+    identity.fleet_secret()
+}
+
+fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
+    let cannot = |reason: String| CliError::Cannot { reason };
+    let (file, node) = match to.rsplit_once(':') {
+        Some((file, id)) if !Path::new(to).exists() => {
+            let id = id.parse::<NodeId>().map_err(|_| {
+                cannot(format!(
+                    "--to: {id:?} is no node id: 64 hexadecimal digits, as `sgc status` there shows it"
+                ))
+            })?;
+            (file, Some(id))
+        }
+        _ => (to, None),
+    };
+    let path = Path::new(file);
+    let found = read_ca_file(path).map_err(|error| cannot(format!("--to: {}: {error}", path.display())))?;
+    let [ca] = &found[..] else {
+        return Err(cannot(format!(
+            "--to: {} holds {} certificates; name one CA",
+            path.display(),
+            found.len()
+        )));
+    };
+    let anchors = TrustAnchors::new([ca.clone()]).map_err(|error| cannot(format!("--to: {error}")))?;
+    let fingerprint = anchors.fingerprints().next().map(|ca| ca.to_string()).unwrap_or_default();
+    Ok((ca.to_vec(), fingerprint, node))
+}
+
+fn routers(args: &ShareTokenArgs, config: &Config) -> Result<Vec<String>, CliError> {
+    if args.router.is_empty() {
+        return Ok(config.routers.iter().take(TOKEN_ROUTERS_MAX).map(ToString::to_string).collect());
+    }
+    let valid = |url: &String| match url.parse::<LinkUrl>() {
+        Ok(url) => Ok(url.to_string()),
+        Err(fault) => Err(CliError::Cannot { reason: format!("--router {url}: {fault}") }),
+    };
+    args.router.iter().map(valid).collect()
+}
+
+fn list(state: &Path) -> Result<(), CliError> {
+    let now = unix_now();
+    let records = TokenRecords::load(state)?;
+    let in_force: Vec<_> = records.tokens.iter().filter(|record| record.expires > now.0).collect();
+    if in_force.is_empty() {
+        return output::line("no token is in force");
+    }
+    let head = ["id", "topic", "type", "for", "made", "until"].map(str::to_owned).to_vec();
+    let row = |record: &&TokenRecord| {
+        let ca: String = record.ca.chars().take(8).collect();
+        let whom = match &record.node {
+            Some(node) => format!("node {} of CA {ca}", node.chars().take(8).collect::<String>()),
+            None => format!("all of CA {ca}"),
+        };
+        let (made, until) = (UnixMillis(record.created), UnixMillis(record.expires));
+        let (topic, kind) = (record.topic.clone(), record.type_name.clone());
+        vec![record.id.to_string(), topic, kind, whom, made.to_string(), until.to_string()]
+    };
+    let rows: Vec<_> = std::iter::once(head).chain(in_force.iter().map(row)).collect();
+    output::columns(&rows).into_iter().try_for_each(output::line)
+}
+
+fn reload_node(
+    config: &Config,
+    node: &str,
+    mut say: impl FnMut(String) -> Result<(), CliError>,
+) -> Result<(), CliError> {
+    let socket = sgc_node::admin_socket_path(config, node);
+    reload::after_change(&socket)?.into_iter().try_for_each(&mut say)
+}
+
+fn pem(der: &[u8]) -> String {
+    let base64 = STANDARD.encode(der);
+    let mut text = String::from("-----BEGIN CERTIFICATE-----\n");
+    for line in base64.as_bytes().chunks(64) {
+        text.push_str(&String::from_utf8_lossy(line));
+        text.push('\n');
+    }
+    text.push_str("-----END CERTIFICATE-----\n");
+    text
+}
+
+fn valid(text: &str) -> Result<Duration, String> {
+    let time = config::parse_duration(text).filter(|time| !time.is_zero() && *time <= VALID_MAX);
+    time.ok_or_else(|| "12h, 90d, for example, and at most 3650d".to_owned())
+}

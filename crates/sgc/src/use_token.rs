@@ -1,0 +1,162 @@
+//! `sgc use`: takes a token of another fleet's topic, and has the node use it.
+//!
+//! The token goes into a file of its own, for this user alone; the configuration gets three lines that name it.
+
+use std::fs;
+use std::io::{IsTerminal, Read, Write};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use sgc_node::config::{self, Config, TokenSource};
+use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
+use zeroize::Zeroizing;
+
+use crate::error::CliError;
+use crate::fleet::unix_now;
+use crate::{files, output, policy, reload, run};
+
+const TOKENS_DIR: &str = "tokens";
+
+/// Use a topic of another fleet, by the token that its owner gave.
+///
+/// The token is kept in the node's state directory, and a [[use]] that names it is added to the configuration. What is in
+/// the file already stays as it is.
+#[derive(Debug, Args)]
+pub(crate) struct UseArgs {
+    /// The token, a file that holds it, or - for standard input, which keeps it out of the shell's history
+    token: String,
+    /// The configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Say what would be done, and do nothing
+    #[arg(long)]
+    dry_run: bool,
+}
+
+/// Runs `sgc use`.
+pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
+    let path = files::config_here(args.config.as_deref())?;
+    let (config, identity, _) = policy::load(&path)?;
+    let text = token_text(&args.token)?;
+    let token = ShareToken::parse(&text)?;
+    check(&token, &config)?;
+    let node = identity.node_name().as_str();
+    let state = sgc_node::state_dir(&config, node).ok_or(sgc_node::StateError::Nowhere)?;
+    let file = std::path::absolute(state.join(TOKENS_DIR).join(file_name(&token)))
+        .map_err(|source| CliError::Read { path: state.clone(), source })?;
+    let block = block(&token, &file);
+    let before = files::read_limited(&path, config::CONFIG_BYTES_MAX)?;
+    let mut after = String::from_utf8_lossy(&before).into_owned();
+    if !after.is_empty() && !after.ends_with('\n') {
+        after.push('\n');
+    }
+    after.push_str(&block);
+    let base = path.parent().unwrap_or(Path::new(""));
+    if config::parse(&after, &path.display().to_string(), base, &run::environment).is_err() {
+        let reason =
+            format!("{} cannot be added to; add these lines yourself:\n{}", path.display(), block.trim());
+        return Err(CliError::Cannot { reason });
+    }
+    let ca = token.ca_fingerprint()?;
+    output::line(format!(
+        "{} [{}] of {}, until {}; its CA is {ca}",
+        token.metadata.ros_name, token.metadata.type_name, token.owner_name, token.expires
+    ))?;
+    if args.dry_run {
+        output::line(format!("would write {} and add to {}:", file.display(), path.display()))?;
+        return output::line(block.trim());
+    }
+    sgc_node::create_state_dir(&state)?;
+    sgc_node::create_state_dir(&state.join(TOKENS_DIR))?;
+    files::write_secret(&file, &token.to_text(), files::Existing::Replace)?;
+    replace(&path, &after)?;
+    output::line(format!("added to {}; the token is in {}", path.display(), file.display()))?;
+    let socket = sgc_node::admin_socket_path(&config, node);
+    reload::after_change(&socket)?.into_iter().try_for_each(output::line)
+}
+
+fn token_text(given: &str) -> Result<Zeroizing<String>, CliError> {
+    let limit = TOKEN_TEXT_BYTES_MAX as u64 + 2;
+    let mut text = Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX + 2));
+    if given.trim_start().starts_with(TOKEN_PREFIX) {
+        text.push_str(given);
+    } else if given == "-" {
+        if std::io::stdin().is_terminal() {
+            output::diagnostic("Paste the token, then end with Ctrl-D:");
+        }
+        let failed = |source| CliError::System { what: "cannot read standard input", source };
+        std::io::stdin().take(limit).read_to_string(&mut text).map_err(failed)?;
+    } else {
+        let path = PathBuf::from(given);
+        let read = fs::File::open(&path).and_then(|file| file.take(limit).read_to_string(&mut text));
+        read.map_err(|source| CliError::Read { path, source })?;
+    }
+    Ok(text)
+}
+
+fn check(token: &ShareToken, config: &Config) -> Result<(), CliError> {
+    let cannot = |reason: String| Err(CliError::Cannot { reason });
+    let topic = &token.metadata.ros_name;
+    if token.expires < unix_now() {
+        return cannot(format!(
+            "the token ended at {}: ask {} for a new one",
+            token.expires, token.owner_name
+        ));
+    }
+    if config.shares.iter().any(|share| share.topic == *topic) {
+        return cannot(format!("{topic} is shared by this node: it would be shared again, in a loop"));
+    }
+    for source in &config.tokens {
+        let known = match source {
+            TokenSource::File(path) => sgc_node::read_token(path)?,
+            TokenSource::Text(token) => ShareToken::clone(token),
+        };
+        if known.name() == token.name() && known == *token {
+            return cannot(format!("{topic} of {} is used with this very token already", token.owner_name));
+        }
+        if known.name() == token.name() {
+            let TokenSource::File(path) = source else {
+                return cannot(format!(
+                    "{topic} is used with another token already: take its [[use]] out first"
+                ));
+            };
+            return cannot(format!(
+                "{topic} is used with another token already, {}: to replace it, write the new one into that file",
+                path.display()
+            ));
+        }
+    }
+    Ok(())
+}
+
+fn file_name(token: &ShareToken) -> String {
+    let topic = token.metadata.ros_name.trim_matches('/').replace('/', "-");
+    let plain: String =
+        topic.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(80).collect();
+    format!("{plain}-{}.token", token.name().short())
+}
+
+fn block(token: &ShareToken, file: &Path) -> String {
+    let plain = |text: &str| text.chars().filter(|c| !c.is_control()).collect::<String>();
+    format!(
+        "\n[[use]]  # {} [{}] of {}, until {}\ntoken = {}\n",
+        plain(&token.metadata.ros_name),
+        plain(&token.metadata.type_name),
+        token.owner_name,
+        token.expires,
+        crate::name::toml_string(&file.display().to_string()),
+    )
+}
+
+/// Replaces the configuration whole or not at all, under the same mode; a link stays one.
+fn replace(path: &Path, text: &str) -> Result<(), CliError> {
+    let failed = |source| CliError::Write { path: path.to_owned(), source };
+    let target = fs::canonicalize(path).map_err(failed)?;
+    let permissions = fs::metadata(&target).map_err(failed)?.permissions();
+    let dir = target.parent().unwrap_or(Path::new("/"));
+    let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
+    file.write_all(text.as_bytes()).map_err(failed)?;
+    file.as_file().set_permissions(permissions).map_err(failed)?;
+    file.as_file().sync_all().map_err(failed)?;
+    file.persist(&target).map(drop).map_err(|error| failed(error.error))
+}

@@ -1,0 +1,387 @@
+//! What the keeper of a fleet does with the real binary: requests, renewal, revocation, other people's CAs.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
+use rustls_pki_types::CertificateDer;
+use sgc_trust::{CertError, Fleet, Identity, TrustAnchors};
+use sgc_wire::UnixMillis;
+use tempfile::TempDir;
+
+/// A directory with `sgc` run in it, away from the user's environment.
+struct Place {
+    dir: TempDir,
+}
+
+impl Place {
+    fn new() -> Self {
+        Self { dir: tempfile::tempdir().unwrap() }
+    }
+
+    /// With the fleet `lab`.
+    fn with_fleet() -> Self {
+        let place = Self::new();
+        place.good(&["fleet", "create", "lab"]);
+        place
+    }
+
+    fn path(&self, file: &str) -> std::path::PathBuf {
+        self.dir.path().join(file)
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sgc"));
+        command.args(args).current_dir(self.dir.path()).env_clear().stdin(Stdio::null());
+        command
+    }
+
+    fn run(&self, args: &[&str]) -> Output {
+        self.command(args).output().unwrap()
+    }
+
+    fn good(&self, args: &[&str]) -> String {
+        let ran = self.run(args);
+        assert!(ran.status.success(), "{args:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        assert!(ran.stderr.is_empty(), "{args:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        String::from_utf8(ran.stdout).unwrap()
+    }
+
+    /// The one line that a run with what cannot be right must fail with.
+    fn bad(&self, args: &[&str]) -> String {
+        let ran = self.run(args);
+        let said = String::from_utf8(ran.stderr).unwrap();
+        assert_eq!((ran.status.code(), ran.stdout.as_slice()), (Some(2), &b""[..]), "{args:?}: {said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+        said
+    }
+
+    fn read(&self, file: &str) -> String {
+        fs::read_to_string(self.path(file)).unwrap()
+    }
+
+    fn write(&self, file: &str, text: &str, mode: u32) {
+        fs::write(self.path(file), text).unwrap();
+        self.set_mode(file, mode);
+    }
+
+    fn mode(&self, file: &str) -> u32 {
+        fs::metadata(self.path(file)).unwrap().permissions().mode() & 0o7777
+    }
+
+    fn set_mode(&self, file: &str, mode: u32) {
+        fs::set_permissions(self.path(file), fs::Permissions::from_mode(mode)).unwrap();
+    }
+
+    fn bring(&self, file: &str, to: &Place) {
+        fs::copy(self.path(file), to.path(file)).unwrap();
+    }
+
+    fn fleet(&self) -> Fleet {
+        Fleet::parse(&self.read("lab.fleet")).unwrap()
+    }
+
+    fn identity(&self, file: &str) -> Identity {
+        Identity::parse(&self.read(file)).unwrap()
+    }
+
+    fn anchors_with_list(&self) -> TrustAnchors {
+        let list = fs::read(self.path("lab.crl")).unwrap();
+        self.fleet().anchors().with_crl(&list, now()).unwrap().unwrap()
+    }
+
+    fn files(&self) -> Vec<String> {
+        let entries = fs::read_dir(self.dir.path()).unwrap();
+        let mut names: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+}
+
+fn now() -> UnixMillis {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    UnixMillis(since.as_millis() as u64)
+}
+
+fn pem(label: &str, der: &[u8]) -> String {
+    use base64::Engine as _;
+    let text = base64::engine::general_purpose::STANDARD.encode(der);
+    format!("-----BEGIN {label}-----\n{text}\n-----END {label}-----\n")
+}
+
+#[test]
+fn a_key_stays_on_its_machine() {
+    let (keeper, robot) = (Place::with_fleet(), Place::new());
+    let said = robot.good(&["fleet", "request", "arm-1"]);
+    assert!(said.contains("sgc fleet enroll arm-1 --csr arm-1.csr"), "{said}");
+    assert_eq!((robot.mode("arm-1.key"), robot.mode("arm-1.csr")), (0o600, 0o644));
+    let key = robot.read("arm-1.key");
+    assert!(robot.bad(&["fleet", "request", "arm-1"]).contains("a key is never overwritten"));
+    assert_eq!(robot.read("arm-1.key"), key);
+
+    robot.bring("arm-1.csr", &keeper);
+    let said = keeper.good(&["fleet", "enroll", "arm-1", "--group", "arms", "--csr", "arm-1.csr", "-o", "a"]);
+    assert!(said.contains("sgc fleet accept a"), "{said}");
+    assert_eq!(keeper.mode("a"), 0o600);
+    let secret_line = key.lines().find(|l| l.len() == 64).unwrap();
+    for file in ["arm-1.csr", "a", "lab.fleet"] {
+        assert!(!keeper.read(file).contains(secret_line), "{file} has the key");
+    }
+
+    keeper.bring("a", &robot);
+    robot.set_mode("a", 0o644);
+    assert!(
+        robot.bad(&["fleet", "accept", "a"]).contains("lets others at secrets of the fleet: chmod 600 a")
+    );
+    robot.set_mode("a", 0o600);
+    let said = robot.good(&["fleet", "accept", "a"]);
+    assert!(said.starts_with("arm-1.identity: node arm-1 of fleet lab, holds until "), "{said}");
+    assert_eq!(robot.mode("arm-1.identity"), 0o600);
+    let identity = robot.identity("arm-1.identity");
+    let peer = keeper.fleet().anchors().verify(identity.chain(), now()).unwrap();
+    assert!(peer.is_in(&keeper.fleet().secret().group_tag("arms")));
+    assert!(
+        robot.bad(&["fleet", "accept", "a"]).contains("arm-1.identity exists already; --force replaces it")
+    );
+
+    // Renewal the same way.
+    keeper.good(&["fleet", "renew", "arm-1", "--csr", "arm-1.csr", "-o", "b", "--valid", "100d"]);
+    keeper.bring("b", &robot);
+    robot.good(&["fleet", "accept", "b", "--force"]);
+    let renewed = robot.identity("arm-1.identity");
+    assert_eq!((renewed.node_id(), renewed.groups()), (identity.node_id(), identity.groups()));
+    assert!(renewed.not_after() > identity.not_after());
+
+    // Whose key is another's has no use for the answer.
+    let other = Place::new();
+    other.good(&["fleet", "request", "arm-1"]);
+    keeper.bring("a", &other);
+    assert!(other.bad(&["fleet", "accept", "a"]).contains("do not belong together"));
+    assert!(
+        keeper.bad(&["fleet", "enroll", "x", "--csr", "a"]).contains("holds no request for a certificate")
+    );
+}
+
+#[test]
+fn the_roster_is_shown() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab", "--authority", "desk", "--post-quantum"]);
+    assert!(place.good(&["fleet", "list"]).contains("No nodes yet"));
+    place.good(&["fleet", "enroll", "arm-1", "--group", "b", "--group", "a", "--valid", "12h"]);
+    place.good(&["fleet", "enroll", "cloud", "--router"]);
+    place.good(&["fleet", "enroll", "relay", "--may-route"]);
+    place.good(&["fleet", "revoke", "relay"]);
+    let shown = place.good(&["fleet", "list"]);
+    let lines: Vec<_> = shown.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
+    assert!(lines[0].ends_with(", renewed by desk, post-quantum"), "{shown}");
+    assert_eq!(lines[1], "NODE ROLE CERTIFICATE GROUPS");
+    assert!(lines[2].starts_with("arm-1 member until ") && lines[2].ends_with(" a, b"), "{shown}");
+    assert!(lines[3].starts_with("cloud router until "), "{shown}");
+    assert!(lines[4].starts_with("relay member, may route revoked 20"), "{shown}");
+    let json: serde_json::Value = serde_json::from_str(&place.good(&["fleet", "list", "--json"])).unwrap();
+    assert_eq!(
+        (&json["fleet"], &json["authority"], &json["post_quantum"]),
+        (&"lab".into(), &"desk".into(), &true.into())
+    );
+    assert_eq!(json["nodes"][0]["name"], "arm-1");
+    assert_eq!(json["nodes"][0]["groups"], serde_json::json!(["a", "b"]));
+    let arm = place.identity("arm-1.identity");
+    assert_eq!(json["nodes"][0]["id"], arm.node_id().to_string());
+    assert_eq!(json["nodes"][0]["expires"], arm.not_after().to_string());
+    assert!(json["nodes"][0]["revoked"].is_null() && json["nodes"][2]["revoked"].is_string());
+    assert_eq!(arm.authority(), Some(place.fleet().node_id_of(&"desk".parse().unwrap())));
+    assert!(arm.post_quantum());
+    let shown = place.good(&["fleet", "set", "--no-authority", "--post-quantum", "false"]);
+    assert!(shown.contains("authority none, post-quantum off"), "{shown}");
+    assert!(place.identity("cloud.identity").as_peer().may_route && !arm.as_peer().may_route);
+}
+
+#[test]
+fn a_revoked_node_is_out() {
+    let place = Place::with_fleet();
+    for node in ["arm-1", "arm-2", "desk"] {
+        place.good(&["fleet", "enroll", node]);
+    }
+    let before = place.read("lab.fleet");
+    let said = place.bad(&["fleet", "revoke", "arm-1", "nobody"]);
+    assert!(said.contains("the fleet's roster has no node nobody: see `sgc fleet list`"), "{said}");
+    assert_eq!(place.read("lab.fleet"), before, "all or none");
+    let said = place.good(&["fleet", "revoke", "arm-1", "arm-2"]);
+    assert!(said.contains("arm-1: revoked\narm-2: revoked\nlab.crl: revocation list "), "{said}");
+    assert_eq!((place.mode("lab.fleet"), place.mode("lab.crl")), (0o600, 0o644));
+    let anchors = place.anchors_with_list();
+    let judge = |node: &str| anchors.verify(place.identity(&format!("{node}.identity")).chain(), now());
+    assert!(matches!(judge("arm-1"), Err(CertError::Revoked { .. })));
+    assert!(matches!(judge("arm-2"), Err(CertError::Revoked { .. })));
+    assert!(judge("desk").is_ok());
+    for command in [&["fleet", "renew", "arm-1"][..], &["fleet", "enroll", "arm-1", "--force"]] {
+        let said = place.bad(command);
+        assert!(said.contains("`sgc fleet enroll arm-1 --again` makes it a node anew"), "{said}");
+    }
+    place.good(&["fleet", "enroll", "arm-1", "--again", "--force"]);
+    // The list can be written again; it says the same.
+    fs::remove_file(place.path("lab.crl")).unwrap();
+    place.good(&["fleet", "revoke"]);
+    let anchors = place.anchors_with_list();
+    assert!(anchors.verify(place.identity("arm-1.identity").chain(), now()).is_ok());
+    assert!(anchors.verify(place.identity("arm-2.identity").chain(), now()).is_err());
+    assert!(place.files().iter().all(|f| !f.starts_with('.')), "{:?}", place.files());
+}
+
+#[test]
+fn commands_at_once_lose_nothing() {
+    let place = Place::with_fleet();
+    let nodes: Vec<_> = (0..12).map(|i| format!("arm-{i}")).collect();
+    let start = |args: &[&str]| place.command(args).stdout(Stdio::null()).spawn().unwrap();
+    let enrolling: Vec<_> = nodes.iter().map(|n| start(&["fleet", "enroll", n])).collect();
+    assert!(enrolling.into_iter().all(|mut child| child.wait().unwrap().success()));
+    assert_eq!(place.fleet().nodes().len(), nodes.len());
+    let (first, rest) = nodes.split_at(6);
+    let revoking = first.iter().map(|n| start(&["fleet", "revoke", n]));
+    let renewing = rest.iter().map(|n| start(&["fleet", "renew", n]));
+    let all: Vec<_> = revoking.chain(renewing).collect();
+    assert!(all.into_iter().all(|mut child| child.wait().unwrap().success()));
+    let fleet = place.fleet();
+    assert_eq!(fleet.nodes().filter(|n| n.revoked.is_some()).count(), first.len());
+    assert_eq!(fleet.nodes().map(|n| n.certificates.len()).sum::<usize>(), nodes.len() + rest.len());
+    let anchors = place.anchors_with_list();
+    let revoked = nodes.iter().filter(|n| anchors.is_revoked(&cert(&place, n))).count();
+    assert_eq!(revoked, first.len());
+}
+
+fn cert(place: &Place, node: &str) -> sgc_trust::CertId {
+    place.identity(&format!("{node}.identity")).as_peer().cert.clone()
+}
+
+#[test]
+fn renewal_keeps_key_and_place() {
+    let place = Place::with_fleet();
+    place.good(&["fleet", "enroll", "arm-1", "--group", "arms", "--valid", "1h"]);
+    let before = place.identity("arm-1.identity");
+    let said = place.good(&["fleet", "rotate-secret"]);
+    assert!(said.contains("generation 2 of the naming secret"), "{said}");
+    place.good(&["fleet", "renew", "arm-1"]);
+    let after = place.identity("arm-1.identity");
+    assert_eq!((after.node_id(), after.groups()), (before.node_id(), before.groups()));
+    assert!(after.not_after() > before.not_after());
+    let generations = |i: &Identity| i.naming_secrets().iter().map(|n| n.generation).collect::<Vec<_>>();
+    assert_eq!((generations(&before), generations(&after)), (vec![1], vec![2, 1]));
+    let signed = before.sign("x", b"y");
+    assert_eq!(after.as_peer().verify_signature("x", b"y", &signed), Ok(()), "the key is the same");
+    // New names come from the new secret.
+    let name = |identity: &str| {
+        let args = ["name", "--owner", "arm-1", "--topic", "/a", "--type", "p/msg/T", "--identity", identity];
+        place.good(&args)
+    };
+    place.write("old.identity", &before.to_text(), 0o600);
+    assert_ne!(name("old.identity"), name("arm-1.identity"));
+
+    assert!(place.bad(&["fleet", "retire-secret", "3"]).contains("generation 2 is the newest"));
+    assert!(place.good(&["fleet", "retire-secret", "2"]).ends_with("generations in use: 2\n"));
+    place.good(&["fleet", "renew", "arm-1", "--force"]);
+    let forced = place.identity("arm-1.identity");
+    assert_eq!(generations(&forced), [2]);
+    assert!(
+        forced.as_peer().verify_signature("x", b"y", &signed).is_err(),
+        "a lost key is replaced by force"
+    );
+    assert!(place.bad(&["fleet", "renew", "nobody"]).contains("has no node nobody"));
+    for (time, said) in
+        [("0d", "longer than nothing"), ("5", "a number with its unit"), ("xd", "90d, 12h or 30m")]
+    {
+        assert!(place.bad(&["fleet", "renew", "arm-1", "--valid", time]).contains(said));
+    }
+}
+
+#[test]
+fn a_fleet_file_that_was_altered_is_refused() {
+    let place = Place::with_fleet();
+    place.good(&["fleet", "enroll", "arm-1"]);
+    let text = place.read("lab.fleet");
+    let marker = "-----BEGIN SGC ROSTER-----\n";
+    let at = text.find(marker).unwrap() + marker.len() + 80;
+    let mut bytes = text.into_bytes();
+    bytes[at] = if bytes[at] == b'A' { b'B' } else { b'A' };
+    place.write("lab.fleet", std::str::from_utf8(&bytes).unwrap(), 0o600);
+    for command in [&["fleet", "list"][..], &["fleet", "revoke", "arm-1"], &["fleet", "enroll", "x"]] {
+        assert!(place.bad(command).contains("SGC ROSTER"));
+    }
+    place.set_mode("lab.fleet", 0o640);
+    for command in [&["fleet", "list"][..], &["fleet", "revoke", "arm-1"], &["fleet", "rotate-secret"]] {
+        let said = place.bad(command);
+        assert!(
+            said.contains("its mode 0640 lets others at the CA's private key: chmod 600 lab.fleet"),
+            "{said}"
+        );
+    }
+}
+
+/// A CA of the kind that a company has already.
+fn company_ca(place: &Place) -> (CertificateParams, KeyPair) {
+    let mut params = CertificateParams::default();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    params.distinguished_name.push(DnType::CommonName, "Company CA");
+    let key = KeyPair::generate_for(&rcgen::PKCS_ECDSA_P384_SHA384).unwrap();
+    let certificate = params.self_signed(&key).unwrap();
+    place.write("ca.pem", &certificate.pem(), 0o644);
+    place.write("ca.key", &key.serialize_pem(), 0o600);
+    (params, key)
+}
+
+#[test]
+fn a_fleet_around_a_ca_that_exists() {
+    let place = Place::new();
+    company_ca(&place);
+    place.good(&["fleet", "import", "lab", "--ca-cert", "ca.pem", "--ca-key", "ca.key"]);
+    place.good(&["fleet", "enroll", "arm-1"]);
+    place.good(&["fleet", "revoke", "arm-1"]);
+    let judged = place.anchors_with_list().verify(place.identity("arm-1.identity").chain(), now());
+    assert!(matches!(judged, Err(CertError::Revoked { .. })));
+    let import = |cert, key| place.bad(&["fleet", "import", "new", "--ca-cert", cert, "--ca-key", key]);
+    place.write("sec1.key", &pem("EC PRIVATE KEY", b"x"), 0o600);
+    assert!(import("ca.pem", "sec1.key").contains("`openssl pkcs8 -topk8 -nodes -in FILE` writes one"));
+    assert!(import("ca.key", "ca.key").contains("it holds no certificate in PEM"));
+    place.set_mode("ca.key", 0o644);
+    assert!(import("ca.pem", "ca.key").contains("its mode 0644 lets others at the CA's private key"));
+}
+
+#[test]
+fn a_certificate_of_a_ca_that_keeps_its_key() {
+    let place = Place::new();
+    let (params, key) = company_ca(&place);
+    // A fleet file stands for the secret; its CA is not used.
+    place.good(&["fleet", "create", "lab"]);
+    let said = place.good(&["fleet", "request", "arm-1", "--secret", "lab.fleet"]);
+    assert!(said.contains("sgc fleet accept CERTIFICATE --ca CA --node arm-1"), "{said}");
+    let sign = |uri: &str, file: &str| {
+        // What a CA does with a request: its key, its alternative names.
+        let mut leaf = CertificateParams::default();
+        leaf.subject_alt_names = vec![rcgen::SanType::URI(uri.try_into().unwrap())];
+        let node_key = KeyPair::from_pem(&place.read("arm-1.key")).unwrap();
+        let made = leaf.signed_by(&node_key, &Issuer::from_params(&params, &key)).unwrap();
+        place.write(file, &made.pem(), 0o644);
+    };
+    let uri = format!("sgc:node:{}", place.fleet().secret().pseudonym("arm-1"));
+    let csr = place.read("arm-1.csr");
+    let der = sgc_trust::pem_contents(&csr, &["CERTIFICATE REQUEST"]).unwrap();
+    assert!(der[0].windows(uri.len()).any(|w| w == uri.as_bytes()), "the request names the node");
+    sign(&uri, "arm-1.pem");
+    let accept = ["fleet", "accept", "arm-1.pem", "--ca", "ca.pem", "--node", "arm-1", "--fleet-name", "lab"];
+    place.good(&[&accept[..], &["--secret", "lab.fleet"]].concat());
+    let identity = place.identity("arm-1.identity");
+    assert_eq!(identity.fleet_secret().unwrap().expose(), place.fleet().secret().expose());
+    let ca = sgc_trust::pem_contents(&place.read("ca.pem"), &["CERTIFICATE"]).unwrap();
+    let anchors = TrustAnchors::new([CertificateDer::from(ca[0].to_vec())]).unwrap();
+    assert_eq!(anchors.verify(identity.chain(), now()).unwrap().node_id, identity.node_id());
+
+    sign("https://example.com", "other.pem");
+    let mut other = accept.to_vec();
+    other[2] = "other.pem";
+    let said = place.bad(&other);
+    assert!(said.contains("names no SGC node") && said.contains("sgc fleet request"), "{said}");
+    assert!(!Path::new(&place.path("other.identity")).exists());
+}

@@ -1,0 +1,494 @@
+//! Who may do what, as its user asks, changes and looks it up: policy, reload, tokens and the audit log, of the real
+//! binary.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use sgc_trust::{Identity, ShareToken, derive_name};
+use sgc_wire::Metadata;
+use tempfile::TempDir;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+const POSE: &str = "geometry_msgs/msg/PoseStamped";
+
+/// A directory with the fleet `lab` (arm-1, desk in operators) and, beside it, the fleet `acme` (cart).
+struct Place {
+    dir: TempDir,
+}
+
+struct Ran {
+    code: Option<i32>,
+    stdout: String,
+    stderr: String,
+}
+
+impl Place {
+    fn new() -> Self {
+        let place = Self { dir: tempfile::tempdir().unwrap() };
+        for args in [
+            &["fleet", "create", "lab"][..],
+            &["fleet", "create", "acme"],
+            &["fleet", "enroll", "arm-1", "--fleet", "lab.fleet"],
+            &["fleet", "enroll", "desk", "--fleet", "lab.fleet", "--group", "operators"],
+            &["fleet", "enroll", "cart", "--fleet", "acme.fleet"],
+        ] {
+            place.good(args);
+        }
+        place.write("acme-ca.pem", &certificate_of(&place.read("acme.fleet")));
+        place.write("lab-ca.pem", &certificate_of(&place.read("lab.fleet")));
+        let text = "# arm-1\n[node]\nname = \"arm-1\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"state\"\n\n\
+                    [admin]\nsocket = \"arm.sock\"\n\n\
+                    [[share]]\ntopic = \"/cmd_vel\"\nto = [\"group:operators\"]\npublish = [\"desk\"]\n\n\
+                    [[share]]\ntopic = \"/handoff/pose\"\nto = [\"desk\"]\n";
+        place.write("arm-1.toml", text);
+        let text = "[node]\nname = \"cart\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"cart-state\"\n\n\
+                    [admin]\nsocket = \"cart.sock\"\n";
+        place.write("cart.toml", text);
+        place
+    }
+
+    fn command(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sgc"));
+        command
+            .args(args)
+            .current_dir(self.dir.path())
+            .env_clear()
+            .env("XDG_RUNTIME_DIR", self.dir.path())
+            .env("XDG_STATE_HOME", self.dir.path().join("states"))
+            .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+            .stdin(Stdio::null());
+        command
+    }
+
+    fn run(&self, args: &[&str]) -> Ran {
+        let output = self.command(args).output().unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        Ran { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
+    }
+
+    fn good(&self, args: &[&str]) -> String {
+        let ran = self.run(args);
+        assert_eq!(ran.code, Some(0), "{args:?}: {}", ran.stderr);
+        ran.stdout
+    }
+
+    fn bad(&self, code: i32, args: &[&str]) -> String {
+        let ran = self.run(args);
+        assert_eq!(ran.code, Some(code), "{args:?}: {}{}", ran.stdout, ran.stderr);
+        ran.stderr
+    }
+
+    fn path(&self, file: &str) -> std::path::PathBuf {
+        self.dir.path().join(file)
+    }
+
+    fn read(&self, file: &str) -> String {
+        fs::read_to_string(self.path(file)).unwrap()
+    }
+
+    fn write(&self, file: &str, text: &str) {
+        fs::write(self.path(file), text).unwrap();
+    }
+
+    fn mode(&self, file: &str) -> u32 {
+        fs::metadata(self.path(file)).unwrap().permissions().mode() & 0o7777
+    }
+
+    fn identity(&self, file: &str) -> Identity {
+        Identity::parse(&self.read(file)).unwrap()
+    }
+
+    fn policy(&self, args: &[&str]) -> (Option<i32>, String) {
+        let ran = self.run(&[&["policy", "test", "-c", "arm-1.toml"], args].concat());
+        assert_eq!(ran.stderr, "");
+        (ran.code, ran.stdout.trim_end().to_owned())
+    }
+
+    fn start(&self, config: &str) -> Running {
+        let mut command = self.command(&["run", "-c", config, "--print-ready"]);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        stdout.read_line(&mut line).unwrap();
+        if line.is_empty() {
+            let mut log = String::new();
+            child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+            panic!("it did not start: {log}");
+        }
+        Running { child, _stdout: stdout }
+    }
+}
+
+struct Running {
+    child: Child,
+    _stdout: BufReader<ChildStdout>,
+}
+
+impl Running {
+    fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    /// Ends it; gives its log.
+    fn end(mut self) -> String {
+        self.signal(Signal::TERM);
+        let deadline = Instant::now() + PATIENCE;
+        while self.child.try_wait().unwrap().is_none() {
+            assert!(Instant::now() < deadline, "it does not end");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let mut log = String::new();
+        self.child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        log
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The CA certificate of a fleet file, which holds no other.
+fn certificate_of(fleet: &str) -> String {
+    let begin = fleet.find("-----BEGIN CERTIFICATE-----").unwrap();
+    let end = "-----END CERTIFICATE-----\n";
+    let length = fleet[begin..].find(end).unwrap() + end.len();
+    fleet[begin..begin + length].to_owned()
+}
+
+#[test]
+fn policy_is_answered_from_the_configuration_alone() {
+    let place = Place::new();
+    let says = |args: &[&str], code: i32, text: &str| {
+        assert_eq!(place.policy(args), (Some(code), text.to_owned()), "{args:?}");
+    };
+    says(
+        &["--identity", "desk", "--topic", "/handoff/pose"],
+        0,
+        "yes: desk may subscribe to /handoff/pose: `to` names \"desk\": that is this node",
+    );
+    // Groups stand in certificates: the name alone does not say them.
+    says(
+        &["--identity", "desk", "--topic", "/cmd_vel"],
+        1,
+        "no: desk may not subscribe to /cmd_vel: `to` of /cmd_vel names \"group:operators\", and it is none of them (a \
+         member of this fleet, in 0 groups)",
+    );
+    let by_group = "yes: desk may subscribe to /cmd_vel: `to` names \"group:operators\": its certificate puts it into that group";
+    says(&["--identity", "desk", "--group", "operators", "--topic", "/cmd_vel"], 0, by_group);
+    says(&["--identity-file", "desk.identity", "--topic", "/cmd_vel"], 0, by_group);
+    says(
+        &["--identity", "desk", "--topic", "/cmd_vel", "--publish"],
+        0,
+        "yes: desk may publish on /cmd_vel: `publish` names \"desk\": that is this node",
+    );
+    says(
+        &["--identity", "desk", "--topic", "/handoff/pose", "--publish"],
+        1,
+        "no: desk may not publish on /handoff/pose: `publish` of /handoff/pose names nobody",
+    );
+    says(
+        &["--identity", "arm-1", "--topic", "/handoff/pose", "--publish"],
+        0,
+        "yes: arm-1 may publish on /handoff/pose: it is the owner",
+    );
+    says(
+        &["--identity", "desk", "--topic", "/other"],
+        1,
+        "no: desk may not subscribe to /other: arm-1 does not share it",
+    );
+    let (code, text) = place.policy(&["--identity-file", "cart.identity", "--topic", "/cmd_vel"]);
+    assert_eq!(code, Some(1));
+    assert!(text.contains("its certificate is not believed"), "{text}");
+    let (_, json) = place.policy(&["--identity", "desk", "--topic", "/handoff/pose", "--json"]);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&json["permitted"], &json["role"]), (&Value::Bool(true), &Value::from("subscribe")));
+    assert_eq!(json["node_id"], place.identity("desk.identity").node_id().to_string());
+    // A question that cannot be answered is neither yes nor no.
+    place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--topic", "/cmd_vel"]);
+    place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--identity", "No One", "--topic", "/cmd_vel"]);
+}
+
+#[test]
+fn partners_are_known_by_their_certificates() {
+    let place = Place::new();
+    let cart = place.identity("cart.identity");
+    let share = "\n[[share]]\ntopic = \"/map\"\nto = [\"partner:acme\"]\n\n[[partner]]\nname = \"acme\"\nca = \"acme-ca.pem\"\n";
+    let base = place.read("arm-1.toml");
+    place.write("arm-1.toml", &format!("{base}{share}"));
+    let of_cart = ["--identity-file", "cart.identity", "--topic", "/map"];
+    let (code, text) = place.policy(&of_cart);
+    assert_eq!((code, text.contains("its certificate is of that partner's CA")), (Some(0), true), "{text}");
+    let certificate = {
+        let file = place.read("cart.identity");
+        let begin =
+            file.find("-----BEGIN CERTIFICATE").or_else(|| file.find("-----BEGIN SGC CHAIN")).unwrap_or(0);
+        file[begin..].replace("SGC CHAIN", "CERTIFICATE")
+    };
+    place.write("cart.pem", &certificate_of(&certificate));
+    let (code, _) = place.policy(&["--certificate", "cart.pem", "--topic", "/map"]);
+    assert_eq!(code, Some(0));
+    assert_eq!(place.policy(&["--identity-file", "desk.identity", "--topic", "/map"]).0, Some(1));
+    // A list of nodes is a list of nodes, whatever else the CA certified.
+    place.write("arm-1.toml", &format!("{base}{share}node = \"{}\"\n", "ab".repeat(32)));
+    let (code, text) = place.policy(&of_cart);
+    assert!(code == Some(1) && text.contains("not one of the nodes listed there"), "{text}");
+    place.write("arm-1.toml", &format!("{base}{share}node = [\"{}\"]\n", cart.node_id()));
+    assert_eq!(place.policy(&of_cart).0, Some(0));
+}
+
+#[test]
+fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
+    let place = Place::new();
+    let node = place.start("arm-1.toml");
+    assert_eq!(place.good(&["reload", "-c", "arm-1.toml"]), "nothing changed\n");
+    let base = place.read("arm-1.toml");
+    place.write(
+        "arm-1.toml",
+        &base.replace("to = [\"desk\"]", "to = [\"desk\", \"lamp\"]").replace("/cmd_vel", "/cmd"),
+    );
+    let said = place.good(&["reload", "--socket", "arm.sock"]);
+    assert_eq!(
+        said.lines().collect::<Vec<_>>(),
+        ["/cmd_vel is no longer shared", "/cmd is shared", "/handoff/pose: who may subscribe changed"]
+    );
+    let status: Value =
+        serde_json::from_str(&place.good(&["status", "--socket", "arm.sock", "--json"])).unwrap();
+    let topics: Vec<_> = status["routes"].as_array().unwrap().iter().map(|r| r["topic"].clone()).collect();
+    assert_eq!(topics, ["/cmd", "/handoff/pose"]);
+
+    // A mistake anywhere: nothing is touched, and all of it is told.
+    let good = place.read("arm-1.toml");
+    place.write(
+        "arm-1.toml",
+        &good.replace("/cmd", "/new").replace("publish", "publsih").replace("\"desk\"", "\"Desk\""),
+    );
+    let said = place.bad(1, &["reload", "--socket", "arm.sock"]);
+    assert!(said.contains("did you mean `publish`?") && said.contains("\"Desk\""), "{said}");
+    let status: Value =
+        serde_json::from_str(&place.good(&["status", "--socket", "arm.sock", "--json"])).unwrap();
+    assert_eq!(status["routes"][0]["topic"], "/cmd");
+
+    place.write("arm-1.toml", &good.replace("127.0.0.1:9", "127.0.0.1:10").replace("lamp", "sofa"));
+    let said = place.good(&["reload", "--socket", "arm.sock"]);
+    let expected = ["/handoff/pose: who may subscribe changed", "`routers` changed, which needs a restart"];
+    assert_eq!(said.lines().collect::<Vec<_>>(), expected);
+    assert_eq!(
+        place.good(&["reload", "--socket", "arm.sock"]),
+        format!("{}\n", expected[1]),
+        "said until it is done"
+    );
+
+    // SIGHUP does the same; the log tells when.
+    place.write("arm-1.toml", &good);
+    node.signal(Signal::HUP);
+    let deadline = Instant::now() + PATIENCE;
+    while !place.read("state/audit.jsonl").contains("SIGHUP") {
+        assert!(Instant::now() < deadline, "the hang-up was not heard");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let log = node.end();
+    assert!(log.contains("reload: /handoff/pose: who may subscribe changed"), "{log}");
+
+    let json = place.good(&["audit", "-c", "arm-1.toml", "--event", "reload", "--json"]);
+    let events: Vec<Value> = json.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(events.len(), 6);
+    assert!(events[2]["reason"].as_str().unwrap().starts_with("refused: "), "{json}");
+    assert_eq!((&events[1]["by"], &events[5]["by"]), (&"sgc reload".into(), &"SIGHUP".into()));
+}
+
+#[test]
+fn the_status_socket_answers_old_and_odd_questions() {
+    let place = Place::new();
+    let node = place.start("arm-1.toml");
+    let ask = |question: &[u8]| {
+        let mut stream = UnixStream::connect(place.path("arm.sock")).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let _ = stream.write_all(question);
+        let mut text = String::new();
+        let _ = stream.read_to_string(&mut text);
+        serde_json::from_str::<Value>(&text).unwrap_or_default()
+    };
+    for question in [&b""[..], b"status\n", b"sgc/1 status\n"] {
+        assert_eq!(ask(question)["node"], "arm-1", "{question:?}");
+    }
+    for (question, error) in [
+        (&b"sgc/1 stop\n"[..], "\"stop\" is nothing"),
+        (b"sgc/9 status\n", "speaks version 1"),
+        (b"\xff\n", "not text"),
+        (b"sgc/1 crl %\n", "lacks a usable argument"),
+    ] {
+        let answer = ask(question);
+        assert!(answer["error"].as_str().unwrap().contains(error), "{answer}");
+    }
+    let long = ask(&vec![b'x'; 2 << 20]);
+    assert!(long == Value::Null || long["error"].as_str().unwrap().contains("more than"), "{long}");
+    // One that asks and never ends its question holds up nobody.
+    let mut slow = UnixStream::connect(place.path("arm.sock")).unwrap();
+    slow.write_all(b"sgc/1 rel").unwrap();
+    assert_eq!(ask(b"sgc/1 status\n")["node"], "arm-1");
+    node.end();
+}
+
+#[test]
+fn a_token_hands_over_one_topic_and_is_taken_back() {
+    let place = Place::new();
+    let give = ["share-token", "-c", "arm-1.toml", "--topic", "/handoff/pose", "--to", "acme-ca.pem"];
+    let said = place.bad(2, &give);
+    assert!(said.contains("add --type PACKAGE/msg/NAME"), "{said}");
+    let ran = place.run(&[&give[..], &["--type", POSE, "--valid", "12h"]].concat());
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    assert!(
+        ran.stderr.contains("Token 1 for /handoff/pose") && ran.stderr.contains("next start"),
+        "{}",
+        ran.stderr
+    );
+    let token = ShareToken::parse(&ran.stdout).unwrap();
+    let arm = place.identity("arm-1.identity");
+    let metadata = Metadata::topic("arm-1", "/handoff/pose", POSE);
+    assert_eq!(token.name(), derive_name(arm.fleet_secret().unwrap(), &arm.node_id(), &metadata));
+    assert_eq!(token.routers, ["quic://127.0.0.1:9"]);
+    assert_eq!((place.mode("state/partners.json"), place.mode("state")), (0o600, 0o700));
+    let records = place.read("state/partners.json");
+    assert!(!records.contains("sgc-token") && records.contains(&token.name().to_string()), "{records}");
+
+    let listed = place.good(&["share-token", "-c", "arm-1.toml", "--list"]);
+    assert!(listed.contains("/handoff/pose") && listed.lines().count() == 2, "{listed}");
+    let of_cart = ["--identity-file", "cart.identity", "--topic", "/handoff/pose"];
+    let (code, text) = place.policy(&of_cart);
+    assert_eq!((code, text.contains("token 1 was given for it")), (Some(0), true), "{text}");
+    assert_eq!(place.policy(&["--identity-file", "cart.identity", "--topic", "/cmd_vel"]).0, Some(1));
+    assert_eq!(place.policy(&[&of_cart[..], &["--publish"]].concat()).0, Some(1));
+
+    // A running node is told by itself.
+    let node = place.start("arm-1.toml");
+    let said = place.good(&["share-token", "-c", "arm-1.toml", "--withdraw", "1"]);
+    assert!(said.contains("/handoff/pose: who may subscribe changed"), "{said}");
+    assert_eq!(place.policy(&of_cart).0, Some(1));
+    let said = place.bad(2, &["share-token", "-c", "arm-1.toml", "--withdraw", "1"]);
+    assert!(said.contains("no token has the number 1"), "{said}");
+    node.end();
+    // Numbers are not given twice; one node of the partner may be meant alone.
+    let cart = place.identity("cart.identity").node_id();
+    for (to, permitted) in
+        [(format!("acme-ca.pem:{cart}"), 0), (format!("acme-ca.pem:{}", "ab".repeat(32)), 1)]
+    {
+        let args = [&give[..5], &["--to", &to, "--type", POSE]].concat();
+        let ran = place.run(&args);
+        assert!(ran.stderr.contains("Token 2") || ran.stderr.contains("Token 3"), "{}", ran.stderr);
+        assert_eq!(place.policy(&of_cart).0, Some(permitted), "{to}");
+        let id = if permitted == 0 { "2" } else { "3" };
+        place.good(&["share-token", "-c", "arm-1.toml", "--withdraw", id]);
+    }
+    let said = place.bad(2, &[&give[..5], &["--to", "lab-ca.pem", "--type", POSE]].concat());
+    assert!(said.contains("its nodes need no token"), "{said}");
+}
+
+#[test]
+fn a_token_is_used_by_adding_three_lines() {
+    let place = Place::new();
+    let args = [
+        "share-token",
+        "-c",
+        "arm-1.toml",
+        "--topic",
+        "/handoff/pose",
+        "--to",
+        "acme-ca.pem",
+        "--type",
+        POSE,
+    ];
+    let token = place.good(&args);
+    let token = token.trim();
+    let before = place.read("cart.toml");
+    let said = place.good(&["use", token, "-c", "cart.toml", "--dry-run"]);
+    assert!(
+        said.contains("/handoff/pose [geometry_msgs/msg/PoseStamped] of arm-1") && said.contains("[[use]]"),
+        "{said}"
+    );
+    assert_eq!(place.read("cart.toml"), before);
+    assert!(!place.path("cart-state").exists());
+
+    fs::set_permissions(place.path("cart.toml"), fs::Permissions::from_mode(0o640)).unwrap();
+    place.good(&["use", token, "-c", "cart.toml"]);
+    let after = place.read("cart.toml");
+    assert!(after.starts_with(&before) && !after.contains("sgc-token"), "{after}");
+    assert_eq!((place.mode("cart.toml"), place.mode("cart-state/tokens")), (0o640, 0o700));
+    let file = fs::read_dir(place.path("cart-state/tokens")).unwrap().next().unwrap().unwrap().path();
+    assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o7777, 0o600);
+    assert!(Path::new(&file).file_name().unwrap().to_str().unwrap().starts_with("handoff-pose-"));
+    assert!(place.good(&["check", "-c", "cart.toml"]).contains("no mistakes"));
+    let said = place.bad(2, &["use", token, "-c", "cart.toml"]);
+    assert!(said.contains("used with this very token already"), "{said}");
+    let said = place.bad(2, &["use", &token[..token.len() - 3], "-c", "cart.toml"]);
+    assert!(said.contains("cut or mistyped") && !said.contains(&token[20..60]), "{said}");
+
+    // The node joins that one name, and says what it waits for.
+    let node = place.start("cart.toml");
+    let status: Value =
+        serde_json::from_str(&place.good(&["status", "--socket", "cart.sock", "--json"])).unwrap();
+    let route = &status["routes"][0];
+    assert_eq!((&route["topic"], &route["owner"]), (&"/handoff/pose".into(), &"arm-1".into()));
+    assert_eq!(route["name"], ShareToken::parse(token).unwrap().name().to_string());
+    let log = node.end();
+    assert!(!log.contains("sgc-token"), "{log}");
+    // Taken out again while the node runs.
+    let node = place.start("cart.toml");
+    place.write("cart.toml", &before);
+    let said = place.good(&["reload", "--socket", "cart.sock"]);
+    assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
+    node.end();
+}
+
+#[test]
+fn the_audit_log_is_found_filtered_and_read_over_what_is_broken() {
+    let place = Place::new();
+    place.start("arm-1.toml").end();
+    let log = place.path("state/audit.jsonl");
+    let peer = "ab".repeat(32);
+    let mut file = fs::OpenOptions::new().append(true).open(&log).unwrap();
+    let line = format!(
+        "{{\"time\":\"2020-01-01T00:00:00Z\",\"unix_ms\":1577836800000,\"event\":\"refused\",\"topic\":\"/cmd_vel\",\
+         \"peer\":\"{peer}\",\"reason\":\"\\u001b[2Jno\"}}\n{{\"time\":\"20"
+    );
+    file.write_all(line.as_bytes()).unwrap();
+    // A run later begins a new line.
+    place.start("arm-1.toml").end();
+    let ran = place.run(&["audit", "-c", "arm-1.toml"]);
+    let events: Vec<_> = ran.stdout.lines().filter_map(|line| line.split_whitespace().nth(1)).collect();
+    assert_eq!(events, ["event", "started", "stopped", "refused", "started", "stopped"], "{}", ran.stdout);
+    assert!(!ran.stdout.contains('\u{1b}') && ran.stdout.contains("[2Jno"));
+    assert!(ran.stderr.contains("1 line is not readable"), "{}", ran.stderr);
+    let lines = |args: &[&str]| {
+        place.run(&[&["audit", "-c", "arm-1.toml", "--json"], args].concat()).stdout.lines().count()
+    };
+    assert_eq!(lines(&["--topic", "/cmd_vel"]), 1);
+    assert_eq!((lines(&["--peer", "abab"]), lines(&["--peer", "ac"])), (1, 0));
+    assert_eq!(lines(&["--event", "started", "--event", "refused"]), 3);
+    assert_eq!(lines(&["--since", "1h"]), 4);
+    let said = place.bad(2, &["audit", "-c", "arm-1.toml", "--event", "no"]);
+    assert!(said.contains("granted, refused"), "{said}");
+    assert!(place.bad(1, &["audit", "--file", "none"]).contains("there is no such file"));
+
+    // The usual place is looked in, too.
+    place.write("arm-1.toml", &place.read("arm-1.toml").replace("state = \"state\"\n", ""));
+    place.start("arm-1.toml").end();
+    assert!(place.good(&["audit"]).contains("started"));
+    assert!(place.good(&["audit", "--node", "arm-1"]).contains("started"));
+    // Off is off.
+    place.write("arm-1.toml", &format!("{}\n[audit]\noff = true\n", place.read("arm-1.toml")));
+    place.start("arm-1.toml").end();
+    assert_eq!(place.good(&["audit", "--node", "arm-1"]).lines().count(), 3);
+    place.bad(2, &["audit", "-c", "arm-1.toml"]);
+}

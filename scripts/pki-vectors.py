@@ -1,0 +1,43 @@
+#!/usr/bin/env python3
+"""Prints known-answer vectors of identities and secrets, computed independently of the Rust code."""
+import hashlib
+import hmac
+
+SECRET = bytes(range(32))
+ROTATED = bytes(range(32, 64))
+# A P-256 SubjectPublicKeyInfo around a point that is none: only its bytes matter here.
+SPKI = bytes.fromhex("3059301306072a8648ce3d020106082a8648ce3d03010703420004") + bytes(range(64))
+
+
+def tag(domain, name):
+    return hmac.digest(SECRET, domain + b"\0" + name, "sha256")
+
+
+def name(secret, owner, metadata):
+    prk = hmac.digest(b"sgc topic secret v1", secret, "sha256")
+    topic = hmac.digest(prk, metadata + b"\x01", "sha256")
+    blind = hmac.digest(topic, b"sgc name", "sha256")
+    return hashlib.sha256(b"sgc name v1" + owner + blind)
+
+
+def metadata(kind, *fields):
+    out = bytes([1, kind])
+    for text in fields:
+        out += len(text).to_bytes(4, "big") + text.encode()
+    return out
+
+
+pseudonym = tag(b"sgc pseudonym v1", b"arm-1")
+node = hashlib.sha256(SPKI + pseudonym).digest()
+ca = hashlib.sha256(SPKI).digest()
+renewal = hashlib.sha256(b"sgc renewal v1" + ca).digest()
+topic = metadata(1, "arm-1", "/camera/image", "sensor_msgs/msg/Image", *[""] * 6)
+print("pseudonym of arm-1      ", pseudonym.hex())
+print("group tag of operators  ", tag(b"sgc group v1", b"operators").hex())
+print("node id of arm-1        ", node.hex())
+print("CA fingerprint          ", ca.hex())
+print("renewal blind           ", renewal.hex())
+print("renewal name            ", hashlib.sha256(b"sgc name v1" + node + renewal).hexdigest())
+print("/camera/image, gen. 1   ", name(SECRET, node, topic).hexdigest())
+print("/camera/image, gen. 2   ", name(ROTATED, node, topic).hexdigest())
+print("naming secret block 2   ", ((2).to_bytes(4, "big") + ROTATED).hex())
