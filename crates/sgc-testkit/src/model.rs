@@ -21,7 +21,9 @@ pub struct Model {
 impl Model {
     /// What should come of a world as it is configured now.
     pub fn of(world: &World) -> Self {
-        let alive = |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none();
+        // Who has heard that it is revoked itself believes nothing of what it says, and is alone.
+        let alive =
+            |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none() && world.believes(n, n);
         let reached: BTreeMap<_, _> =
             world.nodes().filter(|n| alive(*n)).map(|n| (n, reach(world, n, alive))).collect();
         let mut granted = BTreeMap::new();
