@@ -171,6 +171,11 @@ fn who_may_publish_no_longer_is_cut_and_its_key_is_believed_no_more() {
         let rekeyed = events(world, *arm, log).find(|(e, _)| matches!(e, Event::Rekeyed { .. }));
         assert!(rekeyed.expect("a new epoch").1 - kept < ms(1001));
         world.run(ms(500));
+        let told = events(world, *arm, log).filter_map(|(e, _)| match e {
+            Event::OwnGrant { grant, .. } => Some((grant.epoch, grant.sources.len())),
+            _ => None,
+        });
+        assert_eq!(told.last(), Some((2, 1)), "its own sink hears of it too");
         for user in [*arm, *lap, *tab] {
             assert_received(world, user, *arm, &before);
             let received = world.received(user, *arm, "/chatter");
