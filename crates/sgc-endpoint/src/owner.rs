@@ -45,6 +45,7 @@ impl Endpoint {
             own: Vec::new(),
             sinks: BTreeMap::new(),
             left: BTreeMap::new(),
+            told_own: false,
         };
         self.shares.shares.insert(name, share);
         self.withdrawn.remove(&blind);
@@ -313,8 +314,9 @@ impl Endpoint {
 
     /// Tells this node's own sink of a share on which others may publish.
     fn tell_own(&mut self, name: Name) {
-        let Some(share) = self.shares.shares.get(&name) else { return };
-        if !share.spec.policy.publish.is_empty() {
+        let Some(share) = self.shares.shares.get_mut(&name) else { return };
+        share.told_own |= !share.spec.policy.publish.is_empty();
+        if share.told_own {
             let grant = share.grant(share.newest(), None);
             self.event(Event::OwnGrant { name, grant });
         }

@@ -108,6 +108,8 @@ pub(crate) struct Share {
     /// This node's own sources.
     pub(crate) own: Vec<Arc<SourceProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
+    /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
+    pub(crate) told_own: bool,
     /// Who left and still has the newest key. If one of them loses its right, that key has to go.
     pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
-use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_trust::{EnrollRequest, Fleet, Identity, TrustAnchors};
 use sgc_wire::UnixMillis;
 
 use crate::clock::GENESIS;
@@ -100,6 +100,12 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     let identity = Arc::new(fleet.issue(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
     cast.identities.insert(member.clone(), identity.clone());
     identity
+}
+
+/// These CAs and that of a fleet.
+pub(crate) fn with_fleet(anchors: &TrustAnchors, fleet: &str) -> TrustAnchors {
+    let ca = cast().fleet(fleet).ca_certificate().clone();
+    anchors.with_anchors([ca]).expect("a CA that was made well")
 }
 
 /// A list of its fleet's CA that revokes these members, in that order of lists.

@@ -1,4 +1,5 @@
-//! What should be: computed from cables, runs, shares and uses alone, never from a machine's state.
+//! What should be: computed from cables, runs, shares, uses, and who has heard of which revocations; apart from those
+//! never from a machine's state.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,7 +21,9 @@ pub struct Model {
 impl Model {
     /// What should come of a world as it is configured now.
     pub fn of(world: &World) -> Self {
-        let alive = |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none();
+        // Who has heard that it is revoked itself believes nothing of what it says, and is alone.
+        let alive =
+            |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none() && world.believes(n, n);
         let reached: BTreeMap<_, _> =
             world.nodes().filter(|n| alive(*n)).map(|n| (n, reach(world, n, alive))).collect();
         let mut granted = BTreeMap::new();
@@ -49,6 +52,7 @@ impl Model {
 
     /// Where a quiet world differs from this.
     pub fn check(&self, world: &World) -> Result<(), String> {
+        self.check_revocations(world)?;
         for ((owner, topic), expected) in &self.granted {
             let granted = world.granted(*owner, topic);
             if !granted.iter().eq(expected) {
@@ -65,6 +69,18 @@ impl Model {
                 }
             }
             self.check_tables(world, *user)?;
+        }
+        Ok(())
+    }
+
+    /// Whoever reach each other have heard of the same revocations.
+    fn check_revocations(&self, world: &World) -> Result<(), String> {
+        for (node, reached) in &self.reached {
+            for other in reached {
+                if world.revocations(*node) != world.revocations(*other) {
+                    return Err(format!("{node:?} and {other:?} know of different revocations"));
+                }
+            }
         }
         Ok(())
     }
@@ -124,7 +140,8 @@ fn reach(world: &World, from: NodeKey, alive: impl Fn(NodeKey) -> bool) -> BTree
         for cable in world.cables.iter().filter(|c| c.whole) {
             let Some(side) = cable.end_of(here) else { continue };
             let there = cable.ends[1 - side];
-            if alive(there) && reached.insert(there) {
+            let trust = world.believes(here, there) && world.believes(there, here);
+            if alive(there) && trust && reached.insert(there) {
                 edge.push(there);
             }
         }
@@ -136,7 +153,8 @@ fn permits(world: &World, owner: NodeKey, sharing: &Sharing, user: NodeKey) -> b
     let member = &world.members[user.0];
     let in_fleet = same_fleet(world, owner, user);
     let in_group = member.groups.iter().any(|g| sharing.groups.contains(g));
-    !member.router && in_fleet && (sharing.fleet || sharing.nodes.contains(&user) || in_group)
+    let good = world.believes(owner, user);
+    good && !member.router && in_fleet && (sharing.fleet || sharing.nodes.contains(&user) || in_group)
 }
 
 fn same_fleet(world: &World, a: NodeKey, b: NodeKey) -> bool {

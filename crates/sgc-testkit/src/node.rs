@@ -21,6 +21,7 @@ use sgc_wire::{
     Name, NodeId, Now, Packet, Qos, Reliability, SinkId, SourceId, SourceOffer, TopicGrant,
 };
 
+use crate::cast::{Member, identity};
 use crate::record::{DataDrop, MessageId, What};
 
 /// Type of every topic.
@@ -54,6 +55,8 @@ pub struct Sharing {
     pub depth: usize,
     /// True if links may lose it.
     pub best_effort: bool,
+    /// With every member of these fleets, which are not the owner's.
+    pub partners: BTreeSet<String>,
     /// These nodes may publish too.
     pub publishers: BTreeSet<NodeKey>,
     /// How it is protected, unless as usual.
@@ -267,6 +270,12 @@ impl Running {
         self.links.insert(link, (wire, side));
         self.router.handle_link_up(now, link, peer);
         link
+    }
+
+    pub(crate) fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
+        self.anchors = anchors.clone();
+        self.router.set_anchors(anchors.clone());
+        self.endpoint.set_anchors(now, anchors);
     }
 
     pub(crate) fn renew(&mut self, now: Now, identity: Arc<Identity>) {
@@ -772,9 +781,18 @@ pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory)
         directory.by_id.iter().find(|(_, k)| *k == node).map(|(id, _)| *id).expect("a node of this world")
     };
     let group = |g: &String| owner.fleet_secret().map(|s| (ca, s.group_tag(g)));
+    let partner = |fleet: &String| {
+        let anyone = Member { fleet: fleet.clone(), ..Member::new("anyone") };
+        identity(&anyone).as_peer().ca
+    };
     Policy {
         subscribe: Grantees {
-            fleets: sharing.fleet.then_some(ca).into_iter().collect(),
+            fleets: sharing
+                .fleet
+                .then_some(ca)
+                .into_iter()
+                .chain(sharing.partners.iter().map(partner))
+                .collect(),
             nodes: sharing.nodes.iter().map(id).collect(),
             groups: sharing.groups.iter().filter_map(group).collect(),
         },

@@ -1,11 +1,12 @@
 //! What is done to the trust between nodes: rights and certificates taken back, clocks that are wrong.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_wire::{Now, UnixMillis};
 
-use crate::cast::identity;
+use crate::cast::{identity, with_fleet};
 use crate::node::{Node, NodeKey, Sharing, policy};
 use crate::world::World;
 
@@ -19,6 +20,20 @@ impl World {
         shares.insert(topic.to_owned(), sharing);
         if let Some(running) = running {
             running.endpoint.update_policy(now, &name, policy);
+        }
+        self.settle(node);
+    }
+
+    /// Lets a node believe another fleet's CA too.
+    pub fn trust_fleet(&mut self, node: NodeKey, fleet: &str) {
+        self.note(format!("{node:?} trusts {fleet}"));
+        let now = self.now_at(node);
+        let Node { identity, anchors, running, .. } = &mut self.nodes[node.0];
+        let known = anchors.as_deref().unwrap_or(identity.anchors());
+        let both = Arc::new(with_fleet(known, fleet));
+        *anchors = Some(both.clone());
+        if let Some(running) = running {
+            running.set_anchors(now, both);
         }
         self.settle(node);
     }
@@ -62,6 +77,18 @@ impl World {
         let news = running.router.add_crl(now, der).expect("a list of a trusted CA");
         self.settle(node);
         news
+    }
+
+    /// True unless a node has heard that the certificate of `other` is revoked.
+    pub fn believes(&self, node: NodeKey, other: NodeKey) -> bool {
+        let anchors = self.nodes[node.0].anchors.as_deref();
+        anchors.is_none_or(|anchors| !anchors.is_peer_revoked(self.identity(other).as_peer()))
+    }
+
+    /// The revocation lists that a node has.
+    pub fn revocations(&self, node: NodeKey) -> Vec<Bytes> {
+        let anchors = self.nodes[node.0].anchors.as_deref();
+        anchors.into_iter().flat_map(|anchors| anchors.crls().cloned()).collect()
     }
 
     /// Makes a node forget what it remembers over restarts: a new disk.

@@ -355,9 +355,15 @@ impl World {
     /// Joins a name without looking into its owner's catalogue, until the node stops.
     pub fn join_blindly(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
         self.note(format!("join blindly {node:?} {owner:?}:{topic}"));
-        let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
+        self.join_name(node, owner, self.name(owner, topic));
+    }
+
+    /// Joins a name that a node came to know otherwise, until it stops.
+    pub fn join_name(&mut self, node: NodeKey, owner: NodeKey, name: Name) {
+        let (now, id) = (self.now_at(node), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
-            running.endpoint.join(now, name, id, Wish::Subscribe { describe: false });
+            // As with a token, which says nothing of the topic but its name.
+            running.endpoint.join(now, name, id, Wish::Subscribe { describe: true });
         }
         self.settle(node);
     }

@@ -10,8 +10,10 @@ use std::time::Duration;
 
 use sgc_endpoint::SinkDrop;
 use sgc_router::DropReason;
-use sgc_testkit::{DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig};
-use sgc_trust::OpenError;
+use sgc_testkit::{
+    DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig, revocation_list,
+};
+use sgc_trust::{CertError, OpenError, SignedError};
 
 /// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
 const COMMITTED: &[u64] = &[
@@ -23,6 +25,8 @@ const COMMITTED: &[u64] = &[
 /// renewal for routes that wait for one, the longest wait between attempts to join, and idle time-outs.
 const QUIET_MAX: Duration = Duration::from_secs(120);
 const IDLE_MAX: Duration = Duration::from_secs(10);
+/// How long the word that a right has ended may take to the farthest router.
+const LAPSE_MAX: Duration = Duration::from_secs(2);
 const TOPICS: [&str; 3] = ["/a", "/b", "/c"];
 
 const fn ms(n: u64) -> Duration {
@@ -38,7 +42,10 @@ enum Transition {
     CutUnseen(NodeKey, NodeKey, Duration, Duration),
     Publish(NodeKey, &'static str),
     Rejoin(NodeKey, NodeKey),
+    Reshare(NodeKey, &'static str, Sharing),
     Restart(NodeKey),
+    Revoke(NodeKey, NodeKey),
+    Rotate(NodeKey, &'static str),
     Share(NodeKey, &'static str, Sharing),
     ShutDown(NodeKey),
     Start(NodeKey),
@@ -46,6 +53,14 @@ enum Transition {
     Unshare(NodeKey, &'static str),
     Use(NodeKey, NodeKey, &'static str),
     Wait(Duration),
+}
+
+fn sharing(dice: &mut Dice, other: NodeKey) -> Sharing {
+    match dice.below(4) {
+        0 => Sharing::to(&[other]),
+        1 => Sharing::to_groups(&["odd"]),
+        _ => Sharing::to_fleet(),
+    }
 }
 
 /// A network under test and what the test knows of it.
@@ -56,8 +71,12 @@ struct Run {
     cables: Vec<(NodeKey, NodeKey)>,
     cut: BTreeSet<(NodeKey, NodeKey)>,
     shared: BTreeMap<(NodeKey, &'static str), Sharing>,
-    /// Who was permitted what when it was published.
+    /// Who may get what: permitted when it was published, shortly before, or while it was history.
     permitted: BTreeMap<MessageId, BTreeSet<NodeKey>>,
+    /// Who lost a right a moment ago, and until when that may not be known everywhere: what goes to others may
+    /// overtake the word of it.
+    lapsing: Vec<(NodeKey, &'static str, BTreeSet<NodeKey>, Duration)>,
+    revoked: Vec<NodeKey>,
     slowest: Duration,
 }
 
@@ -113,6 +132,8 @@ impl Run {
             cut: BTreeSet::new(),
             shared: BTreeMap::new(),
             permitted: BTreeMap::new(),
+            lapsing: Vec::new(),
+            revoked: Vec::new(),
             slowest: Duration::ZERO,
         }
     }
@@ -130,7 +151,19 @@ impl Run {
         let other = dice.pick(&self.members).filter(|o| *o != member)?;
         let topic = TOPICS[dice.below(TOPICS.len())];
         let idle = Duration::ZERO..=IDLE_MAX;
-        Some(match dice.below(100) {
+        let mine: Vec<_> = self.shared.keys().copied().collect();
+        Some(match dice.below(112) {
+            100..104 => dice.pick(&mine).map(|(n, t)| Transition::Rotate(n, t))?,
+            104..110 => {
+                let (n, t) = dice.pick(&mine)?;
+                let depth = self.shared[&(n, t)].depth;
+                Transition::Reshare(n, t, sharing(dice, other).transient_local(depth))
+            }
+            110..112 if dice.chance(60) => {
+                let fresh = |n: &NodeKey| !self.revoked.contains(n);
+                let thief = dice.pick(&nodes.iter().copied().filter(fresh).collect::<Vec<_>>())?;
+                Transition::Revoke(thief, dice.pick(&up)?)
+            }
             0..5 => dice.pick(&whole).map(|(a, b)| Transition::Cut(a, b))?,
             5..9 => {
                 let (a, b) = dice.pick(&whole)?;
@@ -143,11 +176,7 @@ impl Run {
             29..32 => Transition::ShutDown(dice.pick(&up)?),
             32..42 => Transition::Start(dice.pick(&down)?),
             42..54 if !self.shared.contains_key(&(member, topic)) => {
-                let sharing = match dice.below(4) {
-                    0 => Sharing::to(&[other]),
-                    1 => Sharing::to_groups(&["odd"]),
-                    _ => Sharing::to_fleet(),
-                };
+                let sharing = sharing(dice, other);
                 Transition::Share(member, topic, sharing.transient_local([0, 0, 1, 5][dice.below(4)]))
             }
             54..57 => dice
@@ -184,7 +213,10 @@ impl Run {
                 self.cut.remove(&(a, b));
                 world.rejoin(a, b);
             }
+            Transition::Reshare(n, topic, sharing) => self.reshare(n, topic, sharing),
             Transition::Restart(n) => world.restart(n),
+            Transition::Revoke(thief, at) => self.revoke(thief, at),
+            Transition::Rotate(n, topic) => world.rotate(n, topic),
             Transition::Share(n, topic, sharing) => {
                 world.share(n, topic, sharing.clone());
                 self.shared.insert((n, topic), sharing);
@@ -203,9 +235,43 @@ impl Run {
     }
 
     fn publish(&mut self, node: NodeKey, topic: &'static str) {
-        let permitted = Model::permitted(&self.world, node, topic);
         let id = self.world.publish(node, topic);
+        let mut permitted = Model::permitted(&self.world, node, topic);
+        let now = self.world.elapsed();
+        let lapsing =
+            self.lapsing.iter().filter(|(n, t, _, until)| (*n, *t) == (node, topic) && now < *until);
+        permitted.extend(lapsing.flat_map(|(_, _, nodes, _)| nodes.iter().copied()));
         self.permitted.insert(id, permitted);
+    }
+
+    /// Remembers who has what rights now, since someone is about to lose some.
+    fn note_lapsing(&mut self) {
+        let until = self.world.elapsed() + LAPSE_MAX;
+        for (node, topic) in self.shared.keys().copied().collect::<Vec<_>>() {
+            let nodes = Model::permitted(&self.world, node, topic);
+            self.lapsing.push((node, topic, nodes, until));
+        }
+    }
+
+    fn reshare(&mut self, node: NodeKey, topic: &'static str, sharing: Sharing) {
+        self.note_lapsing();
+        self.world.reshare(node, topic, sharing.clone());
+        self.shared.insert((node, topic), sharing);
+        // Who may have the topic may have its history.
+        let permitted = Model::permitted(&self.world, node, topic);
+        let published = self.world.all_published().iter();
+        for p in published.filter(|p| p.owner == node && p.topic == topic) {
+            self.permitted.entry(p.id).or_default().extend(permitted.iter().copied());
+        }
+    }
+
+    fn revoke(&mut self, thief: NodeKey, at: NodeKey) {
+        self.note_lapsing();
+        self.revoked.push(thief);
+        let members: Vec<_> = self.revoked.iter().map(|n| self.world.member(*n).clone()).collect();
+        let list = revocation_list("acme", &members, self.revoked.len() as u64);
+        self.world.note(format!("revoke {thief:?}"));
+        self.world.hand_crl(at, &list);
     }
 
     /// Lets time pass and looks for circles now and then.
@@ -231,14 +297,15 @@ impl Run {
 
     /// Waits until all is as the model says, then checks that messages go where they should.
     fn quiet(&mut self) {
-        let model = Model::of(&self.world);
         let begin = self.world.elapsed();
         // What nobody noticed yet may look as it should.
         self.pass(IDLE_MAX + ms(500));
+        let mut model = Model::of(&self.world);
         while let Err(why) = model.check(&self.world) {
             let waited = self.world.elapsed() - begin;
             assert!(waited < QUIET_MAX, "after {waited:?} of quiet: {why}");
             self.pass(ms(500));
+            model = Model::of(&self.world);
         }
         let took = self.world.elapsed() - begin;
         self.slowest = self.slowest.max(took);
@@ -253,7 +320,8 @@ impl Run {
             for _ in 0..2 {
                 self.publish(owner, topic);
                 let id = self.world.all_published().last().expect("just published").id;
-                expected.insert(id, model.granted[&(owner, topic.to_owned())].clone());
+                let users = model.granted.get(&(owner, topic.to_owned()));
+                expected.insert(id, users.cloned().unwrap_or_default());
             }
         }
         self.pass(ms(1500));
@@ -310,12 +378,25 @@ impl Run {
             let fine = match &logged.what {
                 What::RouterDrop(dropped) => matches!(
                     dropped.reason,
-                    DropReason::Unknown { .. } | DropReason::WrongWay { .. } | DropReason::Stale { .. }
+                    DropReason::Unknown { .. }
+                        | DropReason::WrongWay { .. }
+                        | DropReason::Stale { .. }
+                        // Passed on by those who have not heard of it.
+                        | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
                 ),
-                What::EndpointDrop(dropped) => matches!(dropped, sgc_endpoint::Dropped::Unexpected { .. }),
+                What::EndpointDrop(dropped) => match dropped {
+                    sgc_endpoint::Dropped::Unexpected { .. } => true,
+                    sgc_endpoint::Dropped::NotVerified { why, .. } => {
+                        matches!(why, SignedError::Cert(CertError::Revoked { .. }))
+                    }
+                    _ => false,
+                },
                 What::DataDrop { why, .. } => match why {
                     DataDrop::HopLimit | DataDrop::Sink(SinkDrop::Head | SinkDrop::Inconsistent) => false,
-                    DataDrop::Sink(SinkDrop::Open(why)) => *why == OpenError::Forged,
+                    // Of an owner that started anew.
+                    DataDrop::Sink(SinkDrop::Open(why)) => {
+                        matches!(why, OpenError::Forged | OpenError::Epoch { .. })
+                    }
                     _ => true,
                 },
                 What::Closed { .. } | What::Event(_) => true,

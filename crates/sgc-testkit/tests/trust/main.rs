@@ -8,6 +8,7 @@ mod certificates;
 mod floods;
 mod members;
 mod nonces;
+mod partners;
 mod publishers;
 mod replay;
 mod revocation;

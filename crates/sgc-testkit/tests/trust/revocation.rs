@@ -410,3 +410,51 @@ fn a_list_goes_over_a_net_with_rings_once_over_each_link_and_way() {
     assert!(sent <= 2 * 7, "{sent}");
     assert_eq!(closed(&world, routers[2]), [LinkClose::Revoked]);
 }
+
+/// Keeps revocation lists from crossing a link.
+fn deafen(world: &mut World, from: NodeKey, to: NodeKey) {
+    world.tamper(from, to, |frame| match frame {
+        sgc_wire::Control::Crl { .. } => vec![],
+        frame => vec![frame.clone()],
+    });
+}
+
+#[test]
+fn one_router_that_knows_is_enough_to_cut_a_revoked_branch() {
+    let mut scene = flowing(46);
+    let Scene { world, arm, east, west, tab, .. } = &mut scene;
+    // Neither the owner nor the router in front of the thief hears of it.
+    deafen(world, *east, *arm);
+    deafen(world, *east, *west);
+    let name = world.name(*arm, "/chatter");
+    let list = revoke(world, &[*tab], 1);
+    world.hand_crl(*east, &list);
+    assert_eq!(world.forwarding_sinks(*east, &name).len(), 2, "at once");
+    let log = world.log().len();
+    let published = publish_steadily(world, *arm, ms(20), ms(3000), |_, _| ());
+    world.run(ms(500));
+    assert_nothing_received(world, *tab, *arm, &published);
+    assert_eq!(world.granted(*arm, "/chatter").len(), 2);
+    let by = RefusedBy::Router(RejectReason::Revoked);
+    let told = events(world, *tab, log).any(|(e, _)| matches!(e, Event::Refused { by: b, .. } if *b == by));
+    assert!(told);
+    for user in scene.without(scene.tab) {
+        assert_received(&scene.world, user, scene.arm, &published);
+    }
+}
+
+#[test]
+fn a_router_that_ignores_the_list_does_not_lead_others_to_a_revoked_owner() {
+    let mut scene = flowing(47);
+    let Scene { world, arm, east, west, desk, .. } = &mut scene;
+    deafen(world, *west, *east);
+    let name = world.name(*arm, "/chatter");
+    let list = revoke(world, &[*arm], 1);
+    world.hand_crl(*west, &list);
+    assert_eq!(world.distance(*west, &name), None, "at once");
+    let published = publish_steadily(world, *arm, ms(500), ms(60_000), |_, _| ());
+    assert!(closed(world, *east).is_empty());
+    assert_eq!(world.distance(*west, &name), None, "nor by what it says later");
+    assert_nothing_received(world, *desk, *arm, &published);
+    assert_ne!(world.status(*desk, *arm, "/chatter"), Some(JoinStatus::Granted));
+}

@@ -1,0 +1,94 @@
+//! A node of another fleet whose CA is trusted: it gets what it was named for, and nothing else.
+
+use sgc_endpoint::{Event, JoinStatus, RefusedBy};
+use sgc_testkit::{Member, NodeKey, Sharing, WorldConfig, revocation_list};
+use sgc_wire::RefuseReason;
+
+use crate::{Scene, assert_received, events, grants, ms, publish_steadily, scene_with};
+
+/// The scene with `/chatter` for its own fleet as `sharing` says, and a node of another fleet that everyone trusts.
+fn scene(seed: u64, sharing: impl FnOnce(Sharing) -> Sharing) -> (Scene, NodeKey) {
+    let mut scene = scene_with(WorldConfig::new(seed));
+    let member =
+        Member { fleet: "umbrella".to_owned(), groups: vec!["crew".to_owned()], ..Member::new("visitor") };
+    let visitor = scene.world.node(member, false);
+    for node in [scene.arm, scene.east, scene.west] {
+        scene.world.trust_fleet(node, "umbrella");
+    }
+    scene.world.trust_fleet(visitor, "acme");
+    scene.world.link(scene.west, visitor);
+    scene.world.share(scene.arm, "/chatter", sharing(Sharing::to(&[scene.desk])));
+    scene.world.share(scene.arm, "/secret", Sharing::to_fleet());
+    scene.world.use_topic(scene.desk, scene.arm, "/chatter");
+    scene.world.until_granted(scene.desk, scene.arm, "/chatter");
+    (scene, visitor)
+}
+
+fn with_umbrella(sharing: Sharing) -> Sharing {
+    Sharing { partners: ["umbrella".to_owned()].into(), ..sharing }
+}
+
+#[test]
+fn a_partner_gets_the_topic_that_it_was_given_and_is_told_what_it_is() {
+    let (mut scene, visitor) = scene(100, with_umbrella);
+    let Scene { world, arm, .. } = &mut scene;
+    world.join_blindly(visitor, *arm, "/chatter");
+    world.until_granted(visitor, *arm, "/chatter");
+    let (_, grant) = grants(world, visitor, *arm).pop().expect("granted");
+    let entry = grant.entry.expect("a partner sees no catalogue");
+    assert_eq!(entry.metadata.ros_name, "/chatter");
+    // Knowing the name of another topic does not help.
+    world.join_blindly(visitor, *arm, "/secret");
+    world.run(ms(1000));
+    let by = RefusedBy::Owner(RefuseReason::NotPermitted);
+    assert_eq!(world.status(visitor, *arm, "/secret"), Some(JoinStatus::Refused(by)));
+}
+
+#[test]
+fn a_trusted_ca_alone_opens_nothing() {
+    // Its members may be called what they like: groups count with the CA that certified them.
+    let (mut scene, visitor) =
+        scene(101, |sharing| Sharing { groups: ["crew".to_owned()].into(), ..sharing });
+    let Scene { world, arm, .. } = &mut scene;
+    world.join_blindly(visitor, *arm, "/chatter");
+    world.run(ms(1000));
+    let by = RefusedBy::Owner(RefuseReason::NotPermitted);
+    assert_eq!(world.status(visitor, *arm, "/chatter"), Some(JoinStatus::Refused(by)));
+    assert_eq!(world.granted(*arm, "/chatter"), [scene.desk]);
+}
+
+#[test]
+fn a_partner_sees_no_catalogue() {
+    let (mut scene, visitor) = scene(102, with_umbrella);
+    let Scene { world, arm, .. } = &mut scene;
+    let name = world.catalogue_name(*arm);
+    world.join_name(visitor, *arm, name);
+    world.run(ms(1000));
+    let refused = events(world, visitor, 0).any(|(e, _)| {
+        let owner = RefusedBy::Owner(RefuseReason::NotPermitted);
+        matches!(e, Event::Refused { name: n, by } if *n == name && *by == owner)
+    });
+    assert!(refused, "even if it is told its name");
+}
+
+#[test]
+fn a_partner_that_is_taken_out_or_revoked_by_its_own_ca_is_cut() {
+    for revoked in [false, true] {
+        let (mut scene, visitor) = scene(103, with_umbrella);
+        let Scene { world, arm, east, desk, .. } = &mut scene;
+        world.join_blindly(visitor, *arm, "/chatter");
+        world.until_granted(visitor, *arm, "/chatter");
+        if revoked {
+            let list = revocation_list("umbrella", &[world.member(visitor).clone()], 1);
+            world.hand_crl(*east, &list);
+        } else {
+            world.reshare(*arm, "/chatter", Sharing::to(&[*desk]));
+        }
+        let published = publish_steadily(world, *arm, ms(10), ms(2000), |_, _| ());
+        world.run(ms(500));
+        assert_eq!(world.granted(*arm, "/chatter"), [*desk]);
+        assert_eq!(world.epoch(*arm, "/chatter"), Some(2));
+        assert!(grants(world, visitor, *arm).iter().all(|(_, g)| g.epoch == 1));
+        assert_received(world, *desk, *arm, &published);
+    }
+}
