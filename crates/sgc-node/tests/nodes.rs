@@ -177,6 +177,7 @@ impl Trio {
         let uses = topics
             .iter()
             .map(|topic| UseConfig {
+                publish: false,
                 from: "robot".parse().unwrap(),
                 topic: (*topic).into(),
                 type_name: None,

@@ -145,6 +145,20 @@ fn only_socket() -> Result<PathBuf, CliError> {
     }
 }
 
+/// Tells a revocation list to every node that this user runs here; who took it. One of another fleet does not.
+pub(crate) fn tell_local(list: &[u8]) -> Vec<String> {
+    let usual = sgc_node::default_socket_path("node");
+    let sockets = usual.parent().map(|dir| files::with_extension(dir, SOCKET_EXTENSION));
+    let request = AdminRequest::Crl(list.to_vec());
+    let took = |socket: &PathBuf| {
+        let answer = ask(socket, &request, ANSWER_MAX).ok()?;
+        let answer: serde_json::Value = serde_json::from_str(&answer).ok()?;
+        answer.get("ok")?;
+        Some(socket.file_stem()?.to_string_lossy().into_owned())
+    };
+    sockets.and_then(Result::ok).unwrap_or_default().iter().filter_map(took).collect()
+}
+
 /// Asks a node; gives its answer as it came.
 pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
     let no_node = |error: std::io::Error| CliError::NoNode {
