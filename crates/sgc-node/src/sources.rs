@@ -1,8 +1,8 @@
 //! This node's own publishers: samples of the local network in, packets out.
 //!
 //! Samples are sealed on the thread of the local reader that took them and pushed straight into the queues of
-//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are at hand
-//! together share a signature; none waits for one that is not.
+//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are
+//! at hand together share a signature; none waits for one that is not.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
@@ -54,7 +54,8 @@ impl SourceSlot {
 pub(crate) struct SourceMap {
     /// For writers that have none of their own.
     pub shared: Option<SourceSlot>,
-    /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until it is.
+    /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until
+    /// it is.
     pub(crate) per_writer: bool,
     /// By writer.
     pub own: HashMap<Guid, SourceSlot>,
@@ -80,8 +81,8 @@ impl SourceMap {
 /// What is between the local reader and the sources.
 #[derive(Default)]
 struct Inbox {
-    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before it
-    /// tells who wrote it.
+    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before
+    /// it tells who wrote it.
     early: VecDeque<Sample>,
     /// Sources that were told that more follows, and wait for it with what they have.
     open: Vec<SourceSlot>,
@@ -146,8 +147,8 @@ impl LocalShare {
             }
             early.push_back(sample);
             self.waiting.store(early.len(), SeqCst);
-            // Its source may have come between the two looks; whoever puts a map in place after this one sees that
-            // something waits.
+            // Its source may have come between the two looks; whoever puts a map in place after this one sees
+            // that something waits.
             self.publish_early(&mut inbox);
         }
         if !more {
@@ -171,8 +172,8 @@ impl LocalShare {
         });
     }
 
-    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or publishes what
-    /// follows.
+    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or
+    /// publishes what follows.
     fn publish_early(&self, inbox: &mut Inbox) {
         if inbox.early.is_empty() {
             return;
@@ -184,8 +185,8 @@ impl LocalShare {
         self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source may be left
-    /// with packets that wait for others; then it is in `open`.
+    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source
+    /// may be left with packets that wait for others; then it is in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
         if self.closed.load(Relaxed) {
             return Ok(());
@@ -254,8 +255,8 @@ impl LocalShare {
         }
     }
 
-    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after its
-    /// message.
+    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after
+    /// its message.
     pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
