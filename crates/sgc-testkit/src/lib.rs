@@ -27,8 +27,10 @@
 
 mod cast;
 mod clock;
+mod evil;
 mod model;
 mod node;
+mod publishers;
 mod record;
 mod rng;
 mod ros;
@@ -38,9 +40,10 @@ mod world;
 
 pub use cast::{Member, identity, revocation_list};
 pub use clock::Clock;
+pub use evil::{Captured, CapturedPacket};
 pub use model::Model;
 pub use node::{NodeKey, Sharing};
 pub use record::{DataDrop, Logged, MessageId, Published, Received, What};
 pub use rng::Dice;
 pub use ros::{FakeDomain, FakeReader, FakeRos, FakeWriter};
-pub use world::{Captured, CapturedPacket, World, WorldConfig};
+pub use world::{World, WorldConfig};

@@ -18,10 +18,11 @@ use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
-    Name, NodeId, Now, Packet, Qos, Reliability, SinkId, SourceId, SourceOffer, TopicGrant,
+    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
 };
 
 use crate::cast::{Member, identity};
+use crate::publishers::Publisher;
 use crate::record::{DataDrop, MessageId, What};
 
 /// Type of every topic.
@@ -30,7 +31,7 @@ const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
 /// How long packets of past epochs may take.
-const EPOCH_GRACE: Duration = Duration::from_secs(5);
+pub(crate) const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A node of a world.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -154,7 +155,7 @@ pub(crate) struct Directory {
 
 /// A running node.
 pub(crate) struct Running {
-    key: NodeKey,
+    pub(crate) key: NodeKey,
     pub(crate) run: u64,
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
@@ -169,7 +170,7 @@ pub(crate) struct Running {
     pub(crate) sinks: BTreeMap<Name, LocalSink>,
     pub(crate) catalogues: BTreeMap<NodeKey, Catalogue>,
     uses: BTreeSet<(NodeKey, String)>,
-    publishing: BTreeSet<(NodeKey, String)>,
+    pub(crate) publishing: BTreeSet<(NodeKey, String)>,
     /// What this node publishes on others' topics.
     pub(crate) publishers: BTreeMap<Name, Publisher>,
     /// Owners that are followed.
@@ -185,26 +186,16 @@ pub(crate) struct LocalSource {
     pub(crate) source: Source,
 }
 
-/// A source of this node on another's topic.
-pub(crate) struct Publisher {
-    owner: NodeKey,
-    config: SourceConfig,
-    message_key: MessageKey,
-    /// The key that `source` seals with.
-    grant: Option<TopicGrant>,
-    pub(crate) source: Option<Source>,
-}
-
 pub(crate) struct LocalSink {
     pub(crate) owner: NodeKey,
     pub(crate) topic: String,
-    use_number: u64,
-    transient_local: bool,
-    sources: Vec<SourceId>,
-    sink: Option<Sink>,
-    retry_at: Option<Instant>,
+    pub(crate) use_number: u64,
+    pub(crate) transient_local: bool,
+    pub(crate) sources: Vec<SourceId>,
+    pub(crate) sink: Option<Sink>,
+    pub(crate) retry_at: Option<Instant>,
     /// When the keys of past epochs are dropped.
-    retire_at: Option<Instant>,
+    pub(crate) retire_at: Option<Instant>,
 }
 
 impl Node {
@@ -375,13 +366,7 @@ impl Running {
         self.follow(now, owner, directory);
     }
 
-    /// Publishes on another's topic whenever its catalogue permits it.
-    pub(crate) fn publish_on(&mut self, now: Now, owner: NodeKey, topic: &str, directory: &Directory) {
-        self.publishing.insert((owner, topic.to_owned()));
-        self.follow(now, owner, directory);
-    }
-
-    fn follow(&mut self, now: Now, owner: NodeKey, directory: &Directory) {
+    pub(crate) fn follow(&mut self, now: Now, owner: NodeKey, directory: &Directory) {
         // The owner may be of a fleet that this node cannot see; then there is nothing to follow.
         let owner_name = &directory.names[owner.0];
         if self.endpoint.follow(now, owner_name) {
@@ -409,21 +394,7 @@ impl Running {
         Some(source)
     }
 
-    /// Publishes on another's topic; `None` while that is not granted.
-    pub(crate) fn publish_as(
-        &mut self,
-        now: Now,
-        name: &Name,
-        id: MessageId,
-        bytes: usize,
-    ) -> Option<SourceId> {
-        let source = self.publishers.get_mut(name)?.source.as_mut()?;
-        let (packets, source) = (sealed(source, id, bytes), source.id());
-        self.send_packets(now, packets);
-        Some(source)
-    }
-
-    fn send_packets(&mut self, now: Now, packets: Vec<Packet>) {
+    pub(crate) fn send_packets(&mut self, now: Now, packets: Vec<Packet>) {
         for packet in packets {
             // As in the driver: what nobody asked for is not sent.
             if self.fib.contains_key(&packet.header.name) {
@@ -607,69 +578,6 @@ impl Running {
         }
     }
 
-    /// Joins what is to be published on, and leaves what no longer is.
-    fn reconcile_publishers(&mut self, now: Now, owner: NodeKey, owner_id: NodeId) {
-        let mut wanted = BTreeMap::new();
-        for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries).filter(|e| e.publish) {
-            if self.publishing.contains(&(owner, entry.metadata.ros_name.clone())) {
-                wanted.insert(name_of(&owner_id, &entry.blind), entry.clone());
-            }
-        }
-        let gone = |(name, p): (&Name, &Publisher)| {
-            (p.owner == owner && !wanted.contains_key(name)).then_some(*name)
-        };
-        for name in self.publishers.iter().filter_map(gone).collect::<Vec<_>>() {
-            self.publishers.remove(&name);
-            self.endpoint.leave(now, &name);
-        }
-        for (name, entry) in wanted {
-            if self.publishers.contains_key(&name) {
-                continue;
-            }
-            let suite = Suite::from_id(entry.suite).expect("a suite of this build");
-            let config = SourceConfig {
-                name,
-                id: self.endpoint.new_source_id(),
-                class: entry.class,
-                reliable: entry.qos.reliability == Reliability::Reliable,
-                history_depth: 0,
-                history_bytes_max: 0,
-            };
-            let message_key = MessageKey::generate(suite);
-            let offer = SourceOffer { source: config.id, key: message_key.public().clone() };
-            self.publishers.insert(name, Publisher { owner, config, message_key, grant: None, source: None });
-            self.endpoint.join(now, name, owner_id, Wish::Publish(offer));
-        }
-    }
-
-    /// Feeds this node's own sink of a topic that others publish on.
-    fn handle_own_grant(&mut self, now: Now, name: Name, grant: TopicGrant) {
-        let Some(share) = self.sources.get(&name) else {
-            // The share is being made; what it was told is told again with its source.
-            return;
-        };
-        let mut released = Vec::new();
-        let own = SinkId([0; 16]);
-        let local = self.sinks.entry(name).or_insert_with(|| LocalSink {
-            owner: self.key,
-            topic: share.topic.clone(),
-            use_number: 0,
-            transient_local: false,
-            sources: Vec::new(),
-            sink: None,
-            retry_at: None,
-            retire_at: None,
-        });
-        match &mut local.sink {
-            Some(sink) => sink.regrant(own, grant, |delivery| released.push(delivery)),
-            None => local.sink = Some(Sink::new(name, own, grant, false, SinkLimits::default())),
-        }
-        local.retire_at = Some(now.instant + EPOCH_GRACE);
-        for delivery in released {
-            self.delivered(now, name, delivery);
-        }
-    }
-
     /// Asks for the histories that are not here yet, if the name is granted.
     fn ask_history(&mut self, now: Now, name: Name) {
         let granted = self.endpoint.join_status(&name) == Some(JoinStatus::Granted);
@@ -725,7 +633,7 @@ impl Running {
     }
 
     /// What a packet came to.
-    fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
+    pub(crate) fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
         let Some(local) = self.sinks.get_mut(&name) else { return };
         match delivery {
             Ok(Delivery::Message(message)) => {
@@ -751,21 +659,7 @@ impl Running {
     }
 }
 
-impl Publisher {
-    fn take_grant(&mut self, grant: TopicGrant, emit: impl FnMut(Packet)) {
-        let of_same_run = |known: &TopicGrant| known.epoch < grant.epoch || known.key == grant.key;
-        match &mut self.source {
-            Some(source) if self.grant.as_ref().is_some_and(of_same_run) => {
-                let _ = source.rekey(&grant, emit);
-            }
-            // The first grant, or one of an owner that started anew, under whose keys nothing was sealed yet.
-            source => *source = Source::new(self.config.clone(), &grant, self.message_key.clone()),
-        }
-        self.grant = Some(grant);
-    }
-}
-
-fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Packet> {
+pub(crate) fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Packet> {
     let mut payload = id.0.to_be_bytes().to_vec();
     payload.resize(bytes.max(8), 0x5a);
     let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };

@@ -15,6 +15,7 @@ use sgc_wire::{
 
 use crate::cast::{Member, identity};
 use crate::clock::{Clock, GENESIS};
+use crate::evil::{Captured, CapturedPacket};
 use crate::node::{Arrival, Directory, Effect, Node, Sharing, metadata};
 use crate::record::{Logged, MessageId, Published, Received, What};
 use crate::rng::Dice;
@@ -60,30 +61,6 @@ impl WorldConfig {
     }
 }
 
-/// A frame that crossed a link while [`World::capture`] was on.
-#[derive(Clone, Debug)]
-pub struct Captured {
-    /// Who sent it.
-    pub from: NodeKey,
-    /// To whom.
-    pub to: NodeKey,
-    /// What.
-    pub frame: Control,
-}
-
-/// A packet that crossed a link while [`World::capture`] was on.
-#[derive(Clone, Debug)]
-pub struct CapturedPacket {
-    /// Who sent it.
-    pub from: NodeKey,
-    /// To whom.
-    pub to: NodeKey,
-    /// When, since the world began.
-    pub at: Duration,
-    /// What.
-    pub packet: Packet,
-}
-
 enum Pending {
     Frame { wire: usize, to: usize, bytes: Vec<u8> },
     Packet { wire: usize, to: usize, packet: Packet },
@@ -116,8 +93,8 @@ pub struct World {
     log: Vec<Logged>,
     received: Vec<Received>,
     published: Vec<Published>,
-    captured: Option<Vec<Captured>>,
-    captured_packets: Vec<CapturedPacket>,
+    pub(crate) captured: Option<Vec<Captured>>,
+    pub(crate) captured_packets: Vec<CapturedPacket>,
     trace: Vec<String>,
     tracing: Tracing,
     steps: usize,
@@ -421,54 +398,6 @@ impl World {
         Some(id)
     }
 
-    // ---- Evil.
-
-    /// Sends a frame from one node to a neighbour, as if its router had.
-    pub fn inject(&mut self, from: NodeKey, to: NodeKey, frame: &Control) {
-        let (wire, side) = self.wire_between(from, to);
-        self.carry_frame(wire, side, frame);
-    }
-
-    /// Sends a packet from one node to a neighbour, as if its data path had.
-    pub fn inject_packet(&mut self, from: NodeKey, to: NodeKey, packet: Packet) {
-        let (wire, side) = self.wire_between(from, to);
-        self.carry_packet(wire, side, packet);
-    }
-
-    /// Replaces every frame that `from` sends to `to` by what `tamper` makes of it.
-    pub fn tamper(
-        &mut self,
-        from: NodeKey,
-        to: NodeKey,
-        tamper: impl FnMut(&Control) -> Vec<Control> + 'static,
-    ) {
-        let cable = self.cable(from, to);
-        let side = self.cables[cable].end_of(from).expect("the cable of both");
-        self.cables[cable].tampers[side] = Some(Box::new(tamper));
-    }
-
-    /// Ends [`World::tamper`].
-    pub fn be_honest(&mut self, from: NodeKey, to: NodeKey) {
-        let cable = self.cable(from, to);
-        let side = self.cables[cable].end_of(from).expect("the cable of both");
-        self.cables[cable].tampers[side] = None;
-    }
-
-    /// Keeps all frames and packets from here on.
-    pub fn capture(&mut self) {
-        self.captured.get_or_insert_default();
-    }
-
-    /// The frames kept.
-    pub fn captured(&self) -> &[Captured] {
-        self.captured.as_deref().unwrap_or_default()
-    }
-
-    /// The packets kept, in the order in which they were sent; those that the network loses among them.
-    pub fn captured_packets(&self) -> &[CapturedPacket] {
-        &self.captured_packets
-    }
-
     // ---- Time.
 
     /// Lets time pass.
@@ -746,12 +675,12 @@ impl World {
         (0..self.cables.len()).filter(|c| self.cables[*c].end_of(node).is_some()).collect()
     }
 
-    fn cable(&self, a: NodeKey, b: NodeKey) -> usize {
+    pub(crate) fn cable(&self, a: NodeKey, b: NodeKey) -> usize {
         let found = self.cables.iter().position(|c| c.end_of(a).is_some() && c.end_of(b).is_some());
         found.expect("a cable between the two")
     }
 
-    fn wire_between(&self, from: NodeKey, to: NodeKey) -> (usize, usize) {
+    pub(crate) fn wire_between(&self, from: NodeKey, to: NodeKey) -> (usize, usize) {
         let wire = self.cables[self.cable(from, to)].wire.expect("the two are connected");
         let side = self.wires[wire].ends.iter().position(|e| e.node == from);
         (wire, side.expect("the wire of both"))
@@ -847,7 +776,7 @@ impl World {
         self.cables[cable].tampers[cable_side] = Some(tamper);
     }
 
-    fn carry_frame(&mut self, wire: usize, side: usize, frame: &Control) {
+    pub(crate) fn carry_frame(&mut self, wire: usize, side: usize, frame: &Control) {
         let ends = &self.wires[wire].ends;
         let (from, to) = (ends[side].node, ends[1 - side].node);
         if let Some(captured) = &mut self.captured {
@@ -860,7 +789,7 @@ impl World {
         self.queue(at, Pending::Frame { wire, to: 1 - side, bytes: frame.to_vec() });
     }
 
-    fn carry_packet(&mut self, wire: usize, side: usize, packet: Packet) {
+    pub(crate) fn carry_packet(&mut self, wire: usize, side: usize, packet: Packet) {
         if self.captured.is_some() {
             let ends = &self.wires[wire].ends;
             let (from, to, at) = (ends[side].node, ends[1 - side].node, self.clock.elapsed());
