@@ -119,8 +119,9 @@ struct Service {
 impl Service {
     fn run(&mut self) {
         let mut batch = Vec::with_capacity(BATCH);
-        // Handed over when it is known whether another follows: after the look that finds the next one, or none. That
-        // the handler hears of the last one is a promise, so it is kept when this reader ends, too.
+        // Handed over when it is known whether another follows: after the look that finds the next one, or
+        // none. That the handler hears of the last one is a promise, so it is kept when this reader ends,
+        // too.
         let mut held: Option<Sample> = None;
         while self.wait_set.wait() {
             loop {
@@ -186,8 +187,8 @@ impl Service {
             return None;
         }
         let writer = self.writer(info.publication_handle);
-        // DDS matches readers with writers of other proxies on this network too. What those wrote came through
-        // SGC already: sharing it again would send it round and round.
+        // DDS matches readers with writers of other proxies on this network too. What those wrote came
+        // through SGC already: sharing it again would send it round and round.
         if writer.is_some_and(|w| w.tagged) && self.participant.ignores_tagged() {
             return None;
         }

@@ -1,7 +1,8 @@
-//! What the suites cost: from a payload to sealed and signed packets, and from those to a message, in one thread.
+//! What the suites cost: from a payload to sealed and signed packets, and from those to a message, in one
+//! thread.
 //!
-//! The suites take turns in short rounds, so that what else the machine does meets all of them; of each the median
-//! round counts. `cargo bench -p sgc-endpoint` prints the tables of `docs/performance.md`.
+//! The suites take turns in short rounds, so that what else the machine does meets all of them; of each the
+//! median round counts. `cargo bench -p sgc-endpoint` prints the tables of `docs/performance.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};

@@ -220,7 +220,9 @@ impl Endpoint {
             join.state = JoinState::ExpectAdvert;
             return;
         }
-        let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
+        // An authority may require post-quantum keys before this node's identity says so.
+        let renews = matches!(join.wish, Wish::Renew(_));
+        let reply_key = ReplyKey::generate(Kem::for_fleet(renews || identity.post_quantum()));
         let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
         let wish = join.wish.clone();
         let frame = self.join_frame(&identity, name, sink, &wish, reply_key);

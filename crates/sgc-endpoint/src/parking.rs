@@ -20,7 +20,8 @@ pub(crate) struct Parked {
 
 impl Parked {
     pub(crate) fn new(packet: &Packet) -> Self {
-        // A copy, so that the bound holds: the payload may be a small piece of a large buffer of the transport.
+        // A copy, so that the bound holds: the payload may be a small piece of a large buffer of the
+        // transport.
         let mut payload = Vec::with_capacity(packet.payload.len());
         packet.payload.copy_into(&mut payload);
         let packet = Packet { header: packet.header.clone(), payload: Bytes::from(payload).into() };

@@ -23,9 +23,9 @@ pub(crate) struct Partial {
 pub(crate) struct Partials(VecDeque<Partial>);
 
 impl Partials {
-    /// Where a fragment can be opened to directly: into its place in a message that was begun and lacks it. The first
-    /// fragment has no such place, since the message's head stands behind it. What is written counts for nothing
-    /// until [`Self::put`] says so.
+    /// Where a fragment can be opened to directly: into its place in a message that was begun and lacks it.
+    /// The first fragment has no such place, since the message's head stands behind it. What is written
+    /// counts for nothing until [`Self::put`] says so.
     pub(crate) fn place(&mut self, header: &PacketHeader) -> Option<&mut [u8]> {
         let partial = self.0.iter_mut().find(|p| p.seq == header.seq)?;
         if header.index == 0 || !partial.matches(header) || partial.has(header.index) {
@@ -40,8 +40,8 @@ impl Partials {
         self.0.iter().any(|p| p.seq == seq)
     }
 
-    /// Takes a fragment, which begins its message or is one of a message that has begun; `fragment` is `None` if it
-    /// was opened in its place. The number is that of messages given up to stay below `max`.
+    /// Takes a fragment, which begins its message or is one of a message that has begun; `fragment` is `None`
+    /// if it was opened in its place. The number is that of messages given up to stay below `max`.
     pub(crate) fn put(
         &mut self,
         header: &PacketHeader,

@@ -1,7 +1,7 @@
 //! One subscriber of one name: opens and verifies packets, puts messages together, and delivers each once.
 //!
-//! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed, first. A
-//! packet that is refused leaves no state.
+//! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed,
+//! first. A packet that is refused leaves no state.
 
 use std::collections::BTreeMap;
 
@@ -16,8 +16,8 @@ use crate::parking::{Parked, Parking};
 use crate::partial::Partials;
 use crate::source::without_lists;
 
-/// Epochs whose keys are held at once. One that is over is held until [`Sink::retire_epochs`]; beyond this number the
-/// oldest goes.
+/// Epochs whose keys are held at once. One that is over is held until [`Sink::retire_epochs`]; beyond this
+/// number the oldest goes.
 pub const EPOCHS_MAX: usize = 8;
 
 /// Bounds of one sink.
@@ -181,7 +181,8 @@ pub struct Sink {
 }
 
 impl Sink {
-    /// A sink that was granted as `id`. A transient-local one takes each source's history before anything else.
+    /// A sink that was granted as `id`. A transient-local one takes each source's history before anything
+    /// else.
     pub fn new(name: Name, id: SinkId, grant: TopicGrant, transient_local: bool, limits: SinkLimits) -> Self {
         let mut sink = Self {
             name,
@@ -200,12 +201,14 @@ impl Sink {
 
     /// Takes a further grant, and hands over what the packets come to that waited for it.
     ///
-    /// - A later epoch is added to those that are known. What was delivered is remembered; packets of the epochs before
-    ///   open until [`Self::retire_epochs`].
-    /// - Another key for an epoch that was known, or an earlier epoch, is that of an owner that started anew: nothing
-    ///   of before counts.
-    /// - Under another id (the way to the owner changed, and this sink asked again), histories must be asked for again.
-    /// - A source that is no longer announced is believed in the epochs until then, and in none that begins later.
+    /// - A later epoch is added to those that are known. What was delivered is remembered; packets of the
+    ///   epochs before open until [`Self::retire_epochs`].
+    /// - Another key for an epoch that was known, or an earlier epoch, is that of an owner that started anew:
+    ///   nothing of before counts.
+    /// - Under another id (the way to the owner changed, and this sink asked again), histories must be asked
+    ///   for again.
+    /// - A source that is no longer announced is believed in the epochs until then, and in none that begins
+    ///   later.
     pub fn regrant(
         &mut self,
         id: SinkId,
@@ -254,7 +257,8 @@ impl Sink {
         }
     }
 
-    /// Drops all epochs but the newest, and the sources that are not announced in it: their packets are refused.
+    /// Drops all epochs but the newest, and the sources that are not announced in it: their packets are
+    /// refused.
     pub fn retire_epochs(&mut self) {
         let newest = self.newest_epoch();
         self.epochs.retain(|known| known.epoch == newest);
@@ -278,8 +282,8 @@ impl Sink {
         }
     }
 
-    /// Begins anew with a source whose messages went nowhere meanwhile: its history will be asked for, and delivered
-    /// again. Other messages that were published until now stay past.
+    /// Begins anew with a source whose messages went nowhere meanwhile: its history will be asked for, and
+    /// delivered again. Other messages that were published until now stay past.
     pub fn forget(&mut self, source: &SourceId) {
         if let Some(state) = self.sources.get_mut(source) {
             state.next = state.next.max(state.window.newest().saturating_add(1));
@@ -323,7 +327,8 @@ impl Sink {
         self.epochs.last().map_or(0, |known| known.epoch)
     }
 
-    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the first.
+    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the
+    /// first.
     fn announce(&mut self, announced: Vec<SourceAnnounce>, before: Option<u32>) {
         for source in self.sources.values_mut() {
             source.last_epoch = source.last_epoch.or(before);
@@ -359,8 +364,8 @@ impl Sink {
         }
     }
 
-    /// What a packet comes to, if a grant explained it. In this order: what costs nothing (addressee, epoch, suite,
-    /// replay); the seal, which only holders of the topic's key pass; the signature.
+    /// What a packet comes to, if a grant explained it. In this order: what costs nothing (addressee, epoch,
+    /// suite, replay); the seal, which only holders of the topic's key pass; the signature.
     fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, Unexplained>, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {
@@ -520,8 +525,8 @@ impl SourceState {
         }
     }
 
-    /// The floors stay those of the first announcement: what is under way since then was not delivered yet, and what
-    /// was is in the window.
+    /// The floors stay those of the first announcement: what is under way since then was not delivered yet,
+    /// and what was is in the window.
     fn announce_again(&mut self, key: Bytes) {
         self.last_epoch = None;
         if self.announced_key != key {
@@ -551,7 +556,8 @@ impl SourceState {
         }
     }
 
-    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for what is addressed.
+    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for what is
+    /// addressed.
     fn derive_key(
         &mut self,
         grant: &TopicGrant,

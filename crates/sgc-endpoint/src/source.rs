@@ -1,7 +1,8 @@
-//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners may ask for.
+//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners
+//! may ask for.
 //!
-//! A payload is read once, from where it is into the packets that leave; fragments of a large message leave before its
-//! end is read. Who may hear it, and when its epoch ends, is decided by the endpoint.
+//! A payload is read once, from where it is into the packets that leave; fragments of a large message leave
+//! before its end is read. Who may hear it, and when its epoch ends, is decided by the endpoint.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -126,8 +127,8 @@ pub struct Source {
 }
 
 impl Source {
-    /// A source that starts at message 1; `None` if the grant's suite is not in this build, or the key is not one to
-    /// sign with in it. Sources may share a key.
+    /// A source that starts at message 1; `None` if the grant's suite is not in this build, or the key is not
+    /// one to sign with in it. Sources may share a key.
     ///
     /// Never make two sources under one id with one topic key: their nonces would repeat.
     pub fn new(config: SourceConfig, grant: &TopicGrant, message_key: MessageKey) -> Option<Self> {
@@ -158,8 +159,8 @@ impl Source {
         })
     }
 
-    /// Seals what follows in a new epoch; what waits for a signature leaves first. False, and nothing happens, unless
-    /// the epoch is later than the present one and of the same suite.
+    /// Seals what follows in a new epoch; what waits for a signature leaves first. False, and nothing
+    /// happens, unless the epoch is later than the present one and of the same suite.
     #[must_use]
     pub fn rekey(&mut self, grant: &TopicGrant, emit: impl FnMut(Packet)) -> bool {
         if grant.epoch <= self.grant.epoch || grant.suite != self.grant.suite {
@@ -175,8 +176,8 @@ impl Source {
 
     /// Seals one message and hands its packets to `emit` in order.
     ///
-    /// With `more` the caller says that it publishes again at once, or calls [`Self::flush`]: packets may then wait for
-    /// those that follow, and share a signature with them. Without it nothing waits.
+    /// With `more` the caller says that it publishes again at once, or calls [`Self::flush`]: packets may
+    /// then wait for those that follow, and share a signature with them. Without it nothing waits.
     pub fn publish(
         &mut self,
         head: &MessageHead,
@@ -203,8 +204,8 @@ impl Source {
         }
     }
 
-    /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the mark that
-    /// they were sent. What was published before leaves before.
+    /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the
+    /// mark that they were sent. What was published before leaves before.
     pub fn replay(&mut self, sink: SinkId, from: u64, to: u64, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
         let Some(key) = SourceKey::derive_addressed(&self.grant, &self.config.name, &self.config.id, &sink)

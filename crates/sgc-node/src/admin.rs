@@ -215,8 +215,8 @@ async fn carry_out(
         AdminRequest::Crl(der) => {
             let (reply, done) = oneshot::channel();
             events.send(CoreEvent::Crl { der: der.into(), reply }).await.map_err(|_| stopping())?;
-            let is_news = done.await.map_err(|_| stopping())?.map_err(|why| why.to_string())?;
-            serde_json::to_string(&is_news).map_err(|error| error.to_string())
+            let is_news = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
+            Ok(serde_json::json!({ "news": is_news }).to_string())
         }
     }
 }

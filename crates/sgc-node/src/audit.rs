@@ -10,9 +10,9 @@ use std::fs;
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use arc_swap::ArcSwap;
@@ -32,6 +32,9 @@ const FIELD_BYTES_MAX: usize = 512;
 /// Longest line that is read, bytes; those written are shorter.
 const LINE_BYTES_MAX: u64 = 16 * 1024;
 const FILE_NAME: &str = "audit.jsonl";
+/// Refusals of one kind kept in a minute: whoever is refused for ever must not push out what is older.
+const REFUSALS_PER_MINUTE_MAX: u32 = 120;
+const MINUTE_MS: u64 = 60_000;
 
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -225,6 +228,34 @@ struct Shared {
     records: SyncSender<Option<AuditRecord>>,
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
+    refusals: [Mutex<Window>; 2],
+    lost_total: AtomicU64,
+}
+
+impl Shared {
+    fn lose(&self) {
+        self.lost.fetch_add(1, Relaxed);
+        self.lost_total.fetch_add(1, Relaxed);
+    }
+}
+
+/// How many there were in a minute.
+#[derive(Debug, Default)]
+struct Window {
+    minute: u64,
+    count: u32,
+}
+
+impl Window {
+    /// Whether one more fits into the minute of `unix_ms`.
+    fn takes(&mut self, unix_ms: u64) -> bool {
+        let minute = unix_ms / MINUTE_MS;
+        if self.minute != minute {
+            *self = Self { minute, count: 0 };
+        }
+        self.count = self.count.saturating_add(1);
+        self.count <= REFUSALS_PER_MINUTE_MAX
+    }
 }
 
 /// The thread that writes.
@@ -241,7 +272,13 @@ impl Audit {
         let (records, waiting) = sync_channel(WAITING_MAX);
         // The thread holds no sender: it ends when nobody can write any more.
         let lost = Arc::<AtomicU64>::default();
-        let shared = Arc::new(Shared { records, lost: lost.clone(), names: ArcSwap::from_pointee(names) });
+        let shared = Arc::new(Shared {
+            records,
+            lost: lost.clone(),
+            names: ArcSwap::from_pointee(names),
+            refusals: Default::default(),
+            lost_total: AtomicU64::new(0),
+        });
         let thread = std::thread::Builder::new()
             .name("sgc-audit".to_owned())
             .spawn(move || write_all(file, &waiting, &lost))?;
@@ -252,13 +289,21 @@ impl Audit {
     /// Hands a record over; never waits.
     pub fn write(&self, mut record: AuditRecord) {
         let Some(shared) = &self.shared else { return };
+        let refusal =
+            [AuditEvent::Refused, AuditEvent::LinkRefused].iter().position(|e| e.label() == record.event);
+        if let Some(Ok(mut window)) = refusal.and_then(|at| shared.refusals.get(at)).map(Mutex::lock)
+            && !window.takes(record.unix_ms)
+        {
+            shared.lose();
+            return;
+        }
         if let Some(peer) = record.peer.as_deref().and_then(|peer| peer.parse::<NodeId>().ok()) {
             record.peer_name = shared.names.load().get(&peer).cloned();
         }
         match shared.records.try_send(Some(record)) {
             Ok(()) => {}
             Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
-                shared.lost.fetch_add(1, Relaxed);
+                shared.lose();
             }
         }
     }
@@ -268,6 +313,11 @@ impl Audit {
         if let Some(shared) = &self.shared {
             shared.names.store(Arc::new(names));
         }
+    }
+
+    /// Records that did not fit, since the node started.
+    pub fn lost_total(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))
     }
 
     /// Records that were lost and not yet said to be.

@@ -12,6 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
+use rustls_pki_types::CertificateDer;
 use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
 use sgc_ros::{
     Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
@@ -19,7 +20,7 @@ use sgc_ros::{
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
-use sgc_trust::{CrlError, Identity, MessageKey, Suite};
+use sgc_trust::{AnchorError, CrlError, Identity, MessageKey, Suite};
 use sgc_wire::{
     Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, Role, SinkId, SourceId, UnixMillis,
 };
@@ -104,21 +105,23 @@ pub(crate) enum CoreEvent {
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
     },
-    /// The authority's answer to a member is ready.
-    RenewalReady {
-        /// Whom to answer.
-        sink: SinkId,
-        /// What.
-        answer: Result<Credentials, RefuseReason>,
-    },
     /// The user wants something else from now on; answered when it is under way.
     Reload {
         /// What is shared.
         shares: Vec<ShareRule>,
         /// What is brought here.
         uses: Vec<UseRule>,
+        /// CAs to be trusted from now on besides those that are.
+        certificates: Vec<CertificateDer<'static>>,
         /// Told when it is done.
-        reply: oneshot::Sender<()>,
+        reply: oneshot::Sender<Result<(), AnchorError>>,
+    },
+    /// The authority's answer to a member is ready.
+    RenewalReady {
+        /// Whom to answer.
+        sink: SinkId,
+        /// What.
+        answer: Result<Credentials, RefuseReason>,
     },
     /// The user brings a revocation list; answered with whether it is news.
     Crl {
@@ -309,7 +312,7 @@ impl<N: RosNetwork> Core<N> {
                 self.next_link += 1;
                 let neighbour = Neighbour::from(link.peer());
                 let remote = link.remote();
-                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&neighbour.node).remote(remote);
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
@@ -350,18 +353,22 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
-            CoreEvent::Crl { der, reply } => {
-                let _ = reply.send(self.router.add_crl(now(), &der));
-                // Whoever brings a list may have changed the fleet's file.
+            CoreEvent::Reload { shares, uses, certificates, reply } => {
+                let _ = reply.send(self.reconfigure(shares, uses, certificates));
                 self.answer_renewals();
             }
-            CoreEvent::Reload { shares, uses, reply } => {
-                if let Some(routes) = &mut self.routes {
-                    routes.reconfigure(Instant::now(), shares, uses);
+            CoreEvent::Crl { der, reply } => {
+                let taken = self.router.add_crl(now(), &der);
+                let record = AuditRecord::new(AuditEvent::Crl).by("a user");
+                match &taken {
+                    // Written where it comes into force.
+                    Ok(true) => {}
+                    Ok(false) => self.audit.write(record.reason("known already")),
+                    Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
                 }
+                let _ = reply.send(taken);
+                // Whoever brings a list may have changed the fleet's file.
                 self.answer_renewals();
-                self.drain();
-                let _ = reply.send(());
             }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
@@ -467,6 +474,10 @@ impl<N: RosNetwork> Core<N> {
             RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
             RouterOutput::Close { link, reason } => {
                 let Some(entry) = self.links.get(&link) else { return };
+                if matches!(reason, LinkClose::Revoked) {
+                    let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
+                }
                 match &reason {
                     LinkClose::Superseded => {
                         let peer = entry.link.peer().node_id.to_string();
@@ -497,7 +508,13 @@ impl<N: RosNetwork> Core<N> {
                     }
                 }
             }
-            RouterOutput::Trust(anchors) => self.set_anchors(anchors),
+            RouterOutput::Trust(anchors) => {
+                let lists = anchors.crls().count();
+                let record =
+                    AuditRecord::new(AuditEvent::Crl).reason(format!("in force, {lists} lists in all"));
+                self.audit.write(record);
+                self.set_anchors(anchors);
+            }
             RouterOutput::Dropped(dropped) => {
                 let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
                 if first && dropped.reason.is_suspicious() {
@@ -622,6 +639,25 @@ impl<N: RosNetwork> Core<N> {
             | Event::Recover(_)
             | Event::Granted { .. } => {}
         }
+    }
+
+    /// What the user wants from now on; nothing of it if the CAs cannot be trusted.
+    fn reconfigure(
+        &mut self,
+        shares: Vec<ShareRule>,
+        uses: Vec<UseRule>,
+        certificates: Vec<CertificateDer<'static>>,
+    ) -> Result<(), AnchorError> {
+        if !certificates.is_empty() {
+            let anchors = Arc::new(self.credentials.anchors().with_anchors(certificates)?);
+            self.router.set_anchors(anchors.clone());
+            self.set_anchors(anchors);
+        }
+        if let Some(routes) = &mut self.routes {
+            routes.reconfigure(Instant::now(), shares, uses);
+        }
+        self.drain();
+        Ok(())
     }
 
     /// Keeps what concerns who gets what of this node.
@@ -915,6 +951,7 @@ impl<N: RosNetwork> Core<N> {
         let mut drops = self.control_drops.snapshot();
         drops.extend(self.data.drops().snapshot());
         drops.extend(self.ros_failures.snapshot());
+        drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
         let router = self.router.stats();
         Status {
             node: self.identity.node_name().to_string(),

@@ -54,22 +54,14 @@ pub(crate) struct Keeper {
 }
 
 impl Keeper {
-    /// Tasks that write into the state directory and over the identity file; they end with this handle. `own` are
-    /// the CAs of the identity file: those of partners are not written into it.
-    pub(crate) fn spawn(
-        dir: Option<PathBuf>,
-        identity_file: PathBuf,
-        own: TrustAnchors,
-        alive: mpsc::Sender<()>,
-    ) -> Self {
+    /// Tasks that write into the state directory and over the identity file; they end with this handle.
+    pub(crate) fn spawn(dir: Option<PathBuf>, identity_file: PathBuf, alive: mpsc::Sender<()>) -> Self {
         let anchors = keep_newest(alive.clone(), move |anchors: &TrustAnchors| {
             if let Some(dir) = &dir {
                 keep_crls(dir, anchors);
             }
         });
-        let identity = keep_newest(alive, move |identity: &Identity| {
-            keep_identity(&identity_file, &identity.with_anchors(own.clone()));
-        });
+        let identity = keep_newest(alive, move |identity: &Identity| keep_identity(&identity_file, identity));
         Self { anchors, identity }
     }
 

@@ -2,10 +2,10 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::fs::{FlockOperation, flock};
 use sgc_trust::{FLEET_FILE_BYTES_MAX, Fleet, FleetError};
 use zeroize::Zeroizing;
 
@@ -61,16 +61,16 @@ impl LockedFleet {
     /// Waits for the lock, then reads the file.
     pub fn open(path: &Path) -> Result<Self, FleetFileError> {
         let failed = |source| FleetFileError::Read { path: path.to_owned(), source };
-        // Beside it, since the file itself is replaced.
-        let mut lock_path = path.as_os_str().to_owned();
-        lock_path.push(".lock");
-        let flags = OFlags::NOFOLLOW.bits() as i32;
-        let mut options = fs::OpenOptions::new();
-        let options = options.write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
-        // Not to be made for a fleet that is not there.
-        fs::metadata(path).map_err(failed)?;
-        let lock = options.open(&lock_path).map_err(failed)?;
-        flock(&lock, FlockOperation::LockExclusive).map_err(|e| failed(e.into()))?;
+        let lock = loop {
+            let file = fs::File::open(path).map_err(failed)?;
+            flock(&file, FlockOperation::LockExclusive).map_err(|e| failed(e.into()))?;
+            // Whoever had the lock may have put another file in the place of this one meanwhile.
+            let locked = file.metadata().map_err(failed)?;
+            let named = fs::metadata(path).map_err(failed)?;
+            if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
+                break file;
+            }
+        };
         Ok(Self { fleet: read_fleet(path)?, path: path.to_owned(), _lock: lock })
     }
 

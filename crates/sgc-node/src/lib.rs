@@ -26,6 +26,7 @@ mod sources;
 mod state;
 mod stats;
 mod status;
+mod tell;
 
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use node::{
@@ -35,3 +36,4 @@ pub use reload::{ConfigSource, ReloadReport};
 pub use rules::{RulesError, read_token};
 pub use state::{StateError, create_state_dir, state_dir};
 pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+pub use tell::{TellError, tell_router};

@@ -13,6 +13,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
 use crate::stats::DataDrop;
@@ -145,6 +146,7 @@ pub(crate) async fn keep_accepting(
     mut listener: Listener,
     core: mpsc::Sender<CoreEvent>,
     mut stop: oneshot::Receiver<()>,
+    audit: Audit,
 ) {
     loop {
         let accepted = tokio::select! {
@@ -160,7 +162,11 @@ pub(crate) async fn keep_accepting(
                     info!(%remote, "link ended: {end}");
                 });
             }
-            Some(Err(refused)) => warn!("{refused}"),
+            Some(Err(refused)) => {
+                warn!("{refused}");
+                let record = AuditRecord::new(AuditEvent::LinkRefused).remote(refused.remote);
+                audit.write(record.reason(&refused.reason));
+            }
             None => return listener.close(CloseReason::Goodbye).await,
         }
     }
@@ -430,7 +436,7 @@ mod tests {
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            tokio::spawn(keep_accepting(listener, far_core, stopped));
+            tokio::spawn(keep_accepting(listener, far_core, stopped, Audit::default()));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));

@@ -224,11 +224,9 @@ pub async fn run_on<N: RosNetwork>(
     let state = state_dir(&config, identity.node_name().as_str())?;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
     rules.warnings.iter().for_each(|warning| warn!("{warning}"));
-    let own_anchors = identity.anchors().clone();
-    let identity = Arc::new(identity.with_anchors(rules.partners.extend(&identity)?));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
     let transport = Arc::new(TransportMetrics::default());
-    let anchors = with_kept_crls(state.as_deref(), identity.anchors().clone(), now());
+    let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let credentials = CredentialStore::new(identity.clone());
     credentials.set_anchors(anchors.clone());
     let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
@@ -280,7 +278,7 @@ pub async fn run_on<N: RosNetwork>(
     let (core, requested) = Core::new(CoreParts {
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
-        keeper: Keeper::spawn(state.clone(), config.identity.clone(), own_anchors, alive.clone()),
+        keeper: Keeper::spawn(state.clone(), config.identity.clone(), alive.clone()),
         redial,
         alive,
         identity: identity.clone(),
@@ -316,7 +314,8 @@ pub async fn run_on<N: RosNetwork>(
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        accepting.push((tokio::spawn(keep_accepting(listener, events.clone(), stopped)), stop));
+        accepting
+            .push((tokio::spawn(keep_accepting(listener, events.clone(), stopped, audit.clone())), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     let reloader = Arc::new(Reloader {

@@ -114,17 +114,27 @@ impl Reloader {
             warnings: rules.warnings.clone(),
         };
         let (reply, done) = oneshot::channel();
-        let event = CoreEvent::Reload { shares: rules.shares.clone(), uses: rules.uses.clone(), reply };
+        let trusted = &running.rules.partners.certificates;
+        let certificates = &rules.partners.certificates;
+        let more: Vec<_> = certificates.iter().filter(|c| !trusted.contains(c)).cloned().collect();
+        if !more.is_empty() {
+            let cas = if more.len() == 1 { "CA is" } else { "CAs are" };
+            report.changed.push(format!("{} more {cas} trusted", more.len()));
+        }
+        let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
+        let event = CoreEvent::Reload { shares, uses, certificates: more.clone(), reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
-        done.await.map_err(|_| stopping())?;
+        done.await.map_err(|_| stopping())?.map_err(|error| format!("trusted CAs: {error}"))?;
         self.audit.set_names(rules.names.clone());
         // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
-        let Config { shares, uses, tokens, partners, .. } = config;
-        running.config = Config { shares, uses, tokens, partners, ..running.config.clone() };
-        let certificates = running.rules.partners.certificates.clone();
+        let Config { shares, uses, tokens, partners, trust, .. } = config;
+        running.config = Config { shares, uses, tokens, partners, trust, ..running.config.clone() };
+        // A CA that was trusted once stays so until the node ends.
+        let mut trusted = running.rules.partners.certificates.clone();
+        trusted.extend(more);
         running.rules = rules;
-        running.rules.partners.certificates = certificates;
+        running.rules.partners.certificates = trusted;
         report.changed.dedup();
         self.changed.notify_one();
         Ok(report)
@@ -235,7 +245,6 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         // Shares and uses join the default network where the file says nothing of it.
         (now.ros != config.ros, "[ros]"),
         (now.state != config.state, "`state`"),
-        (now.trust != config.trust, "`trust`"),
         (now.authority != config.authority, "[authority]"),
         (now.rotation != config.rotation, "[rotation]"),
         (now.audit != config.audit, "[audit]"),
@@ -245,15 +254,9 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
     .filter(|(is_changed, _)| *is_changed)
     .map(|(_, what)| format!("{what} changed, which needs a restart"))
     .collect();
-    let trusted = &running.rules.partners.certificates;
-    if now.trust == config.trust && *trusted != rules.partners.certificates {
-        let is_new = rules.partners.certificates.iter().any(|c| !trusted.contains(c));
-        let what = if is_new {
-            "a CA is to be trusted that was not at start"
-        } else {
-            "a CA is no longer to be trusted"
-        };
-        lines.push(format!("{what}, which needs a restart"));
+    let wanted = &rules.partners.certificates;
+    if running.rules.partners.certificates.iter().any(|trusted| !wanted.contains(trusted)) {
+        lines.push("a CA is no longer to be trusted, which needs a restart".to_owned());
     }
     if running.rules.routers != rules.routers {
         lines.push("tokens name other routers, which needs a restart".to_owned());

@@ -130,7 +130,7 @@ pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
 
 fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
     Some(UseRule {
-        direction: Direction::Bring,
+        direction: if rule.publish { Direction::Publish } else { Direction::Bring },
         owner: identity.node_id_of(rule.from.as_str())?,
         owner_name: rule.from.to_string(),
         topic: rule.topic.clone(),

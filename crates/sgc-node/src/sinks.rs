@@ -70,7 +70,8 @@ impl LocalSink {
         }
     }
 
-    /// Takes a grant. Packets that waited for it are written by a task of their own, since that may take a while.
+    /// Takes a grant. Packets that waited for it are written by a task of their own, since that may take a
+    /// while.
     pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<DataPlane>) {
         let mut released = Vec::new();
         let turn = {

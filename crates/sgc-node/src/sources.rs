@@ -1,8 +1,8 @@
 //! This node's own publishers: samples of the local network in, packets out.
 //!
 //! Samples are sealed on the thread of the local reader that took them and pushed straight into the queues of
-//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are at hand
-//! together share a signature; none waits for one that is not.
+//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are
+//! at hand together share a signature; none waits for one that is not.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
@@ -54,7 +54,8 @@ impl SourceSlot {
 pub(crate) struct SourceMap {
     /// For writers that have none of their own.
     pub shared: Option<SourceSlot>,
-    /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until it is.
+    /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until
+    /// it is.
     pub(crate) per_writer: bool,
     /// By writer.
     pub own: HashMap<Guid, SourceSlot>,
@@ -80,8 +81,8 @@ impl SourceMap {
 /// What is between the local reader and the sources.
 #[derive(Default)]
 struct Inbox {
-    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before it
-    /// tells who wrote it.
+    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before
+    /// it tells who wrote it.
     early: VecDeque<Sample>,
     /// Sources that were told that more follows, and wait for it with what they have.
     open: Vec<SourceSlot>,
@@ -146,8 +147,8 @@ impl LocalShare {
             }
             early.push_back(sample);
             self.waiting.store(early.len(), SeqCst);
-            // Its source may have come between the two looks; whoever puts a map in place after this one sees that
-            // something waits.
+            // Its source may have come between the two looks; whoever puts a map in place after this one sees
+            // that something waits.
             self.publish_early(&mut inbox);
         }
         if !more {
@@ -171,8 +172,8 @@ impl LocalShare {
         });
     }
 
-    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or publishes what
-    /// follows.
+    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or
+    /// publishes what follows.
     fn publish_early(&self, inbox: &mut Inbox) {
         if inbox.early.is_empty() {
             return;
@@ -184,8 +185,8 @@ impl LocalShare {
         self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source may be left
-    /// with packets that wait for others; then it is in `open`.
+    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source
+    /// may be left with packets that wait for others; then it is in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
         if self.closed.load(Relaxed) {
             return Ok(());
@@ -254,8 +255,8 @@ impl LocalShare {
         }
     }
 
-    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after its
-    /// message.
+    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after
+    /// its message.
     pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
@@ -304,4 +305,91 @@ impl LocalShare {
 
 fn lock(source: &Mutex<Source>) -> std::sync::MutexGuard<'_, Source> {
     source.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use sgc_endpoint::SourceConfig;
+    use sgc_trust::{MessageKey, Suite};
+    use sgc_wire::{Class, SecretBytes};
+
+    use super::*;
+
+    const KNOWN: Guid = Guid([1; 16]);
+    const STRANGER: Guid = Guid([2; 16]);
+
+    fn sample(writer: Guid, more: bool) -> Sample {
+        let payload = Bytes::from_static(b"\0\x01\0\0data");
+        Sample { kind: SampleKind::Write, writer: Some(writer), source_timestamp_ns: 0, payload, more }
+    }
+
+    fn grant(epoch: u32) -> TopicGrant {
+        let key = SecretBytes::new([epoch as u8; 32]);
+        TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
+    }
+
+    /// A share with a source for one writer; samples of others wait until their writer is known.
+    fn share() -> (Arc<LocalShare>, SourceSlot) {
+        let (alive, _) = mpsc::channel(1);
+        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2));
+        let config = SourceConfig {
+            name: Name([1; 32]),
+            id: SourceId([1; 16]),
+            class: Class::Default,
+            reliable: true,
+            history_depth: 10,
+            history_bytes_max: 1000,
+        };
+        let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
+        let slot = SourceSlot::new(source, true, true);
+        share.set_map(SourceMap {
+            shared: None,
+            per_writer: true,
+            own: HashMap::from([(KNOWN, slot.clone())]),
+        });
+        (share, slot)
+    }
+
+    fn unflushed(slot: &SourceSlot) -> usize {
+        let mut n = 0;
+        lock(&slot.source).flush(|_| n += 1);
+        n
+    }
+
+    #[test]
+    fn nothing_stays_unsigned_when_the_last_sample_of_a_batch_goes_elsewhere() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.publish(sample(KNOWN, true));
+        share.publish(sample(KNOWN, true));
+        share.publish(sample(STRANGER, false));
+        assert_eq!((share.published(), unflushed(&slot)), (2, 0));
+        // The same once the stranger is known and what waited for it is published.
+        share.publish(sample(KNOWN, true));
+        assert_eq!(unflushed(&slot), 1, "it does wait while more is to come");
+        share.publish(sample(KNOWN, true));
+        share.closed.store(true, Relaxed);
+        share.publish(sample(KNOWN, false));
+        assert_eq!(unflushed(&slot), 0);
+    }
+
+    #[test]
+    fn an_epoch_is_over_once_however_often_that_is_asked() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.publish(sample(KNOWN, false));
+        assert!(!share.is_epoch_over());
+        share.publish(sample(KNOWN, false));
+        assert_eq!(slot.progress.published_in_epoch(), 2);
+        assert!(share.is_epoch_over());
+        assert!(!share.is_epoch_over());
+        share.rekey(grant(2));
+        while lock(&slot.source).epoch() == 1 {
+            std::thread::yield_now();
+        }
+        assert_eq!(slot.progress.published_in_epoch(), 0);
+    }
 }

@@ -114,7 +114,7 @@ fn what_is_lost_is_said() {
     let place = Place::new();
     let (audit, writer) = Audit::open(&place.path(), 1 << 30, PeerNames::new()).unwrap();
     // More than can wait, faster than a disk: whatever does not fit has to be accounted for.
-    const N: u64 = 200_000;
+    const N: u64 = 50_000;
     (0..N).for_each(|_| audit.write(granted(1)));
     writer.finish();
     let said = audit.lost();
@@ -124,6 +124,18 @@ fn what_is_lost_is_said() {
     let written = records.iter().filter(|r| r.event == "granted").count() as u64;
     let lost: u64 = records.iter().filter_map(|r| r.lost).sum();
     assert_eq!((written + lost + said, malformed), (N, 0));
+}
+
+#[test]
+fn refusals_without_end_do_not_push_out_what_is_older() {
+    let place = Place::new();
+    let refused = |unix_ms| AuditRecord::at(AuditEvent::Refused, UnixMillis(unix_ms)).peer(&NodeId([9; 32]));
+    let flood = (0..10_000).map(|n| refused(60_000 + n % 60_000));
+    place.write(1 << 30, flood.chain([refused(120_000), granted(1)]));
+    let (records, _) = place.read();
+    let count = |event: &str| records.iter().filter(|r| r.event == event).count();
+    let lost: u64 = records.iter().filter_map(|r| r.lost).sum();
+    assert_eq!((count("refused"), count("granted"), lost), (121, 1, 9_880));
 }
 
 #[test]

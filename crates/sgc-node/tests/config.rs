@@ -181,7 +181,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ("[ros]\ndomain = 3", &["node.toml:4: [ros] has no key `domain`; did you mean `domain_id`?"]),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
-            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `token`"],
+            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `publish`, `token`"],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
         ("[[user]]", &["node.toml:3: the top level has no key `user`; did you mean `use`?"]),
@@ -502,22 +502,29 @@ fn suites_are_called_by_name() {
 #[test]
 fn who_may_publish_is_said_as_who_may_subscribe() {
     let config = good(&format!(
-        "{NODE}[[share]]\ntopic = '/a'\nto = ['*', 'partner:acme']\npublish = ['desk', 'group:ops', 'partner:acme']\n\
+        "{NODE}[[share]]\ntopic = '/a'\ntype = 'p/msg/T'\nto = ['*', 'partner:acme']\npublish = ['desk', 'group:ops', 'partner:acme']\n\
          [[partner]]\nname = 'acme'\nca = 'acme.pem'"
     ));
     assert_eq!(texts(&config.shares[0].publish), ["desk", "group:ops", "partner:acme"]);
     assert_eq!(texts(&config.shares[0].to), ["*", "partner:acme"]);
     assert!(
-        good(&format!("{NODE}[[share]]\ntopic = '/a'\nto = ['b']\npublish = []")).shares[0]
+        good(&format!("{NODE}[[share]]\ntopic = '/a'\ntype = 'p/msg/T'\nto = ['b']\npublish = []")).shares[0]
             .publish
             .is_empty()
     );
     check_all(&[(
-        "[[share]]\ntopic = '/a'\nto = ['b']\npublish = ['b', 'b', 7]",
+        "[[share]]\ntopic = '/a'\ntype = 'p/msg/T'\nto = ['b']\npublish = ['b', 'b', 7]",
         &[
-            "node.toml:6: `publish` is an integer (7); it takes an array of strings, such as [\"desk\", \
+            "node.toml:7: `publish` is an integer (7); it takes an array of strings, such as [\"desk\", \
              \"group:operators\"]",
-            "node.toml:6: `publish` names \"b\" twice; once is enough",
+            "node.toml:7: `publish` names \"b\" twice; once is enough",
+        ],
+    )]);
+    check_all(&[(
+        "[[share]]\ntopic = '/a'\nto = ['b']\npublish = ['b']",
+        &[
+            "node.toml:6: `publish` lets others publish, so the share needs a `type`: no local publisher has to be \
+           there to show it; add one, such as type = \"geometry_msgs/msg/Twist\"",
         ],
     )]);
 }

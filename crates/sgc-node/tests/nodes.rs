@@ -177,6 +177,7 @@ impl Trio {
         let uses = topics
             .iter()
             .map(|topic| UseConfig {
+                publish: false,
                 from: "robot".parse().unwrap(),
                 topic: (*topic).into(),
                 type_name: None,
@@ -471,6 +472,31 @@ fn status_names_links_and_routes() {
     wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 2);
     // The document is what `Status` says.
     let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
+}
+
+#[test]
+fn signed_messages_pass_one_by_one_and_in_batches() {
+    for suite in [Suite::Standard, Suite::StandardChacha, Suite::Paper] {
+        let trio = Trio::new();
+        let (_cloud, _robot) = (trio.cloud(), trio.robot_in(suite, &["/signed"], "desk"));
+        let _desk = trio.desk(&["/signed"]);
+        let qos = Qos { history: History::KeepAll, ..Qos::default() };
+        let talker = Talker::new(&trio.robot_net, "/signed", qos.clone());
+        let listener = Listener::new(&trio.desk_net, "/signed", qos);
+        talker.wait_for_readers(1);
+        let message = |n: usize| Bytes::from(vec![n as u8; 10 + n * 300]);
+        listener.hears_at_last(|_| talker.say(message(255)));
+        talker.writer.write_burst((0..150).map(message));
+        for n in 0..150 {
+            loop {
+                let heard = listener.samples.recv_timeout(PATIENCE).expect("a sample arrives");
+                if heard == message(n) {
+                    break;
+                }
+                assert!(n == 0 && heard == message(255), "{} bytes in {suite}", heard.len());
+            }
+        }
+    }
 }
 
 /// Not a test: how many messages of 1 KB pass from a local network over a robot, a cloud router and a desk to another

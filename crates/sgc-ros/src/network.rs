@@ -111,8 +111,8 @@ pub struct Sample {
     pub source_timestamp_ns: i64,
     /// Encapsulation header and body.
     pub payload: Bytes,
-    /// True if the handler gets another sample at once: it may then put off what is cheaper for several. After the last
-    /// one that is at hand it is false.
+    /// True if the handler gets another sample at once: it may then put off what is cheaper for several.
+    /// After the last one that is at hand it is false.
     pub more: bool,
 }
 
@@ -179,8 +179,8 @@ pub trait RosNetwork: Send + Sync + 'static {
     /// Starts discovery; each endpoint already there is told as an appearance. Call once.
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError>;
 
-    /// Creates a reader whose samples go to `handler`. Samples of writers made by SGC, this process's or another's,
-    /// never do: what they wrote came through SGC already.
+    /// Creates a reader whose samples go to `handler`. Samples of writers made by SGC, this process's or
+    /// another's, never do: what they wrote came through SGC already.
     fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<Self::Reader, RosError>;
 
     /// Creates a writer.

@@ -1,8 +1,9 @@
-//! One signature for up to 64 packets of a source: a Merkle tree over them (RFC 6962, 2.1), whose root is signed.
+//! One signature for up to 64 packets of a source: a Merkle tree over them (RFC 6962, 2.1), whose root is
+//! signed.
 //!
-//! Each packet carries its audit path, its place and the signature behind its tag, so it verifies whatever became of
-//! the others. A receiver checks a signature once per batch and remembers what followed from it: of the later
-//! packets it hashes little more than themselves. Sealing is [`crate::SourceKey`]'s.
+//! Each packet carries its audit path, its place and the signature behind its tag, so it verifies whatever
+//! became of the others. A receiver checks a signature once per batch and remembers what followed from it: of
+//! the later packets it hashes little more than themselves. Sealing is [`crate::SourceKey`]'s.
 
 use std::collections::VecDeque;
 
@@ -114,8 +115,8 @@ pub struct BatchVerifier {
     checked: u64,
 }
 
-/// A batch whose signature verified, and the nodes of its tree that follow from it. Whatever node is known, its
-/// sibling, its ancestors and their siblings are.
+/// A batch whose signature verified, and the nodes of its tree that follow from it. Whatever node is known,
+/// its sibling, its ancestors and their siblings are.
 struct KnownBatch {
     count: u16,
     signature: Vec<u8>,
@@ -174,8 +175,8 @@ impl BatchVerifier {
 }
 
 impl KnownBatch {
-    /// Hashes upwards from a leaf to the first node that is known, or to the root; what lies above a known node must
-    /// be known too, and as the path says.
+    /// Hashes upwards from a leaf to the first node that is known, or to the root; what lies above a known
+    /// node must be known too, and as the path says.
     fn climb(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<Climb, OpenError> {
         let (count, index) = (usize::from(self.count), usize::from(index));
         let mut climb = Climb { found: [(0, leaf); CLIMB_NODES_MAX], len: 0, root: leaf };
@@ -237,7 +238,8 @@ struct Trailer<'a> {
     signature: &'a [u8],
 }
 
-/// Divides a payload into what was sealed and the trailer. Every length must be what header, index and count say.
+/// Divides a payload into what was sealed and the trailer. Every length must be what header, index and count
+/// say.
 fn split<'a>(
     header: &PacketHeader,
     payload: &'a [u8],
@@ -300,8 +302,8 @@ fn position(count: usize, level: usize, index: usize) -> usize {
     below + index
 }
 
-/// Nodes on a level. One without a sibling, the last of an odd number, stands on the next level too; which gives the
-/// trees of RFC 6962, where the left part is the largest power of two.
+/// Nodes on a level. One without a sibling, the last of an odd number, stands on the next level too; which
+/// gives the trees of RFC 6962, where the left part is the largest power of two.
 fn width(count: usize, level: usize) -> usize {
     count.div_ceil(1 << level)
 }

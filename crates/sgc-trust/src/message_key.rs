@@ -19,8 +19,9 @@ use crate::suite::Scheme;
 
 /// A key that messages are signed with. Cloning shares.
 ///
-/// One key may serve several sources, names, epochs and suites: a signature covers the packets' headers, which hold
-/// all of these. RSA keys take a tenth of a second and more to make, so a node makes one of each kind that it needs.
+/// One key may serve several sources, names, epochs and suites: a signature covers the packets' headers,
+/// which hold all of these. RSA keys take a tenth of a second and more to make, so a node makes one of each
+/// kind that it needs.
 #[derive(Clone)]
 pub struct MessageKey {
     inner: Arc<Inner>,
@@ -41,7 +42,8 @@ pub struct MessageKeyError {
 }
 
 impl MessageKey {
-    /// Makes a key for a suite, an empty one if its messages are not signed. The provider draws the randomness.
+    /// Makes a key for a suite, an empty one if its messages are not signed. The provider draws the
+    /// randomness.
     ///
     /// # Panics
     /// If the provider cannot make keys: it has no randomness or no memory.
@@ -80,8 +82,8 @@ impl MessageKey {
         Some(Self { inner: Arc::new(inner), public })
     }
 
-    /// What its signatures verify with, as announcements carry it: 32 bytes for Ed25519, a SubjectPublicKeyInfo for
-    /// RSA, nothing for suites without signatures.
+    /// What its signatures verify with, as announcements carry it: 32 bytes for Ed25519, a
+    /// SubjectPublicKeyInfo for RSA, nothing for suites without signatures.
     pub fn public(&self) -> &Bytes {
         &self.public
     }
@@ -138,8 +140,8 @@ impl VerifyKey {
         Some(Self { key: key.ok()?, scheme })
     }
 
-    /// Length of its signatures, bytes. One of another length does not verify, so neither does an RSA key of another
-    /// size than the suite's.
+    /// Length of its signatures, bytes. One of another length does not verify, so neither does an RSA key of
+    /// another size than the suite's.
     pub(crate) fn signature_bytes(&self) -> usize {
         self.scheme.signature_bytes()
     }

@@ -52,14 +52,14 @@ pub struct SourceKey {
 }
 
 impl SourceKey {
-    /// The key of packets to all: `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source id)`;
-    /// `None` for a suite that this build does not have.
+    /// The key of packets to all: `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source
+    /// id)`; `None` for a suite that this build does not have.
     pub fn derive(grant: &TopicGrant, name: &Name, source: &SourceId) -> Option<Self> {
         Self::expand(grant, name, source, None)
     }
 
-    /// The key of packets to one sink: the same with the sink's id behind the source's. History that was sent to
-    /// another sink, or to this node when it asked under another id, never opens with it.
+    /// The key of packets to one sink: the same with the sink's id behind the source's. History that was sent
+    /// to another sink, or to this node when it asked under another id, never opens with it.
     pub fn derive_addressed(
         grant: &TopicGrant,
         name: &Name,
@@ -100,10 +100,11 @@ impl SourceKey {
         self.to
     }
 
-    /// A sealed fragment: `fragment`, behind the first one the message's head, and the tag; with room for a trailer.
+    /// A sealed fragment: `fragment`, behind the first one the message's head, and the tag; with room for a
+    /// trailer.
     ///
-    /// The header must be of this key's suite, epoch and addressee. The caller must seal one text only under each
-    /// (sequence, index): the nonce is made of them.
+    /// The header must be of this key's suite, epoch and addressee. The caller must seal one text only under
+    /// each (sequence, index): the nonce is made of them.
     pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8]) -> Vec<u8> {
         use sgc_wire::Encode;
         debug_assert_eq!(fragment.len(), header.fragment_bytes());
@@ -126,8 +127,8 @@ impl SourceKey {
         out
     }
 
-    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes; what it holds after an error is
-    /// not to be used. What stands behind the tag is not looked at.
+    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes; what it holds after an
+    /// error is not to be used. What stands behind the tag is not looked at.
     pub fn open(&self, header: &PacketHeader, payload: &[u8], out: &mut [u8]) -> Result<(), OpenError> {
         if header.suite != self.suite.id() {
             return Err(OpenError::Suite { found: header.suite });

@@ -7,8 +7,8 @@ use aws_lc_rs::aead::{AES_256_GCM, Algorithm, CHACHA20_POLY1305};
 
 /// How payloads of a topic are protected.
 ///
-/// The `group` suites keep out whoever was not granted the topic; those who were trust each other not to forge one
-/// another. In all others each source signs, so that nobody but it can make its messages.
+/// The `group` suites keep out whoever was not granted the topic; those who were trust each other not to
+/// forge one another. In all others each source signs, so that nobody but it can make its messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Suite {
     /// AES-256-GCM.
@@ -37,7 +37,8 @@ pub(crate) enum Scheme {
     Unsigned,
     /// Ed25519 (RFC 8032).
     Ed25519,
-    /// RSASSA-PSS, SHA-256, MGF1 with SHA-256, salt of 32 bytes (RFC 8017, 8.1), with a modulus of this many bytes.
+    /// RSASSA-PSS, SHA-256, MGF1 with SHA-256, salt of 32 bytes (RFC 8017, 8.1), with a modulus of this many
+    /// bytes.
     RsaPss(usize),
 }
 

@@ -130,7 +130,8 @@ fn the_vectors_open_and_verify() {
     }
 }
 
-/// Not a test: prints what `scripts/trust-vectors.py --take` takes, so that the other side verifies what this one signs.
+/// Not a test: prints what `scripts/trust-vectors.py --take` takes, so that the other side verifies what this
+/// one signs.
 #[test]
 #[ignore = "prints"]
 fn packets_signed_with_rsa() {

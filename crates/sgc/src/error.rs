@@ -41,6 +41,9 @@ pub(crate) enum CliError {
     /// A name of a node, group or fleet that is none.
     #[error(transparent)]
     Label(#[from] LabelError),
+    /// A router was not told of a revocation list.
+    #[error("the revocation is in force here, but a router was not told: {0}")]
+    Tell(#[from] sgc_node::TellError),
     /// A file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
     Read {
@@ -303,6 +306,7 @@ impl CliError {
             | Self::NodeRefused { .. }
             | Self::NoAudit { .. }
             | Self::Demo { .. }
+            | Self::Tell(_)
             | Self::System { .. }
             | Self::Output(_) => EXIT_FAILURE,
         }

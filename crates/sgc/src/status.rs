@@ -133,16 +133,36 @@ pub(crate) fn node_name(config: &Config) -> Result<String, CliError> {
     }
 }
 
-/// The socket of the one node that this user runs with nothing said about its socket.
-fn only_socket() -> Result<PathBuf, CliError> {
+/// The sockets of this user's nodes that are in their usual place, whether somebody answers there or not.
+pub(crate) fn usual_sockets() -> Vec<PathBuf> {
     let usual = sgc_node::default_socket_path("node");
     let dir = usual.parent().unwrap_or(Path::new("/"));
-    let mut found = files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default();
+    files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default()
+}
+
+/// The socket of the one node that this user runs with nothing said about its socket.
+fn only_socket() -> Result<PathBuf, CliError> {
+    let mut found = usual_sockets();
     match found.len() {
-        0 => Err(CliError::NoNodeHere { dir: dir.to_owned() }),
+        0 => {
+            let usual = sgc_node::default_socket_path("node");
+            Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })
+        }
         1 => Ok(found.swap_remove(0)),
         _ => Err(CliError::SeveralNodes { sockets: found.iter().map(|p| p.display().to_string()).collect() }),
     }
+}
+
+/// Tells a revocation list to every node that this user runs here; who took it. One of another fleet does not.
+pub(crate) fn tell_local(list: &[u8]) -> Vec<String> {
+    let request = AdminRequest::Crl(list.to_vec());
+    let took = |socket: &PathBuf| {
+        let answer = ask(socket, &request, ANSWER_MAX).ok()?;
+        let answer: serde_json::Value = serde_json::from_str(&answer).ok()?;
+        answer.get("ok")?;
+        Some(socket.file_stem()?.to_string_lossy().into_owned())
+    };
+    usual_sockets().iter().filter_map(took).collect()
 }
 
 /// Asks a node; gives its answer as it came.

@@ -250,15 +250,18 @@ fn what_is_kept_can_be_run_again() {
     let expected = [
         "cloud.identity",
         "cloud.log",
+        "cloud.state",
         "cloud.toml",
         "demo.fleet",
         "operator-peer.log",
         "operator.identity",
         "operator.log",
+        "operator.state",
         "operator.toml",
         "robot-peer.log",
         "robot.identity",
         "robot.log",
+        "robot.state",
         "robot.toml",
     ];
     assert_eq!(kept, expected);

@@ -47,7 +47,7 @@ impl Place {
         place.write("lab-ca.pem", &certificate_of(&place.read("lab.fleet")));
         let text = "# arm-1\n[node]\nname = \"arm-1\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"state\"\n\n\
                     [admin]\nsocket = \"arm.sock\"\n\n\
-                    [[share]]\ntopic = \"/cmd_vel\"\nto = [\"group:operators\"]\npublish = [\"desk\"]\n\n\
+                    [[share]]\ntopic = \"/cmd_vel\"\nto = [\"group:operators\"]\npublish = [\"desk\"]\ntype = \"geometry_msgs/msg/Twist\"\n\n\
                     [[share]]\ntopic = \"/handoff/pose\"\nto = [\"desk\"]\n";
         place.write("arm-1.toml", text);
         let text = "[node]\nname = \"cart\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"cart-state\"\n\n\

@@ -149,7 +149,8 @@ fn a_member_cannot_forge_another() {
         assert_eq!(delivered(&mut sink, &replayed(&mut honest)), [bytes(30)]);
         let forged = published(&mut mallory, bytes(40), false);
         assert_eq!(sink.handle_packet(&forged[0]), Err(OpenError::Signature.into()));
-        // A true trailer behind a text of its own: it holds the AEAD key, so only the signature stands against it.
+        // A true trailer behind a text of its own: it holds the AEAD key, so only the signature stands
+        // against it.
         let next = batch(&mut honest, 3);
         let mut own = batch(&mut mallory, 3);
         for (own, true_one) in own.iter_mut().zip(&next) {
@@ -165,8 +166,8 @@ fn a_member_cannot_forge_another() {
     }
 }
 
-/// The signature of a batch moved to a batch of another size, source or name does not verify: the headers of the
-/// packets are in the leaves, so sources can share a key.
+/// The signature of a batch moved to a batch of another size, source or name does not verify: the headers of
+/// the packets are in the leaves, so sources can share a key.
 #[test]
 fn sources_that_share_a_key_cannot_be_taken_for_each_other() {
     let suite = Suite::Standard;

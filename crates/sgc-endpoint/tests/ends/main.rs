@@ -1,5 +1,5 @@
-//! The two ends of the data path against each other, in every suite: what a source makes, a sink delivers, once, and
-//! nothing else.
+//! The two ends of the data path against each other, in every suite: what a source makes, a sink delivers,
+//! once, and nothing else.
 
 mod epochs;
 mod forgery;

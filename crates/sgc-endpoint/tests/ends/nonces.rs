@@ -1,4 +1,5 @@
-//! No key seals two texts under one nonce, whatever sources go through: the one thing that AES-GCM does not forgive.
+//! No key seals two texts under one nonce, whatever sources go through: the one thing that AES-GCM does not
+//! forgive.
 
 use std::collections::BTreeMap;
 
@@ -11,8 +12,8 @@ use super::*;
 /// What a packet's key is derived from, and its nonce.
 type KeyAndNonce = (u32, SourceId, Option<SinkId>, u64, u16);
 
-/// Everything that was sealed: associated data, ciphertext and tag. With one key and nonce, two of them are the same
-/// only if text and associated data are.
+/// Everything that was sealed: associated data, ciphertext and tag. With one key and nonce, two of them are
+/// the same only if text and associated data are.
 #[derive(Default)]
 struct Sealed(BTreeMap<KeyAndNonce, (Vec<u8>, Vec<u8>)>);
 
@@ -70,8 +71,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
     }
 }
 
-/// What is sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another epoch, it
-/// is under another key.
+/// What is sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another
+/// epoch, it is under another key.
 #[test]
 fn replays_repeat_themselves_and_nothing_else() {
     for suite in [Suite::Group, Suite::Standard] {

@@ -106,6 +106,7 @@ pub(super) struct UseDraft {
     pub(super) from: Option<Located<String>>,
     pub(super) topic: Option<Located<String>>,
     pub(super) type_name: Option<Located<String>>,
+    pub(super) publish: Option<Located<bool>>,
     pub(super) token: Option<Located<String>>,
 }
 

@@ -478,6 +478,14 @@ pub enum Mistake {
         /// This node.
         name: String,
     },
+    /// A share that others publish on, of a type that nobody knows.
+    #[error(
+        "`{key}` lets others publish, so the share needs a `type`: no local publisher has to be there to show it; add one, such as type = \"geometry_msgs/msg/Twist\""
+    )]
+    PublishWithoutType {
+        /// The key.
+        key: &'static str,
+    },
     /// The same topic shared twice.
     #[error("`{key}` is {topic:?}, which {other} shares already: make it one share and join the recipients")]
     SharedTwice {

@@ -207,6 +207,7 @@ impl FileReader<'_> {
             from: self.string(one, "from", "a string, such as \"arm-1\""),
             topic: self.string(one, "topic", "a string, such as \"/camera/image\""),
             type_name: self.string(one, "type", "a string, such as \"sensor_msgs/msg/Image\""),
+            publish: self.boolean(one, "publish", "true or false"),
         }
     }
 

@@ -143,7 +143,7 @@ pub struct ShareMetadata {
     pub node: String,
 }
 
-/// A topic of another node that is to appear here.
+/// A topic of another node that is to appear here, or that this node publishes on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UseConfig {
     /// The node that shares it.
@@ -152,6 +152,8 @@ pub struct UseConfig {
     pub topic: String,
     /// `pkg/msg/Name`, if the user insists on one; otherwise the owner's catalogue says.
     pub type_name: Option<String>,
+    /// True if local messages go there, false if it appears here.
+    pub publish: bool,
 }
 
 /// Where a token is.

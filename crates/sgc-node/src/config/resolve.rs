@@ -236,6 +236,11 @@ impl Resolver<'_> {
         });
         let publish = share.publish.as_ref().map(|publish| self.recipients(publish, node_name, partners));
         let type_name = share.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
+        if let Some(publish) = &share.publish
+            && share.type_name.is_none()
+        {
+            self.record(&publish.origin, Mistake::PublishWithoutType { key: publish.key });
+        }
         let priority = share.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
         let suite = share.suite.as_ref().and_then(|name| self.keep(name, suite));
         let metadata = ShareMetadata {
@@ -505,7 +510,8 @@ impl Resolver<'_> {
         });
         let topic = one.topic.as_ref().and_then(|topic| self.keep(topic, names::topic));
         let type_name = one.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
-        Some(UseConfig { from: from?, topic: topic?, type_name })
+        let publish = one.publish.as_ref().is_some_and(|publish| publish.value);
+        Some(UseConfig { from: from?, topic: topic?, type_name, publish })
     }
 
     fn socket(&mut self, socket: &Located<PathBuf>) -> Option<PathBuf> {

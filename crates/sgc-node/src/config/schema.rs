@@ -95,7 +95,7 @@ impl Table {
                 "unique",
                 "node",
             ],
-            Self::Use => &["from", "topic", "type", "token"],
+            Self::Use => &["from", "topic", "type", "publish", "token"],
             Self::Router => &["listen"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],

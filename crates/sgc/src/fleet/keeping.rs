@@ -1,19 +1,26 @@
 //! `sgc fleet list`, `revoke`, `adopt`, `rotate-secret`, `retire-secret`: what a fleet's keeper does over the years.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
 
 use clap::Args;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_trust::{Fleet, GroupName, NodeName, RosterNode, pem_contents};
+use sgc_transport::LinkUrl;
+use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents};
 use sgc_wire::UnixMillis;
 
 use super::{FleetFile, WhichFleet, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files;
-use crate::output;
+use crate::{output, status};
 
 const LIST_EXTENSION: &str = "crl";
+/// What the keeper of a fleet calls itself when it tells a router something.
+const KEEPER_NAME: &str = "fleet-keeper";
+/// For how long that certificate holds.
+const KEEPER_VALID: Duration = Duration::from_secs(600);
 
 /// Show the nodes of a fleet: groups, role, until when their certificates hold, and who is revoked.
 #[derive(Debug, Args)]
@@ -33,6 +40,9 @@ pub(super) struct ListArgs {
 pub(super) struct RevokeArgs {
     /// Names of the nodes
     nodes: Vec<String>,
+    /// Tell this router, too; repeat for more. Nodes of this user on this machine are told anyway
+    #[arg(long = "router", value_name = "URL")]
+    routers: Vec<LinkUrl>,
     #[command(flatten)]
     which: WhichFleet,
 }
@@ -130,13 +140,19 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
         text.push_str(&format!("{node}: revoked\n"));
     }
     text.push_str(&format!("{}: revocation list {}\n", path.display(), file.fleet.crl_number()));
-    let told = push_crl(&list);
-    if told.is_empty() {
-        text.push_str("Bring it to any node that runs: nodes tell it to each other.");
-    } else {
-        text.push_str(&format!("Told to {}: nodes tell it to each other.", told.join(", ")));
+    let (told, failed) = tell(&file.fleet, &list, &args.routers)?;
+    match told.is_empty() {
+        true => text.push_str(
+            "Nobody was told yet. Tell one node, and all will know:\n  sgc fleet revoke --router quic://…   \
+             or, where a node runs:  sgc fleet revoke",
+        ),
+        false => text.push_str(&format!("Told {}: nodes tell it to each other.", told.join(", "))),
     }
-    output::line(text)
+    output::line(text)?;
+    match failed {
+        Some(error) => Err(error),
+        None => Ok(()),
+    }
 }
 
 pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
@@ -157,6 +173,9 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
     let generation = file.fleet.rotate_secret(unix_now(), &mut system_rng()?);
     let generation = generation.map_err(|e| file.error(e))?;
     file.save()?;
+    // An authority that runs here looks into the file again when it is told a list.
+    let (_, list) = write_list(&file, unix_now())?;
+    tell(&file.fleet, &list, &[])?;
     output::line(format!(
         "{}: generation {generation} of the naming secret\n\
          Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
@@ -174,9 +193,35 @@ pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     output::line(format!("{}: generations in use: {}", file.path.display(), left.join(", ")))
 }
 
-/// Hands a list to nodes that run here, and says which. There is no way yet.
-fn push_crl(_list: &[u8]) -> Vec<String> {
-    Vec::new()
+/// Tells a list to the nodes that this user runs here and to these routers; who was told, and the last router that
+/// could not be.
+fn tell(
+    fleet: &Fleet,
+    list: &[u8],
+    routers: &[LinkUrl],
+) -> Result<(Vec<String>, Option<CliError>), CliError> {
+    let mut told = status::tell_local(list);
+    let mut failed = None;
+    if routers.is_empty() {
+        return Ok((told, failed));
+    }
+    // A certificate for this errand alone; the roster does not know it.
+    let keeper = KEEPER_NAME.parse().map_err(CliError::Label)?;
+    let request =
+        EnrollRequest { router: true, valid: KEEPER_VALID, ..EnrollRequest::new(keeper, unix_now()) };
+    let identity = fleet.issue(&request, &mut system_rng()?);
+    let identity = Arc::new(identity.map_err(|source| CliError::Fleet { path: PathBuf::new(), source })?);
+    let runtime = tokio::runtime::Runtime::new();
+    let runtime =
+        runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
+    for url in routers {
+        let list = bytes::Bytes::copy_from_slice(list);
+        match runtime.block_on(sgc_node::tell_router(url, identity.clone(), list)) {
+            Ok(()) => told.push(url.to_string()),
+            Err(source) => failed = Some(CliError::Tell(source)),
+        }
+    }
+    Ok((told, failed))
 }
 
 fn write_list(file: &FleetFile, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
