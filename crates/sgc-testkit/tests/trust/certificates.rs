@@ -130,12 +130,14 @@ fn an_owners_names_end_with_its_certificate() {
 fn a_renewed_certificate_carries_what_was_granted_past_the_end_of_the_old_one() {
     let (mut scene, guest) = with_guest(95, short_lived());
     let Scene { world, arm, west, .. } = &mut scene;
+    // So that the link outlasts the old one: the driver makes another.
+    world.set_behind(*west, 9 * MINUTE);
     world.link(*west, guest);
     world.until_granted(guest, *arm, "/chatter");
     world.run(ms(500));
-    let (mut renewed, mut linked) = (false, false);
+    let mut renewed = false;
     let log = world.log().len();
-    let published = publish_steadily(world, *arm, ms(500), 7 * MINUTE, |world, passed| {
+    let published = publish_steadily(world, *arm, ms(500), 14 * MINUTE, |world, passed| {
         if passed >= 5 * MINUTE && !renewed {
             renewed = true;
             world.renew(guest);
@@ -143,21 +145,9 @@ fn a_renewed_certificate_carries_what_was_granted_past_the_end_of_the_old_one() 
     });
     world.run(ms(500));
     assert_received(world, guest, *arm, &published);
-    let again = events(world, guest, log).filter(|(e, _)| matches!(e, Event::Lost { .. })).count();
-    assert_eq!(again, 0, "nothing was interrupted");
-    // The driver makes a new link under it before the old one ends.
-    let published = publish_steadily(world, *arm, ms(500), 10 * MINUTE, |world, _| {
-        if !linked {
-            linked = true;
-            world.cut(*west, guest);
-            world.rejoin(*west, guest);
-        }
-    });
-    world.run(ms(500));
-    let missed = published.len()
-        - world.received(guest, *arm, "/chatter").iter().filter(|id| published.contains(id)).count();
-    assert!(missed <= 3, "{missed}");
-    assert!(!closed(world, *west).contains(&LinkClose::Expired));
+    let lost = events(world, guest, log).filter(|(e, _)| matches!(e, Event::Lost { .. })).count();
+    assert_eq!(lost, 0, "nothing was interrupted");
+    assert!(closed(world, *west).is_empty());
     assert_eq!(world.epoch(*arm, "/chatter"), Some(1), "nobody was cut");
 }
 
