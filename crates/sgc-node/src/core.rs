@@ -12,7 +12,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
-use rustls_pki_types::CertificateDer;
 use sgc_endpoint::{Endpoint, Event, Output as EndpointOutput, Source, SourceConfig, Wish};
 use sgc_ros::{
     Command, DiscoveryEvent, EndpointSpec, Guid, RosNetwork, Routes, Sample, SampleHandler, ShareRule,
@@ -20,18 +19,19 @@ use sgc_ros::{
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link};
-use sgc_trust::{AnchorError, CrlError, Identity, MessageKey, Suite};
+use sgc_trust::{CrlError, Identity, MessageKey, Suite, TrustAnchors};
 use sgc_wire::{
     Class, Control, Credentials, History, Name, Now, Qos, RefuseReason, Role, SinkId, SourceId, UnixMillis,
 };
-use tokio::sync::{Semaphore, mpsc, oneshot, watch};
+use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
 use tracing::{debug, error, info, warn};
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
-use crate::core::publish::Publishing;
+use crate::core::publish::{Offer, Publishing};
 use crate::credentials::Keeper;
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::links::ControlTx;
+use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
 use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::{LocalShare, REPLAYS_MAX, SourceMap, SourceSlot};
@@ -111,10 +111,12 @@ pub(crate) enum CoreEvent {
         shares: Vec<ShareRule>,
         /// What is brought here.
         uses: Vec<UseRule>,
-        /// CAs to be trusted from now on besides those that are.
-        certificates: Vec<CertificateDer<'static>>,
+        /// Whom to believe, if that changes: the CAs, and what is kept of their lists.
+        anchors: Option<TrustAnchors>,
+        /// Keys for suites that were not in use.
+        message_keys: MessageKeys,
         /// Told when it is done.
-        reply: oneshot::Sender<Result<(), AnchorError>>,
+        reply: oneshot::Sender<()>,
     },
     /// The authority's answer to a member is ready.
     RenewalReady {
@@ -130,6 +132,8 @@ pub(crate) enum CoreEvent {
         /// Where to answer.
         reply: oneshot::Sender<Result<bool, CrlError>>,
     },
+    /// Keys that messages of these suites are signed with are made.
+    MessageKeys(MessageKeys),
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
     /// Take nothing in any more; answered with what still leaves.
@@ -143,6 +147,8 @@ struct LinkEntry {
     url: Option<String>,
     control: ControlTx,
     flows: HashMap<Name, Arc<OutFlow>>,
+    /// Why this node closed it, if it did.
+    closed_for: Option<String>,
 }
 
 /// The control task's state. `N` is the local network; a pure router has none.
@@ -164,10 +170,14 @@ pub(crate) struct Core<N: RosNetwork> {
     /// When the keys of past epochs of a joined name are dropped.
     retire_due: BTreeMap<Name, Instant>,
     /// What the messages of this node are signed with, by suite.
-    message_keys: BTreeMap<Suite, MessageKey>,
+    message_keys: MessageKeys,
     publishing: BTreeMap<Name, Publishing>,
+    /// Topics of others that wait for a key to be made.
+    keyless: BTreeMap<Name, Offer>,
     /// Messages of one source under one key.
     epoch_messages_max: u64,
+    /// Told when a source has published as many.
+    epoch_over: Arc<Notify>,
     credentials: CredentialStore,
     /// The fleet's file, if this node is the authority of its fleet.
     authority: Option<PathBuf>,
@@ -197,6 +207,8 @@ pub(crate) struct CoreParts<N> {
     pub authority: Option<PathBuf>,
     /// Messages of one source under one key.
     pub epoch_messages_max: u64,
+    /// For the suites of its shares.
+    pub(crate) message_keys: MessageKeys,
     /// Writes what outlives the process.
     pub(crate) keeper: Keeper,
     /// Tells the dialling tasks that there is another certificate.
@@ -245,9 +257,11 @@ impl<N: RosNetwork> Core<N> {
             writers: HashMap::new(),
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
-            message_keys: BTreeMap::new(),
+            message_keys: parts.message_keys,
             publishing: BTreeMap::new(),
+            keyless: BTreeMap::new(),
             epoch_messages_max: parts.epoch_messages_max,
+            epoch_over: Arc::default(),
             credentials: parts.credentials,
             authority: parts.authority,
             keeper: parts.keeper,
@@ -274,6 +288,7 @@ impl<N: RosNetwork> Core<N> {
         mut requested: mpsc::Receiver<SinkRequest>,
     ) {
         let mut batch = Vec::with_capacity(BATCH_MAX);
+        let epoch_over = self.epoch_over.clone();
         self.ask_renewal();
         let mut deadline = self.drain();
         loop {
@@ -298,6 +313,7 @@ impl<N: RosNetwork> Core<N> {
                     }
                 }
                 Some(request) = requested.recv() => self.handle_sink(request),
+                () = epoch_over.notified() => {}
                 () = timer => {}
             }
             self.handle_timeouts();
@@ -314,7 +330,8 @@ impl<N: RosNetwork> Core<N> {
                 let remote = link.remote();
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                self.links.insert(id, LinkEntry { link, url, control, flows: HashMap::new() });
+                self.links
+                    .insert(id, LinkEntry { link, url, control, flows: HashMap::new(), closed_for: None });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
@@ -324,7 +341,11 @@ impl<N: RosNetwork> Core<N> {
                 self.router.handle_link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
-                    self.audit.write(record.remote(entry.link.remote()));
+                    let record = record.remote(entry.link.remote());
+                    self.audit.write(match &entry.closed_for {
+                        Some(reason) => record.reason(reason),
+                        None => record,
+                    });
                     entry.flows.values().for_each(|f| f.close());
                 }
             }
@@ -353,8 +374,10 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
-            CoreEvent::Reload { shares, uses, certificates, reply } => {
-                let _ = reply.send(self.reconfigure(shares, uses, certificates));
+            CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
+                self.add_message_keys(message_keys);
+                self.reconfigure(shares, uses, anchors);
+                let _ = reply.send(());
                 self.answer_renewals();
             }
             CoreEvent::Crl { der, reply } => {
@@ -370,6 +393,7 @@ impl<N: RosNetwork> Core<N> {
                 // Whoever brings a list may have changed the fleet's file.
                 self.answer_renewals();
             }
+            CoreEvent::MessageKeys(keys) => self.add_message_keys(keys),
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }
@@ -473,7 +497,8 @@ impl<N: RosNetwork> Core<N> {
             }
             RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
             RouterOutput::Close { link, reason } => {
-                let Some(entry) = self.links.get(&link) else { return };
+                let Some(entry) = self.links.get_mut(&link) else { return };
+                entry.closed_for = Some(reason.to_string());
                 if matches!(reason, LinkClose::Revoked) {
                     let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
                     self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
@@ -642,22 +667,16 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// What the user wants from now on; nothing of it if the CAs cannot be trusted.
-    fn reconfigure(
-        &mut self,
-        shares: Vec<ShareRule>,
-        uses: Vec<UseRule>,
-        certificates: Vec<CertificateDer<'static>>,
-    ) -> Result<(), AnchorError> {
-        if !certificates.is_empty() {
-            let anchors = Arc::new(self.credentials.anchors().with_anchors(certificates)?);
-            self.router.set_anchors(anchors.clone());
-            self.set_anchors(anchors);
-        }
+    fn reconfigure(&mut self, shares: Vec<ShareRule>, uses: Vec<UseRule>, anchors: Option<TrustAnchors>) {
         if let Some(routes) = &mut self.routes {
             routes.reconfigure(Instant::now(), shares, uses);
         }
+        // Who may no longer join is told so before its link goes.
         self.drain();
-        Ok(())
+        if let Some(anchors) = anchors {
+            self.trust(anchors);
+            self.drain();
+        }
     }
 
     /// Keeps what concerns who gets what of this node.
@@ -700,6 +719,7 @@ impl<N: RosNetwork> Core<N> {
                             self.data.clone(),
                             self.alive.clone(),
                             self.epoch_messages_max,
+                            self.epoch_over.clone(),
                         );
                         self.shares.insert(name, Arc::new(share));
                     }
@@ -736,7 +756,7 @@ impl<N: RosNetwork> Core<N> {
                 self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
             }
             Command::Publish { name, owner, suite, class, reliable } => {
-                self.publish_under(name, owner, suite, class, reliable);
+                self.publish_under(name, Offer { owner, suite, class, reliable });
             }
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
@@ -799,7 +819,8 @@ impl<N: RosNetwork> Core<N> {
         share.set_map(map);
     }
 
-    /// The key that messages are signed with in this suite: one for the whole node, made when it is needed first.
+    /// The key that messages are signed with in this suite: one for the whole node. Those that take long to make are
+    /// there before they are needed.
     fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
         let suite = Suite::from_id(suite)?;
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())

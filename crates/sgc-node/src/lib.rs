@@ -14,6 +14,7 @@ mod credentials;
 mod dataplane;
 mod fleet_file;
 mod links;
+mod message_keys;
 mod node;
 mod outflow;
 pub mod partners;

@@ -28,6 +28,7 @@ use crate::config::{Config, DiscoveryRange, RosConfig};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
+use crate::message_keys;
 use crate::reload::{ConfigSource, Reloader, Running};
 use crate::rules::{Rules, RulesError};
 use crate::state::{self, StateError};
@@ -123,8 +124,8 @@ pub enum NodeError {
     /// The local network could not be joined.
     #[error(transparent)]
     Ros(#[from] RosError),
-    /// The local network's threads did not start.
-    #[error("joining the local network ended in a panic; this is a bug")]
+    /// The local network's threads did not start, or no keys could be made.
+    #[error("starting ended in a panic; this is a bug")]
     Panicked,
     /// The system gives no randomness.
     #[error("the system gives no randomness: {0}")]
@@ -275,7 +276,12 @@ pub async fn run_on<N: RosNetwork>(
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
     let (redial, on_redial) = watch::channel(());
+    let wanted = rules.shares.clone();
+    let made = tokio::task::spawn_blocking(move || message_keys::make_for(&wanted, |_| false)).await;
+    let message_keys = made.map_err(|_| NodeError::Panicked)?;
+    let suites = message_keys.keys().copied().collect();
     let (core, requested) = Core::new(CoreParts {
+        message_keys,
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
         keeper: Keeper::spawn(state.clone(), config.identity.clone(), alive.clone()),
@@ -321,11 +327,12 @@ pub async fn run_on<N: RosNetwork>(
     let reloader = Arc::new(Reloader {
         source: options.source,
         identity: identity.clone(),
+
         state,
         audit: audit.clone(),
         events: events.clone(),
         has_ros: network.is_some(),
-        running: Mutex::new(Running { config, rules }),
+        running: Mutex::new(Running { config, rules, suites }),
         changed: Notify::new(),
     });
     let watch = reloader.clone();

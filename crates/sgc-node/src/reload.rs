@@ -2,14 +2,15 @@
 //!
 //! It works out what changed; the route machine changes it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_ros::{ShareRule, UseRule};
-use sgc_trust::Identity;
+use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_wire::UnixMillis;
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tracing::{info, warn};
@@ -17,6 +18,9 @@ use tracing::{info, warn};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::config::{Config, ConfigErrors};
 use crate::core::{CoreEvent, now};
+use crate::credentials::with_kept_crls;
+use crate::message_keys::{MessageKeys, make_for};
+use crate::node::NodeError;
 use crate::rules::Rules;
 
 /// Reads the configuration again as it was read at start.
@@ -55,6 +59,16 @@ pub(crate) struct Running {
     /// What restart-only settings were at start, and the others are now.
     pub(crate) config: Config,
     pub(crate) rules: Rules,
+    /// For which there are keys to sign with.
+    pub(crate) suites: BTreeSet<Suite>,
+}
+
+/// What has to be there before another configuration is carried out.
+struct Prepared {
+    rules: Rules,
+    /// Whom to believe; nothing if that is as it was.
+    anchors: Option<TrustAnchors>,
+    message_keys: MessageKeys,
 }
 
 impl Reloader {
@@ -103,38 +117,42 @@ impl Reloader {
     /// Carries out `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
         let (identity, state) = (self.identity.clone(), self.state.clone());
-        let wanted = config.clone();
-        let load = tokio::task::spawn_blocking(move || {
-            Rules::load(&wanted, &identity, state.as_deref(), now().unix)
+        let (wanted, own, suites) = (config.clone(), self.identity.anchors().clone(), running.suites.clone());
+        let trusted = running.rules.partners.certificates.clone();
+        let prepare = tokio::task::spawn_blocking(move || -> Result<Prepared, NodeError> {
+            let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
+            let certificates = &rules.partners.certificates;
+            let anchors = match same(&trusted, certificates) {
+                true => None,
+                // Lists of a CA that was trusted once may be kept here.
+                false => Some(with_kept_crls(
+                    state.as_deref(),
+                    own.with_anchors(certificates.iter().cloned())?,
+                    now(),
+                )),
+            };
+            let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
+            Ok(Prepared { rules, anchors, message_keys })
         });
-        let rules = load.await.map_err(|_| "reading ended in a panic")?.map_err(|error| error.to_string())?;
+        let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
+        let Prepared { rules, anchors, message_keys } = prepared.map_err(|error| error.to_string())?;
+        running.suites.extend(message_keys.keys().copied());
         let mut report = ReloadReport {
             changed: changes(&running.rules, &rules),
             needs_restart: needs_restart(running, &config, &rules),
             warnings: rules.warnings.clone(),
         };
         let (reply, done) = oneshot::channel();
-        let trusted = &running.rules.partners.certificates;
-        let certificates = &rules.partners.certificates;
-        let more: Vec<_> = certificates.iter().filter(|c| !trusted.contains(c)).cloned().collect();
-        if !more.is_empty() {
-            let cas = if more.len() == 1 { "CA is" } else { "CAs are" };
-            report.changed.push(format!("{} more {cas} trusted", more.len()));
-        }
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
-        let event = CoreEvent::Reload { shares, uses, certificates: more.clone(), reply };
+        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
-        done.await.map_err(|_| stopping())?.map_err(|error| format!("trusted CAs: {error}"))?;
+        done.await.map_err(|_| stopping())?;
         self.audit.set_names(rules.names.clone());
         // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
         let Config { shares, uses, tokens, partners, trust, .. } = config;
         running.config = Config { shares, uses, tokens, partners, trust, ..running.config.clone() };
-        // A CA that was trusted once stays so until the node ends.
-        let mut trusted = running.rules.partners.certificates.clone();
-        trusted.extend(more);
         running.rules = rules;
-        running.rules.partners.certificates = trusted;
         report.changed.dedup();
         self.changed.notify_one();
         Ok(report)
@@ -209,7 +227,20 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
             Some(_) => lines.push(format!("{} of {} is used with another type", key.1, key.0)),
         }
     }
+    let trusted = |rules: &Rules| rules.partners.certificates.clone();
+    let (before, after) = (trusted(old), trusted(new));
+    if after.iter().any(|ca| !before.contains(ca)) {
+        lines.push("nodes of another CA may link to this one".to_owned());
+    }
+    if before.iter().any(|ca| !after.contains(ca)) {
+        lines.push("nodes of a CA may no longer link to this one".to_owned());
+    }
     lines
+}
+
+/// Whether the same CAs are in both, in whatever order.
+fn same(a: &[CertificateDer<'_>], b: &[CertificateDer<'_>]) -> bool {
+    a.len() == b.len() && a.iter().all(|ca| b.contains(ca))
 }
 
 fn share_change(topic: &str, known: &ShareRule, rule: &ShareRule) -> String {
@@ -254,10 +285,6 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
     .filter(|(is_changed, _)| *is_changed)
     .map(|(_, what)| format!("{what} changed, which needs a restart"))
     .collect();
-    let wanted = &rules.partners.certificates;
-    if running.rules.partners.certificates.iter().any(|trusted| !wanted.contains(trusted)) {
-        lines.push("a CA is no longer to be trusted, which needs a restart".to_owned());
-    }
     if running.rules.routers != rules.routers {
         lines.push("tokens name other routers, which needs a restart".to_owned());
     }

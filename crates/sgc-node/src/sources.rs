@@ -15,7 +15,7 @@ use sgc_ros::{Guid, Sample, SampleKind};
 use sgc_router::LinkId;
 use sgc_wire::{MessageHead, MessageKind, Name, Packet, Recover, SourceId, TopicGrant};
 use tokio::runtime::Handle;
-use tokio::sync::{Semaphore, mpsc};
+use tokio::sync::{Notify, Semaphore, mpsc};
 
 use crate::dataplane::DataPlane;
 use crate::stats::DataDrop;
@@ -103,6 +103,10 @@ pub(crate) struct LocalShare {
     epoch_messages_max: u64,
     /// True while the epoch that is over by its number of messages has no successor yet.
     rotating: AtomicBool,
+    /// True until the control task has seen that it is over.
+    is_over: AtomicBool,
+    /// Wakes the control task, which nothing else may wake while messages flow.
+    over: Arc<Notify>,
     published: AtomicU64,
 }
 
@@ -118,6 +122,7 @@ impl LocalShare {
         data: Arc<DataPlane>,
         alive: mpsc::Sender<()>,
         epoch_messages_max: u64,
+        over: Arc<Notify>,
     ) -> Self {
         Self {
             name,
@@ -130,6 +135,8 @@ impl LocalShare {
             closed: AtomicBool::new(false),
             epoch_messages_max,
             rotating: AtomicBool::new(false),
+            is_over: AtomicBool::new(false),
+            over,
             published: AtomicU64::new(0),
         }
     }
@@ -228,6 +235,12 @@ impl LocalShare {
         match result {
             Ok(()) => {
                 self.published.fetch_add(1, Relaxed);
+                if slot.progress.published_in_epoch() >= self.epoch_messages_max
+                    && !self.rotating.swap(true, Relaxed)
+                {
+                    self.is_over.store(true, SeqCst);
+                    self.over.notify_one();
+                }
             }
             Err(PublishError::TooLarge { .. }) => {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
@@ -261,18 +274,17 @@ impl LocalShare {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
-            share.rotating.store(false, Relaxed);
             for slot in share.map.load().slots() {
                 // A source that was made meanwhile has the key already, or that of a later epoch.
                 let _ = lock(&slot.source).rekey(&grant, share.emit());
             }
+            share.rotating.store(false, Relaxed);
         });
     }
 
     /// True, once per epoch, when a source has published so many messages that a new one shall begin.
     pub(crate) fn is_epoch_over(&self) -> bool {
-        let over = |slot: &SourceSlot| slot.progress.published_in_epoch() >= self.epoch_messages_max;
-        self.map.load().slots().any(over) && !self.rotating.swap(true, Relaxed)
+        self.is_over.swap(false, SeqCst)
     }
 
     /// Sends a sink what it asks for, in order with what is published meanwhile.
@@ -332,7 +344,7 @@ mod tests {
     /// A share with a source for one writer; samples of others wait until their writer is known.
     fn share() -> (Arc<LocalShare>, SourceSlot) {
         let (alive, _) = mpsc::channel(1);
-        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2));
+        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2, Arc::default()));
         let config = SourceConfig {
             name: Name([1; 32]),
             id: SourceId([1; 16]),

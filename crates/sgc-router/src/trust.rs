@@ -72,9 +72,11 @@ impl Router {
         Ok(true)
     }
 
+    /// True if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.
     pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
         let anchors = &self.config.anchors;
-        certs.iter().any(|c| anchors.is_revoked(c) || anchors.ca_spki(&c.ca).is_none())
+        let other_ca = certs.first().is_some_and(|c| anchors.ca_spki(&c.ca).is_none());
+        other_ca || certs.iter().any(|c| anchors.is_revoked(c))
     }
 
     /// Closes the links of nodes whose certificates have ended.

@@ -41,6 +41,18 @@ impl TrustAnchors {
         Ok(Some(Self { lists: Arc::new(lists), ..self.clone() }))
     }
 
+    /// The same CAs, with the lists in force elsewhere of those of them that are known there, where they are newer.
+    pub fn with_lists_of(&self, known: &Self) -> Self {
+        let mut lists = BTreeMap::clone(&self.lists);
+        let here = |ca: &CaFingerprint| self.ca_spki(ca).is_some();
+        for (ca, list) in known.lists.iter().filter(|(ca, _)| here(ca)) {
+            if lists.get(ca).is_none_or(|own| is_greater(&list.number, &own.number)) {
+                lists.insert(*ca, list.clone());
+            }
+        }
+        Self { lists: Arc::new(lists), ..self.clone() }
+    }
+
     /// The lists in force, DER, to be passed on; one for each CA at most.
     pub fn crls(&self) -> impl Iterator<Item = &Bytes> {
         self.lists.values().map(|list| &list.der)

@@ -8,13 +8,25 @@ use sgc_ros::RosNetwork;
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
 use tracing::warn;
 
-use super::{Core, now};
+use sgc_trust::{MessageKey, Suite};
+
+use super::{Core, CoreEvent, now};
+use crate::message_keys::MessageKeys;
 use crate::sinks::LocalSink;
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
 
 /// How long a publisher goes on under the old key of a topic that is not its own: the owner gives the others as long
 /// to get the new one.
 const REKEY_WAIT: Duration = Duration::from_secs(1);
+
+/// A topic of another node that this one is to publish on.
+pub(super) struct Offer {
+    pub(super) owner: NodeId,
+    /// Its id on the wire.
+    pub(super) suite: u8,
+    pub(super) class: Class,
+    pub(super) reliable: bool,
+}
 
 /// What this node publishes under another's name.
 pub(super) struct Publishing {
@@ -28,25 +40,47 @@ pub(super) struct Publishing {
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// Asks the owner of `name` to let this node publish under it.
-    pub(super) fn publish_under(
-        &mut self,
-        name: Name,
-        owner: NodeId,
-        suite: u8,
-        class: Class,
-        reliable: bool,
-    ) {
-        let Some(message_key) = self.message_key(suite) else {
+    /// Asks the owner of `name` to let this node publish under it, at once or when there is a key to sign with.
+    pub(super) fn publish_under(&mut self, name: Name, wanted: Offer) {
+        let Offer { owner, suite, class, reliable } = wanted;
+        let Some(suite) = Suite::from_id(suite) else {
             warn!(suite, "a topic's suite is not in this build; this node cannot publish on it");
             return;
         };
+        let Some(message_key) = self.message_keys.get(&suite).cloned() else {
+            if self.keyless.values().all(|other| other.suite != wanted.suite) {
+                self.make_message_key(suite);
+            }
+            self.keyless.insert(name, wanted);
+            return;
+        };
         let id = self.endpoint.new_source_id();
-        let share = LocalShare::new(name, self.data.clone(), self.alive.clone(), self.epoch_messages_max);
+        let (max, over) = (self.epoch_messages_max, self.epoch_over.clone());
+        let share = LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over);
         self.shares.insert(name, Arc::new(share));
         self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, Wish::Publish(offer));
+    }
+
+    fn make_message_key(&self, suite: Suite) {
+        let Some(events) = self.events.upgrade() else { return };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let keys = MessageKeys::from([(suite, MessageKey::generate(suite))]);
+            let _ = events.blocking_send(CoreEvent::MessageKeys(keys));
+        });
+    }
+
+    /// Takes keys that are made; one that is there already stays.
+    pub(super) fn add_message_keys(&mut self, keys: MessageKeys) {
+        for (suite, key) in keys {
+            self.message_keys.entry(suite).or_insert(key);
+        }
+        for (name, wanted) in std::mem::take(&mut self.keyless) {
+            self.publish_under(name, wanted);
+        }
     }
 
     /// The owner lets this node publish, or begins a new epoch; false if this node does not publish under `name`.
@@ -91,6 +125,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn stop_publishing(&mut self, name: &Name) {
+        self.keyless.remove(name);
         if self.publishing.remove(name).is_some()
             && let Some(share) = self.shares.remove(name)
         {

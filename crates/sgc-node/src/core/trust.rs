@@ -86,6 +86,15 @@ impl<N: RosNetwork> Core<N> {
         self.redial.send_replace(());
     }
 
+    /// Trusts these CAs from here on and no others; what they have revoked stays so.
+    pub(super) fn trust(&mut self, anchors: TrustAnchors) {
+        let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
+        self.router.set_anchors(anchors.clone());
+        self.set_anchors(anchors);
+        // On new links neighbours say again what they know of nodes that nobody here believed before.
+        self.redial.send_replace(());
+    }
+
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
         let lists = anchors.crls().count();

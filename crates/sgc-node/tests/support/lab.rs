@@ -1,0 +1,272 @@
+//! A fleet on the disk with nodes that keep their identities, state and sockets over restarts, and streams of numbered
+//! messages through them.
+
+#![allow(clippy::unwrap_used, dead_code, unreachable_pub)]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write as _;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering::SeqCst};
+use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use rand_core::{OsRng, TryRngCore as _};
+use sgc_node::LockedFleet;
+use sgc_node::audit::{self, AuditRecord};
+use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_testkit::FakeDomain;
+use sgc_transport::{ListenAddr, Scheme};
+use sgc_trust::{EnrollRequest, Fleet, Identity, Suite};
+use sgc_wire::{Class, History, NodeId, Qos};
+
+use crate::support::{Listener, Node, PATIENCE, Talker, begin, unix_now, wait};
+
+/// A fleet, its nodes and their networks. Every node dials the router `cloud`.
+pub struct Lab {
+    pub dir: tempfile::TempDir,
+    fleet: PathBuf,
+    port: u16,
+    nets: Mutex<BTreeMap<String, FakeDomain>>,
+}
+
+impl Lab {
+    /// A fleet of these nodes, and of the router `cloud`.
+    pub fn new(nodes: &[&str]) -> Self {
+        let lab = Self::empty("lab", begin());
+        lab.enroll("cloud", |request| request.router = true);
+        nodes.iter().for_each(|node| lab.enroll(node, |_| {}));
+        lab
+    }
+
+    /// A fleet without nodes, whose router is at that port of this machine.
+    pub fn empty(name: &str, port: u16) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let fleet = dir.path().join("lab.fleet");
+        let new = Fleet::create(name.parse().unwrap(), unix_now(), &mut OsRng.unwrap_err()).unwrap();
+        write_secret(&fleet, &new.to_text());
+        Self { dir, fleet, port, nets: Mutex::default() }
+    }
+
+    /// Another fleet, for whose nodes the router of this one is theirs.
+    pub fn beside(&self, name: &str) -> Self {
+        Self::empty(name, self.port)
+    }
+
+    pub fn path(&self, file: &str) -> PathBuf {
+        self.dir.path().join(file)
+    }
+
+    pub fn fleet_file(&self) -> PathBuf {
+        self.fleet.clone()
+    }
+
+    /// Changes the fleet's file, as `sgc fleet` does.
+    pub fn with_fleet<T>(&self, change: impl FnOnce(&mut Fleet) -> T) -> T {
+        let mut locked = LockedFleet::open(&self.fleet).unwrap();
+        let done = change(&mut locked.fleet);
+        locked.save().unwrap();
+        done
+    }
+
+    /// Enrols a node; its identity file is where its configuration looks for it.
+    pub fn enroll(&self, node: &str, change: impl FnOnce(&mut EnrollRequest)) {
+        let mut request = EnrollRequest::new(node.parse().unwrap(), unix_now());
+        change(&mut request);
+        let identity = self.with_fleet(|fleet| fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap());
+        write_secret(&self.path(&format!("{node}.identity")), &identity.to_text());
+    }
+
+    /// What the node's identity file holds now.
+    pub fn identity(&self, node: &str) -> Arc<Identity> {
+        Arc::new(sgc_node::load_identity(&self.path(&format!("{node}.identity"))).unwrap())
+    }
+
+    pub fn id(&self, node: &str) -> NodeId {
+        self.identity(node).node_id()
+    }
+
+    /// The list that is in force once this node is revoked.
+    pub fn revoke(&self, node: &str) -> Vec<u8> {
+        self.with_fleet(|fleet| {
+            fleet.revoke(&[node.parse().unwrap()], unix_now()).unwrap();
+            fleet.revocation_list(unix_now()).unwrap()
+        })
+    }
+
+    /// The local network of a node.
+    pub fn net(&self, node: &str) -> FakeDomain {
+        self.nets.lock().unwrap().entry(node.to_owned()).or_default().clone()
+    }
+
+    pub fn state(&self, node: &str) -> PathBuf {
+        self.path(&format!("{node}.state"))
+    }
+
+    pub fn url(&self) -> String {
+        format!("quic://127.0.0.1:{}", self.port)
+    }
+
+    pub fn config(&self, node: &str) -> Config {
+        Config {
+            identity: self.path(&format!("{node}.identity")),
+            routers: vec![self.url().parse().unwrap()],
+            admin_socket: Some(self.path(&format!("{node}.sock"))),
+            state: Some(self.state(node)),
+            ..Config::default()
+        }
+    }
+
+    pub fn start(&self, node: &str, change: impl FnOnce(&mut Config)) -> Node {
+        let mut config = self.config(node);
+        change(&mut config);
+        Node::start(config, self.identity(node), Some(&self.net(node)))
+    }
+
+    pub fn cloud(&self) -> Node {
+        self.cloud_with(|_| {})
+    }
+
+    pub fn cloud_with(&self, change: impl FnOnce(&mut Config)) -> Node {
+        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
+        let mut config = Config { routers: vec![], listen: vec![addr], ..self.config("cloud") };
+        change(&mut config);
+        Node::start(config, self.identity("cloud"), None)
+    }
+
+    pub fn talker(&self, node: &str, topic: &str) -> Talker {
+        Talker::new(&self.net(node), topic, all())
+    }
+
+    pub fn listener(&self, node: &str, topic: &str) -> Listener {
+        Listener::new(&self.net(node), topic, all())
+    }
+
+    /// What a node's audit log says so far.
+    pub fn audit(&self, node: &str) -> Vec<AuditRecord> {
+        let mut records = Vec::new();
+        match audit::read(&self.state(node).join("audit.jsonl"), |record| records.push(record)) {
+            Ok(malformed) => assert_eq!(malformed, 0),
+            Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::NotFound),
+        }
+        records
+    }
+
+    /// The number of the newest epoch that a node has begun.
+    pub fn epoch(&self, node: &str) -> u32 {
+        self.audit(node).iter().filter(|r| r.event == "epoch").filter_map(|r| r.epoch).max().unwrap_or(1)
+    }
+}
+
+pub fn write_secret(path: &Path, text: &str) {
+    let mut options = fs::OpenOptions::new();
+    let mut file = options.write(true).create(true).truncate(true).mode(0o600).open(path).unwrap();
+    file.write_all(text.as_bytes()).unwrap();
+}
+
+/// Reliable, and nothing is forgotten.
+pub fn all() -> Qos {
+    Qos { history: History::KeepAll, ..Qos::default() }
+}
+
+pub fn nodes(names: &[&str]) -> Vec<Recipient> {
+    names.iter().map(|name| Recipient::Node(name.parse().unwrap())).collect()
+}
+
+pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
+    ShareConfig {
+        topic: topic.into(),
+        type_name: None,
+        to: nodes(to),
+        publish: vec![],
+        priority: Class::Default,
+        suite: Suite::DEFAULT,
+        metadata: ShareMetadata::default(),
+    }
+}
+
+pub fn uses(topic: &str) -> UseConfig {
+    UseConfig { publish: false, from: "robot".parse().unwrap(), topic: topic.into(), type_name: None }
+}
+
+/// Says 1, 2, 3, … about a thousand times a second, until it is told to end.
+pub struct Stream {
+    said: Arc<AtomicU64>,
+    end: Sender<()>,
+    thread: JoinHandle<Talker>,
+}
+
+impl Stream {
+    pub fn start(talker: Talker) -> Self {
+        Self::start_from(talker, 1)
+    }
+
+    pub fn start_from(talker: Talker, first: u64) -> Self {
+        let said = Arc::new(AtomicU64::new(first - 1));
+        let (end, ended) = channel();
+        let count = said.clone();
+        let thread = std::thread::spawn(move || {
+            for n in first.. {
+                talker.say(n.to_string());
+                count.store(n, SeqCst);
+                if ended.recv_timeout(Duration::from_millis(1)).is_ok() {
+                    break;
+                }
+            }
+            talker
+        });
+        Self { said, end, thread }
+    }
+
+    /// How far it is.
+    pub fn said(&self) -> u64 {
+        self.said.load(SeqCst)
+    }
+
+    /// Lets it go on for as many more.
+    pub fn more(&self, n: u64) {
+        let until = self.said() + n;
+        wait("the stream goes on", || self.said() >= until);
+    }
+
+    /// Ends it; the talker and its last number.
+    pub fn end(self) -> (Talker, u64) {
+        self.end.send(()).unwrap();
+        let talker = self.thread.join().unwrap();
+        (talker, self.said.load(SeqCst))
+    }
+}
+
+/// Says 0 until each of them has heard it, so that the way is there.
+pub fn warm_up(talker: &Talker, listeners: &[&Listener]) {
+    for listener in listeners {
+        listener.hears_at_last(|_| talker.say("0"));
+    }
+}
+
+fn number(payload: &[u8]) -> u64 {
+    std::str::from_utf8(payload).unwrap().parse().unwrap()
+}
+
+/// What was heard so far of a stream.
+pub fn heard(listener: &Listener) -> Vec<u64> {
+    listener.drain().iter().map(|b| number(b)).filter(|n| *n > 0).collect()
+}
+
+/// Hears every number from `first` to `last` once and in order.
+pub fn hears_each(listener: &Listener, first: u64, last: u64) {
+    let deadline = Instant::now() + PATIENCE;
+    let mut next = first;
+    while next <= last {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let payload = listener.samples.recv_timeout(left);
+        let n = number(&payload.unwrap_or_else(|_| panic!("{next} of {last} never comes")));
+        if n > 0 {
+            assert_eq!(n, next, "one is lost, comes twice or out of order");
+            next += 1;
+        }
+    }
+}

@@ -1,0 +1,327 @@
+//! What tests of whole nodes share: nodes in this process, each with a runtime of its own, real QUIC on the loopback
+//! interface, and local networks in memory with applications on them.
+
+#![allow(clippy::unwrap_used, dead_code, unreachable_pub)]
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use rand_core::{OsRng, TryRngCore as _};
+use sgc_node::admin::AdminRequest;
+use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::{ConfigSource, RunOptions, run_on};
+use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
+use sgc_transport::{ListenAddr, Scheme};
+use sgc_trust::{EnrollRequest, Fleet, FleetName, Identity, NodeName, Suite};
+use sgc_wire::{Class, Durability, History, Qos, UnixMillis};
+use tokio::sync::oneshot;
+
+/// Longer than anything takes that works.
+pub const PATIENCE: Duration = Duration::from_secs(40);
+
+pub fn fleet() -> &'static Fleet {
+    static FLEET: OnceLock<Fleet> = OnceLock::new();
+    FLEET.get_or_init(|| {
+        let name: FleetName = "lab".parse().unwrap();
+        Fleet::create(name, unix_now(), &mut OsRng.unwrap_err()).unwrap()
+    })
+}
+
+pub fn unix_now() -> UnixMillis {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+    UnixMillis(now.as_millis() as u64)
+}
+
+pub fn identity(name: &str, router: bool) -> Arc<Identity> {
+    let mut request = EnrollRequest::new(name.parse::<NodeName>().unwrap(), unix_now());
+    request.router = router;
+    Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
+}
+
+/// A node in a runtime of its own.
+pub struct Node {
+    runtime: Option<tokio::runtime::Runtime>,
+    stop: Option<oneshot::Sender<()>>,
+    ended: Receiver<()>,
+    pub addr: Option<SocketAddr>,
+    socket: std::path::PathBuf,
+    /// What a reload reads.
+    config: Arc<Mutex<Config>>,
+}
+
+impl Node {
+    pub fn start(config: Config, identity: Arc<Identity>, domain: Option<&FakeDomain>) -> Self {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let (stop, stopped) = oneshot::channel::<()>();
+        let (ready, is_ready) = oneshot::channel();
+        let (done, ended) = channel();
+        let network = domain.map(|d| Arc::new(d.join(true)));
+        let socket = config.admin_socket.clone().unwrap();
+        let file = Arc::new(Mutex::new(config.clone()));
+        let read = file.clone();
+        let source: ConfigSource = Arc::new(move || Ok(read.lock().unwrap().clone()));
+        runtime.spawn(async move {
+            let options = RunOptions { ready: Some(ready), source: Some(source), ..RunOptions::default() };
+            let stopped = async {
+                let _ = stopped.await;
+            };
+            run_on::<FakeRos>(config, identity, network, options, stopped).await.unwrap();
+            let _ = done.send(());
+        });
+        let listening = runtime.block_on(is_ready).unwrap();
+        let addr = listening.first().map(|l| l.addr);
+        Self { runtime: Some(runtime), stop: Some(stop), ended, addr, socket, config: file }
+    }
+
+    /// As SIGTERM does.
+    pub fn stop(mut self) {
+        let _ = self.stop.take().unwrap().send(());
+        self.ended.recv_timeout(PATIENCE).expect("the node stops");
+    }
+
+    /// As SIGKILL does, as far as the others can tell.
+    pub fn kill(mut self) {
+        // Waits until the sockets are closed, which the system does for a killed process.
+        self.runtime.take().unwrap().shutdown_timeout(PATIENCE);
+    }
+
+    pub fn status(&self) -> serde_json::Value {
+        self.ask(&AdminRequest::Status)
+    }
+
+    /// Asks at the status socket.
+    pub fn ask(&self, request: &AdminRequest) -> serde_json::Value {
+        use std::io::{Read, Write};
+        let mut text = String::new();
+        let mut stream = std::os::unix::net::UnixStream::connect(&self.socket).unwrap();
+        stream.write_all(request.to_line().as_bytes()).unwrap();
+        stream.read_to_string(&mut text).unwrap();
+        serde_json::from_str(&text).unwrap()
+    }
+
+    /// Changes the configuration and has it read again; what the report says changed.
+    pub fn reload(&self, change: impl FnOnce(&mut Config)) -> serde_json::Value {
+        change(&mut self.config.lock().unwrap());
+        let answer = self.ask(&AdminRequest::Reload);
+        assert!(answer["ok"].is_object(), "{answer}");
+        answer["ok"].clone()
+    }
+
+    /// Node ids of those that it has links to, each once.
+    pub fn peers(&self) -> BTreeSet<String> {
+        let status = self.status();
+        status["links"].as_array().unwrap().iter().map(|l| l["peer"].as_str().unwrap().to_owned()).collect()
+    }
+
+    /// How many connections it refused for this reason, or was refused.
+    pub fn refused(&self, kind: &str) -> u64 {
+        self.status()["refused"][kind].as_u64().unwrap_or(0)
+    }
+
+    /// What its only route says of itself.
+    pub fn route_state(&self) -> String {
+        self.status()["routes"][0]["state"].as_str().unwrap_or_default().to_owned()
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+/// Lets nodes speak (`SGC_LOG=debug cargo test …` shows what they say), and finds a port for a router.
+pub fn begin() -> u16 {
+    let filter = tracing_subscriber::EnvFilter::from_env("SGC_LOG");
+    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
+    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    socket.local_addr().unwrap().port()
+}
+
+/// The three of the demo: a robot, a cloud router, an operator, each network its own.
+pub struct Trio {
+    pub robot_net: FakeDomain,
+    pub desk_net: FakeDomain,
+    dir: tempfile::TempDir,
+    port: u16,
+    starts: std::cell::Cell<u32>,
+}
+
+impl Trio {
+    pub fn new() -> Self {
+        let port = begin();
+        Self {
+            robot_net: FakeDomain::default(),
+            desk_net: FakeDomain::default(),
+            dir: tempfile::tempdir().unwrap(),
+            port,
+            starts: std::cell::Cell::new(0),
+        }
+    }
+
+    pub fn config(&self) -> Config {
+        self.starts.set(self.starts.get() + 1);
+        Config {
+            node_name: None,
+            identity: "unused".into(),
+            routers: vec![format!("quic://127.0.0.1:{}", self.port).parse().unwrap()],
+            listen: vec![],
+            ros: None,
+            shares: vec![],
+            uses: vec![],
+            admin_socket: Some(self.dir.path().join(format!("{}.sock", self.starts.get()))),
+            state: Some(self.dir.path().join(format!("{}.state", self.starts.get()))),
+            ..Config::default()
+        }
+    }
+
+    pub fn cloud(&self) -> Node {
+        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
+        let config = Config { routers: vec![], listen: vec![addr], ..self.config() };
+        let node = Node::start(config, identity("cloud", true), None);
+        assert_eq!(node.addr.unwrap().port(), self.port);
+        node
+    }
+
+    pub fn robot(&self, topics: &[&str], to: &str) -> Node {
+        self.robot_in(Suite::Group, topics, to)
+    }
+
+    pub fn robot_in(&self, suite: Suite, topics: &[&str], to: &str) -> Node {
+        let shares = topics
+            .iter()
+            .map(|topic| ShareConfig {
+                topic: (*topic).into(),
+                type_name: None,
+                to: vec![Recipient::Node(to.parse().unwrap())],
+                publish: vec![],
+                priority: Class::Default,
+                suite,
+                metadata: ShareMetadata::default(),
+            })
+            .collect();
+        let config = Config { shares, ..self.config() };
+        Node::start(config, identity("robot", false), Some(&self.robot_net))
+    }
+
+    pub fn desk(&self, topics: &[&str]) -> Node {
+        self.desk_on(topics, &self.desk_net)
+    }
+
+    pub fn desk_on(&self, topics: &[&str], net: &FakeDomain) -> Node {
+        let uses = topics
+            .iter()
+            .map(|topic| UseConfig {
+                publish: false,
+                from: "robot".parse().unwrap(),
+                topic: (*topic).into(),
+                type_name: None,
+            })
+            .collect();
+        let config = Config { uses, ..self.config() };
+        Node::start(config, identity("desk", false), Some(net))
+    }
+}
+
+pub fn spec(topic: &str, qos: Qos) -> EndpointSpec {
+    EndpointSpec {
+        topic: dds_topic(topic),
+        type_name: dds_type("std_msgs/msg/String"),
+        keyless: true,
+        type_hash: None,
+        qos,
+    }
+}
+
+pub fn latched() -> Qos {
+    Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() }
+}
+
+/// An application that publishes.
+pub struct Talker {
+    pub writer: FakeWriter,
+    _net: FakeRos,
+}
+
+impl Talker {
+    pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        let net = domain.join(false);
+        Self { writer: net.create_writer(&spec(topic, qos)).unwrap(), _net: net }
+    }
+
+    pub fn say(&self, payload: impl Into<Bytes>) {
+        self.writer.write(SampleKind::Write, 1, payload.into()).unwrap();
+    }
+
+    pub fn wait_for_readers(&self, n: u32) {
+        wait(&format!("{n} readers"), || self.writer.matched_readers() == n);
+    }
+}
+
+/// An application that subscribes.
+pub struct Listener {
+    pub samples: Receiver<Bytes>,
+    _reader: FakeReader,
+    _net: FakeRos,
+}
+
+impl Listener {
+    pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        let net = domain.join(false);
+        let (sender, samples) = channel();
+        let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));
+        let reader = net.create_reader(&spec(topic, qos), handler).unwrap();
+        Self { samples, _reader: reader, _net: net }
+    }
+
+    pub fn hears(&self, payload: impl Into<Bytes>) {
+        let payload = payload.into();
+        let heard = self.samples.recv_timeout(PATIENCE).expect("a sample arrives");
+        assert!(heard == payload, "{} bytes instead of {}", heard.len(), payload.len());
+    }
+
+    /// Nothing, for as long as something that is known to come takes: `until` makes and awaits it.
+    pub fn hears_nothing(&self) {
+        match self.samples.try_recv() {
+            Err(std::sync::mpsc::TryRecvError::Empty) => {}
+            other => panic!("heard {other:?}"),
+        }
+    }
+
+    /// Skips what comes until `payload` does; fails if anything comes twice.
+    pub fn hears_at_last(&self, say: impl Fn(u32)) {
+        let deadline = Instant::now() + PATIENCE;
+        for n in 0.. {
+            say(n);
+            match self.samples.recv_timeout(Duration::from_millis(20)) {
+                Ok(_) => return,
+                Err(RecvTimeoutError::Timeout) => assert!(Instant::now() < deadline, "nothing arrives"),
+                Err(error) => panic!("{error}"),
+            }
+        }
+    }
+
+    pub fn drain(&self) -> Vec<Bytes> {
+        self.samples.try_iter().collect()
+    }
+}
+
+pub fn wait(what: &str, until: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !until() {
+        assert!(Instant::now() < deadline, "never: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+pub fn writers(net: &FakeDomain, topic: &str) -> usize {
+    net.count(&dds_topic(topic), EndpointKind::Writer)
+}
