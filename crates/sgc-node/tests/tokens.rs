@@ -169,7 +169,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
     };
     let id = TokenRecords::change(&state, |records| records.add(record, unix_now())).unwrap();
     let said = reload(&at("robot.sock"));
-    assert!(said.contains("who may subscribe changed") && said.contains("1 more CA is trusted"), "{said}");
+    assert!(said.contains("who may subscribe changed") && said.contains("another CA may link"), "{said}");
     let cart_net = FakeDomain::default();
     let nowhere = "quic://127.0.0.1:9".parse().unwrap();
     let tokens = vec![TokenSource::Text(Box::new(token.clone()))];
