@@ -499,7 +499,7 @@ impl Endpoint {
                 return Err(RefuseReason::NotVerified);
             }
             // Two sources under one id would use one nonce twice.
-            Request::Publish { offer } if share.has_source(offer, &asked.peer.node_id) => {
+            Request::Publish { offer } if share.has_source(&offer.source, sink) => {
                 return Err(RefuseReason::NotPermitted);
             }
             Request::Publish { .. } | Request::Subscribe { .. } => {}

@@ -9,7 +9,7 @@ use rand_core::RngCore;
 use sgc_trust::{Policy, Suite, VerifiedPeer};
 use sgc_wire::{
     Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, GRANT_SOURCES_MAX, Metadata, Name, NodeId, Qos,
-    Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceOffer, TopicGrant,
+    Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::SourceProgress;
@@ -118,17 +118,12 @@ impl Share {
     /// What is granted of an epoch to one who asked with `request`.
     pub(crate) fn grant(&self, epoch: &Epoch, peer: Option<&GrantedSink>) -> TopicGrant {
         let own = self.own.iter().map(|s| s.announce());
-        // By source: one that moved to another way may have two places for a while.
-        let others: BTreeMap<_, _> = self
-            .sinks
-            .values()
-            .filter_map(|s| match &s.request {
-                Request::Publish { offer } => Some((offer.source, offer.key.clone())),
-                Request::Subscribe { .. } | Request::Renew { .. } => None,
-            })
-            .collect();
-        let others =
-            others.into_iter().map(|(source, key)| SourceAnnounce { source, key, oldest: 0, next: 0 });
+        let others = self.sinks.values().filter_map(|s| match &s.request {
+            Request::Publish { offer } => {
+                Some(SourceAnnounce { source: offer.source, key: offer.key.clone(), oldest: 0, next: 0 })
+            }
+            Request::Subscribe { .. } | Request::Renew { .. } => None,
+        });
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {
             epoch: epoch.number,
@@ -144,16 +139,12 @@ impl Share {
         self.rotation.as_ref().map_or(&self.epoch, |r| &r.epoch)
     }
 
-    /// True if the source of this offer publishes here already, and is not the very same one of `peer`, which may have
-    /// moved to another way.
-    pub(crate) fn has_source(&self, offered: &SourceOffer, peer: &NodeId) -> bool {
-        let taken = |s: &GrantedSink| match &s.request {
-            Request::Publish { offer } => {
-                offer.source == offered.source && (offer != offered || s.peer.node_id != *peer)
-            }
-            Request::Subscribe { .. } | Request::Renew { .. } => false,
-        };
-        self.own.iter().any(|s| s.id() == offered.source) || self.sinks.values().any(taken)
+    /// True if `source` publishes here already, other than by the request of `sink`.
+    pub(crate) fn has_source(&self, source: &SourceId, sink: &SinkId) -> bool {
+        let offered =
+            |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);
+        self.own.iter().any(|s| s.id() == *source)
+            || self.sinks.iter().any(|(id, s)| id != sink && offered(s))
     }
 
     /// The share as `peer` may see it.
