@@ -431,7 +431,10 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
         )
         .unwrap();
     let (arrived_tx, arrived) = channel();
-    let _witness = sgc.create_reader(&spec("burst"), Box::new(move |_| drop(arrived_tx.send(())))).unwrap();
+    let arrives = move |_| {
+        let _ = arrived_tx.send(());
+    };
+    let _witness = sgc.create_reader(&spec("burst"), Box::new(arrives)).unwrap();
     let writer = writer(&ros, &spec("burst"), 2);
     // What gathered behind the gate is at hand together; the witness may be a moment ahead of the reader, so that
     // the gate opens too early now and then.

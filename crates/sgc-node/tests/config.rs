@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use sgc_node::config::{
     ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Origin, Recipient,
-    RotationConfig, SHARES_MAX, SUITES, Table, TokenSource, load, load_args, parse, suite_default,
+    RotationConfig, SHARES_MAX, SUITES, Table, TokenSource, load, load_args, parse,
 };
 use sgc_trust::Suite;
 use sgc_wire::Class;
@@ -81,7 +81,7 @@ fn the_example_of_the_design_is_valid() {
         share.to,
         [Recipient::Node("desk".parse().unwrap()), Recipient::Group("operators".parse().unwrap())]
     );
-    assert_eq!((share.priority, share.suite), (Class::Default, suite_default()));
+    assert_eq!((share.priority, share.suite), (Class::Default, Suite::DEFAULT));
     assert_eq!(config.uses.len(), 1);
     let one = &config.uses[0];
     assert_eq!((one.from.as_str(), one.topic.as_str()), ("desk", "/cmd_vel"));
@@ -489,7 +489,7 @@ fn words_are_checked() {
 
 #[test]
 fn suites_are_called_by_name() {
-    assert_eq!(suite_default(), Suite::from_id(3).unwrap_or(Suite::Group));
+    assert_eq!(Suite::DEFAULT, Suite::Standard);
     for (name, id) in SUITES.iter().zip(1..) {
         let text = format!("[[share]]\ntopic = '/a'\nto = ['b']\nsuite = '{name}'");
         match Suite::from_id(id) {

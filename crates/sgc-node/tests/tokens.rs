@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, TokenSource, suite_default};
+use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, TokenSource};
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_node::{RunOptions, create_state_dir, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
@@ -133,7 +133,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         to: vec![Recipient::Node("desk".parse().unwrap())],
         publish: vec![],
         priority: Class::Default,
-        suite: suite_default(),
+        suite: Suite::DEFAULT,
         metadata: ShareMetadata::default(),
     };
     let robot_net = FakeDomain::default();

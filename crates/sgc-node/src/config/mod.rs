@@ -33,7 +33,7 @@ pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
 pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration};
 pub use resolve::{
     LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES,
-    TRUST_MAX, USES_MAX, suite_default,
+    TRUST_MAX, USES_MAX,
 };
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
 pub use schema::Table;

@@ -47,7 +47,6 @@ pub const SUITES: [&str; 8] = [
     "paper-chacha",
     "paper-3072-chacha",
 ];
-const SUITE_DEFAULT: &str = "standard";
 
 /// An identity file and what an error about it needs to know.
 pub(super) struct IdentityFile<'i> {
@@ -257,7 +256,7 @@ impl Resolver<'_> {
             publish: publish.unwrap_or_default(),
             type_name,
             priority: priority.unwrap_or_default(),
-            suite: suite.unwrap_or_else(suite_default),
+            suite: suite.unwrap_or(Suite::DEFAULT),
             metadata,
         })
     }
@@ -536,27 +535,8 @@ fn priority_class(key: &'static str, value: &str) -> Result<Class, Mistake> {
     }
 }
 
-/// The suite of shares that do not say one.
-pub fn suite_default() -> Suite {
-    suite_named(SUITE_DEFAULT).unwrap_or(Suite::Group)
-}
-
-/// The one place where suites have names.
-fn suite_named(name: &str) -> Option<Suite> {
-    let index = SUITES.iter().position(|known| *known == name)?;
-    Suite::from_id(u8::try_from(index + 1).ok()?)
-}
-
 fn suite(key: &'static str, value: &str) -> Result<Suite, Mistake> {
-    suite_named(value).ok_or_else(|| match SUITES.contains(&value) {
-        true => Mistake::PlannedValue {
-            key,
-            value: value.to_owned(),
-            what: "this suite is",
-            instead: "use \"group\"",
-        },
-        false => unknown_word(key, value, &SUITES),
-    })
+    value.parse().map_err(|_| unknown_word(key, value, &SUITES))
 }
 
 fn unknown_word(key: &'static str, value: &str, known: &'static [&'static str]) -> Mistake {
