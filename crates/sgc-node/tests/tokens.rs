@@ -17,7 +17,7 @@ use sgc_node::{RunOptions, create_state_dir, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeRos};
 use sgc_transport::{ListenAddr, Scheme};
-use sgc_trust::{EnrollRequest, Fleet, Identity, ShareToken, TopicSecret};
+use sgc_trust::{EnrollRequest, Fleet, Identity, ShareToken, Suite, TopicSecret};
 use sgc_wire::{Class, Metadata, Qos, UnixMillis};
 use tokio::sync::oneshot;
 
