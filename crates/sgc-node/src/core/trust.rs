@@ -76,6 +76,7 @@ impl<N: RosNetwork> Core<N> {
     /// Is this from here on: with another certificate, or other secrets for names made later.
     pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
         let now = now();
+        let recertified = identity.chain() != self.identity.chain();
         self.identity = identity.clone();
         self.renew_due = Some(renew_at(&identity, now));
         if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
@@ -83,7 +84,9 @@ impl<N: RosNetwork> Core<N> {
         }
         self.credentials.set_identity(identity.clone());
         self.endpoint.set_identity(now, identity);
-        self.redial.send_replace(());
+        if recertified {
+            self.redial.send_replace(());
+        }
     }
 
     /// Trusts these CAs from here on and no others; what they have revoked stays so.
@@ -97,8 +100,6 @@ impl<N: RosNetwork> Core<N> {
 
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
-        let lists = anchors.crls().count();
-        self.audit.write(AuditRecord::new(AuditEvent::Crl).reason(format!("{lists} lists are in force")));
         self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.endpoint.set_anchors(now(), anchors);
