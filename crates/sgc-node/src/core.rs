@@ -937,6 +937,7 @@ impl<N: RosNetwork> Core<N> {
             LinkStatus {
                 id: id.0,
                 peer: entry.link.peer().node_id.to_string(),
+                peer_until: entry.link.peer().not_after.to_string(),
                 remote: entry.link.remote().to_string(),
                 url: entry.url.clone(),
                 kex: stats.key_exchange.label(),

@@ -76,6 +76,8 @@ impl<N: RosNetwork> Core<N> {
     /// Is this from here on: with another certificate, or other secrets for names made later.
     pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
         let now = now();
+        // A link shows a certificate and no secret: it stays if that is the same.
+        let shows_another = self.identity.chain() != identity.chain();
         self.identity = identity.clone();
         self.renew_due = Some(renew_at(&identity, now));
         if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
@@ -83,7 +85,9 @@ impl<N: RosNetwork> Core<N> {
         }
         self.credentials.set_identity(identity.clone());
         self.endpoint.set_identity(now, identity);
-        self.redial.send_replace(());
+        if shows_another {
+            self.redial.send_replace(());
+        }
     }
 
     /// Trusts these CAs from here on and no others; what they have revoked stays so.

@@ -173,7 +173,11 @@ pub fn all() -> Qos {
 }
 
 pub fn nodes(names: &[&str]) -> Vec<Recipient> {
-    names.iter().map(|name| Recipient::Node(name.parse().unwrap())).collect()
+    let recipient = |name: &&str| match *name {
+        "*" => Recipient::Everyone,
+        name => Recipient::Node(name.parse().unwrap()),
+    };
+    names.iter().map(recipient).collect()
 }
 
 pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
@@ -254,6 +258,20 @@ fn number(payload: &[u8]) -> u64 {
 /// What was heard so far of a stream.
 pub fn heard(listener: &Listener) -> Vec<u64> {
     listener.drain().iter().map(|b| number(b)).filter(|n| *n > 0).collect()
+}
+
+/// Hears the rest of a stream up to `last`, each number once and in order; how many do not come.
+pub fn hears_some(listener: &Listener, first: u64, last: u64) -> u64 {
+    let (mut next, mut lost) = (first, 0);
+    while next <= last {
+        let n = number(&listener.samples.recv_timeout(PATIENCE).expect("the last one"));
+        if n > 0 {
+            assert!(n >= next, "{n} comes after {}", next - 1);
+            lost += n - next;
+            next = n + 1;
+        }
+    }
+    lost
 }
 
 /// Hears every number from `first` to `last` once and in order.
