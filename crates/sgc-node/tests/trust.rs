@@ -14,7 +14,7 @@ use lab::*;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
 use sgc_node::audit::AuditRecord;
-use sgc_node::config::Config;
+use sgc_node::config::{Config, UseConfig};
 use sgc_trust::{Identity, Suite, derive_name};
 use sgc_wire::Metadata;
 use support::*;
@@ -313,4 +313,68 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
     let late_hears = lab.listener("late", "/later");
     warm_up(&later, &[&late_hears]);
     drop((cloud, keeper, desk, thief));
+}
+
+#[test]
+fn a_member_publishes_on_a_topic_of_another() {
+    let lab = Lab::new(&["robot", "desk1", "desk2", "desk3"]);
+    let share_it = |c: &mut Config| {
+        let mut share = share("/cmd", &["desk2", "desk3"]);
+        share.publish = nodes(&["desk1"]);
+        share.type_name = Some("std_msgs/msg/String".into());
+        c.shares = vec![share];
+    };
+    let publish = |c: &mut Config| c.uses = vec![UseConfig { publish: true, ..uses("/cmd") }];
+    let mut cloud = lab.cloud();
+    let mut robot = lab.start("robot", share_it);
+    let mut desk1 = lab.start("desk1", publish);
+    let _desk2 = lab.start("desk2", |c| c.uses = vec![uses("/cmd")]);
+    let desk3 = lab.start("desk3", publish);
+    let talker = lab.talker("desk1", "/cmd");
+    let [at_home, at_robot, at_desk2] = ["desk1", "robot", "desk2"].map(|node| lab.listener(node, "/cmd"));
+    warm_up(&talker, &[&at_robot, &at_desk2]);
+    let stream = Stream::start(talker);
+    stream.more(300);
+    let (talker, last) = stream.end();
+    hears_each(&at_robot, 1, last);
+    hears_each(&at_desk2, 1, last);
+    hears_each(&at_home, 1, last);
+
+    // Who may subscribe may not publish.
+    let intruder = lab.talker("desk3", "/cmd");
+    wait("it is told", || desk3.route_state().contains("does not let this node publish"));
+    intruder.say("not a number");
+
+    // Whoever comes back, it goes on, and nothing comes twice.
+    let mut talker = Some(talker);
+    let mut first = last + 1;
+    for round in ["robot", "desk1", "cloud"] {
+        match round {
+            "robot" => {
+                robot.kill();
+                robot = lab.start("robot", share_it);
+            }
+            "desk1" => {
+                desk1.kill();
+                desk1 = lab.start("desk1", publish);
+            }
+            _ => {
+                cloud.kill();
+                cloud = lab.cloud();
+            }
+        }
+        let stream = Stream::start_from(talker.take().unwrap(), first);
+        for listener in [&at_robot, &at_desk2] {
+            let n = listener.samples.recv_timeout(PATIENCE);
+            assert!(n.is_ok(), "it does not go on after a restart of {round}");
+        }
+        stream.more(200);
+        let (back, last) = stream.end();
+        hears_some(&at_robot, first, last);
+        hears_some(&at_desk2, first, last);
+        hears_each(&at_home, first, last);
+        (talker, first) = (Some(back), last + 1);
+    }
+    at_home.hears_nothing();
+    drop((cloud, robot, desk1));
 }
