@@ -512,8 +512,12 @@ impl<N: RosNetwork> Core<N> {
                     }
                     LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
                     LinkClose::Revoked => {
-                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate is revoked; its link is closed");
-                        entry.link.close(CloseReason::Revoked);
+                        let peer = entry.link.peer();
+                        let why = self.credentials.objection(peer, now().unix);
+                        let why = why.unwrap_or(CloseReason::Revoked);
+                        info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                        entry.closed_for = Some(why.to_string());
+                        entry.link.close(why);
                     }
                     LinkClose::Expired => {
                         info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");

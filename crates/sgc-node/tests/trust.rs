@@ -6,6 +6,7 @@
 mod lab;
 mod support;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::time::{Duration, Instant};
@@ -14,9 +15,10 @@ use lab::*;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
 use sgc_node::audit::AuditRecord;
-use sgc_node::config::{Config, UseConfig};
-use sgc_trust::{Identity, Suite, derive_name};
-use sgc_wire::Metadata;
+use sgc_node::config::{Config, TokenSource, UseConfig};
+use sgc_node::partners::{TokenRecord, TokenRecords};
+use sgc_trust::{Identity, ShareToken, Suite, TopicSecret, derive_name};
+use sgc_wire::{Metadata, UnixMillis};
 use support::*;
 
 #[test]
@@ -377,4 +379,203 @@ fn a_member_publishes_on_a_topic_of_another() {
     }
     at_home.hears_nothing();
     drop((cloud, robot, desk1));
+}
+
+/// What the owner makes of one of its shares for a partner, as `sgc share-token` does.
+fn token_for(lab: &Lab, topic: &str, partner: &Lab, node: Option<&str>, recorded: bool) -> (ShareToken, u64) {
+    let owner = lab.identity("robot");
+    let mut share = share(topic, &["desk"]);
+    share.type_name = Some("std_msgs/msg/String".into());
+    let metadata = sgc_node::policy::metadata(&share, "robot");
+    let token = ShareToken {
+        owner: owner.node_id(),
+        owner_name: owner.node_name().clone(),
+        ca: owner.anchors().certificates().next().unwrap().clone(),
+        secret: TopicSecret::derive(&owner.naming_secrets()[0].secret, &metadata),
+        metadata,
+        routers: vec![lab.url()],
+        expires: UnixMillis(unix_now().0 + 3_600_000),
+    };
+    let record = TokenRecord {
+        id: 0,
+        topic: topic.to_owned(),
+        type_name: "std_msgs/msg/String".to_owned(),
+        name: token.name().to_string(),
+        ca: partner.ca().1,
+        ca_pem: fs::read_to_string(partner.ca().0).unwrap(),
+        node: node.map(|node| partner.id(node).to_string()),
+        created: unix_now().0,
+        expires: token.expires.0,
+    };
+    let state = lab.state("robot");
+    let id = recorded.then(|| TokenRecords::change(&state, |r| r.add(record, unix_now())).unwrap());
+    (token, id.unwrap_or(0))
+}
+
+#[test]
+fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let acme = lab.beside("acme");
+    ["arm", "other"].iter().for_each(|node| acme.enroll(node, |_| {}));
+    let cloud = lab.cloud();
+    let robot =
+        lab.start("robot", |c| c.shares = vec![share("/pose", &["desk"]), share("/private", &["desk"])]);
+    let _desk = lab.start("desk", |c| c.uses = vec![uses("/pose")]);
+    let (talker, private) = (lab.talker("robot", "/pose"), lab.talker("robot", "/private"));
+    let (token, id) = token_for(&lab, "/pose", &acme, Some("arm"), true);
+    // As if the secret of another topic had become known: it admits nobody.
+    let (leaked, _) = token_for(&lab, "/private", &acme, Some("arm"), false);
+    assert_eq!(robot.reload(|_| {})["changed"][0], "/pose: who may subscribe changed");
+    let with = |tokens: &[&ShareToken]| {
+        let all: Vec<_> = tokens.iter().map(|t| TokenSource::Text(Box::new((*t).clone()))).collect();
+        move |c: &mut Config| c.tokens = all.clone()
+    };
+    let arm = acme.start("arm", with(&[&token, &leaked]));
+    let other = acme.start("other", with(&[&token]));
+    let (arm_id, other_id) = (acme.id("arm").to_string(), acme.id("other").to_string());
+
+    // A router that does not trust that CA lets nobody in, until it is told to while it runs.
+    wait("they are refused", || cloud.refused("other_ca") >= 2);
+    assert!(cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
+    let report = cloud.reload(|c| c.trust = vec![acme.ca().0]);
+    assert_eq!(report["changed"][0], "nodes of another CA may link to this one");
+    assert_eq!(report["needs_restart"].as_array().map(Vec::len), Some(0));
+    wait("they are let in", || cloud.peers().is_superset(&[arm_id.clone(), other_id.clone()].into()));
+
+    let (at_desk, at_arm) = (lab.listener("desk", "/pose"), acme.listener("arm", "/pose"));
+    let (at_other, peeks) = (acme.listener("other", "/pose"), acme.listener("arm", "/private"));
+    warm_up(&talker, &[&at_desk, &at_arm]);
+    let stream = Stream::start(talker);
+    stream.more(100);
+    private.say("for the fleet alone");
+    let state_of = |node: &Node, topic: &str| {
+        let status = node.status();
+        let route = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == *topic).cloned();
+        route.unwrap()["state"].as_str().unwrap().to_owned()
+    };
+    wait("another node with the token is refused", || other.route_state().starts_with("refused"));
+    wait("another topic is refused", || state_of(&arm, "/private").starts_with("refused"));
+    let refused = |peer: &str| {
+        let by = |r: &AuditRecord| r.event == "refused" && r.peer.as_deref() == Some(peer);
+        lab.audit("robot").iter().any(by)
+    };
+    assert!(refused(&arm_id) && refused(&other_id));
+    stream.more(100);
+
+    // Withdrawn: cut off at once, and nobody else notices.
+    TokenRecords::change(&lab.state("robot"), |records| records.withdraw(id)).unwrap();
+    robot.reload(|_| {});
+    wait("a new epoch", || lab.epoch("robot") >= 2);
+    let mark = stream.said();
+    wait("it is told", || state_of(&arm, "/pose").contains("refused"));
+    stream.more(300);
+    let (_talker, last) = stream.end();
+    hears_each(&at_desk, 1, last);
+    at_desk.hears_nothing();
+    let got = heard(&at_arm);
+    assert!(got.iter().zip(1..).all(|(n, expected)| *n == expected), "{got:?}");
+    assert!((100..=mark).contains(got.last().unwrap()), "it heard {:?}, of {mark}", got.last());
+    at_other.hears_nothing();
+    peeks.hears_nothing();
+
+    // The router forgets that CA: its nodes are cut off, and let in no more.
+    let before = cloud.refused("other_ca");
+    cloud.reload(|c| c.trust = vec![]);
+    wait("they are cut off", || cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
+    wait("they are refused", || cloud.refused("other_ca") > before);
+    let closed = |r: &AuditRecord| r.event == "link_closed" && r.peer.as_deref() == Some(&arm_id);
+    let reason = lab.audit("cloud").into_iter().rfind(closed).unwrap().reason.unwrap();
+    assert!(reason.contains("no longer trusted"), "{reason}");
+}
+
+#[test]
+fn the_audit_log_tells_what_happened_and_no_secret() {
+    let lab = Lab::new(&["robot", "desk1", "desk2", "desk3"]);
+    let acme = lab.beside("acme");
+    acme.enroll("arm", |_| {});
+    let cloud = lab.cloud_with(|c| c.trust = vec![acme.ca().0]);
+    let robot = lab.start("robot", |c| {
+        c.shares = vec![share("/pose", &["desk1", "desk2", "desk3"])];
+        c.trust = vec![acme.ca().0];
+    });
+    let listeners = ["desk1", "desk2", "desk3"].map(|node| {
+        let node_runs = lab.start(node, |c| c.uses = vec![uses("/pose")]);
+        (node_runs, lab.listener(node, "/pose"))
+    });
+    let talker = lab.talker("robot", "/pose");
+    warm_up(&talker, &[&listeners[0].1, &listeners[1].1, &listeners[2].1]);
+    let (token, _) = token_for(&lab, "/pose", &acme, Some("arm"), false);
+    let arm = acme.start("arm", |c| c.tokens = vec![TokenSource::Text(Box::new(token.clone()))]);
+    wait("a refusal", || arm.route_state().starts_with("refused"));
+    robot.reload(|c| c.shares[0].to = nodes(&["desk1", "desk3"]));
+    let list = lab.revoke("desk3");
+    assert_eq!(robot.ask(&AdminRequest::Crl(list))["ok"], true);
+    wait("two new epochs", || lab.epoch("robot") == 3);
+    wait("the router knows", || lab.audit("cloud").iter().any(|r| r.event == "crl"));
+    // What is queued is written once it has stopped.
+    robot.stop();
+    cloud.stop();
+
+    let is = |event: &str, peer: &str| {
+        let is = |r: &AuditRecord| r.event == event && r.peer.as_deref() == Some(peer);
+        assert!(lab.audit("robot").iter().any(is), "{event} {peer} is not in the log");
+    };
+    let [one, two, three] = ["desk1", "desk2", "desk3"].map(|node| lab.id(node).to_string());
+    is("granted", &one);
+    is("granted", &two);
+    is("refused", &acme.id("arm").to_string());
+    is("cut", &two);
+    is("revoked", &three);
+    for event in ["started", "link_up", "epoch", "crl", "reload", "stopped"] {
+        assert!(lab.audit("robot").iter().any(|r| r.event == event), "{event} is not in the log");
+    }
+
+    // Nothing that looks like a key is in it but the names of what is shared and of who is there.
+    let mut known: BTreeSet<String> =
+        ["robot", "cloud", "desk1", "desk2", "desk3"].map(|node| lab.id(node).to_string()).into();
+    known.insert(acme.id("arm").to_string());
+    known.insert(token.name().to_string());
+    for node in ["robot", "cloud"] {
+        let log = fs::read_to_string(lab.state(node).join("audit.jsonl")).unwrap();
+        assert_eq!(
+            fs::metadata(lab.state(node).join("audit.jsonl")).unwrap().permissions().mode() & 0o777,
+            0o600
+        );
+        for line in log.lines() {
+            serde_json::from_str::<serde_json::Value>(line).unwrap();
+        }
+        let is_key = |c: char| c.is_ascii_alphanumeric() || "+/-_=".contains(c);
+        let long = log.split(|c| !is_key(c)).filter(|word| word.len() >= 32);
+        for word in long {
+            assert!(known.contains(word), "{node}: {word}");
+        }
+    }
+}
+
+#[test]
+fn nodes_of_a_post_quantum_fleet_link_and_grant_so() {
+    let lab = Lab::empty("lab", begin());
+    lab.enroll("before", |_| {});
+    lab.with_fleet(|fleet| fleet.set_post_quantum(true, unix_now()).unwrap());
+    lab.enroll("cloud", |request| request.router = true);
+    ["robot", "desk"].iter().for_each(|node| lab.enroll(node, |_| {}));
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["*"])]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/chatter")]);
+    let before = lab.start("before", |c| c.uses = vec![uses("/chatter")]);
+    let talker = lab.talker("robot", "/chatter");
+    let listener = lab.listener("desk", "/chatter");
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    for node in [&robot, &desk, &cloud] {
+        let status = node.status();
+        let links = status["links"].as_array().unwrap();
+        assert!(!links.is_empty() && links.iter().all(|l| l["kex"] == "X25519MLKEM768"), "{links:?}");
+    }
+    // One whose identity does not know of it asks for grants that a recording could tell later.
+    wait("it gets nothing", || {
+        cloud.refused("key_exchange") > 0
+            || before.status()["routes"][0]["state"].as_str().unwrap().contains("refuse")
+    });
+    assert_eq!(writers(&lab.net("before"), "/chatter"), 0);
 }

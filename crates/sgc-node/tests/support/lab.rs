@@ -14,6 +14,8 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::LockedFleet;
 use sgc_node::audit::{self, AuditRecord};
@@ -62,6 +64,16 @@ impl Lab {
 
     pub fn fleet_file(&self) -> PathBuf {
         self.fleet.clone()
+    }
+
+    /// The file with its CA certificate, PEM, and the CA's fingerprint.
+    pub fn ca(&self) -> (PathBuf, String) {
+        let path = self.path("ca.pem");
+        let fleet = sgc_node::read_fleet(&self.fleet).unwrap();
+        let base64 = STANDARD.encode(fleet.ca_certificate());
+        let text = format!("-----BEGIN CERTIFICATE-----\n{base64}\n-----END CERTIFICATE-----\n");
+        fs::write(&path, text).unwrap();
+        (path, fleet.anchors().fingerprints().next().unwrap().to_string())
     }
 
     /// Changes the fleet's file, as `sgc fleet` does.
