@@ -95,8 +95,6 @@ impl<N: RosNetwork> Core<N> {
         let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
         self.router.set_anchors(anchors.clone());
         self.set_anchors(anchors);
-        // On new links neighbours say again what they know of nodes that nobody here believed before.
-        self.redial.send_replace(());
     }
 
     /// Believes others from here on, everywhere.
