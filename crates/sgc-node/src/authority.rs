@@ -5,12 +5,15 @@ use std::path::Path;
 use std::time::Duration;
 
 use rand_core::{OsRng, TryRngCore};
-use sgc_trust::{FleetError, VerifiedPeer};
+use sgc_trust::{CLOCK_SKEW, FleetError, VerifiedPeer};
 use sgc_wire::{Credentials, Now, RefuseReason};
 use tracing::{error, info, warn};
 
 use crate::credentials::is_due;
 use crate::fleet_file::{FleetFileError, LockedFleet};
+
+/// Shortest time for which a new certificate holds.
+const VALID_MIN: Duration = Duration::from_secs(60);
 
 /// Answers a member that asks for credentials; reads and writes files. A certificate that has time left is not
 /// replaced: then the chain of the answer is empty. A new one holds for as long as the old one did.
@@ -62,6 +65,8 @@ fn try_answer(file: &Path, peer: &VerifiedPeer, csr: &[u8], now: Now) -> Result<
         return Ok(locked.fleet.credentials_for(&node, Vec::new())?);
     }
     let valid = Duration::from_millis(peer.not_after.0.saturating_sub(peer.not_before.0));
+    // Certificates begin so long before they are made; counted once more each time, they would last ever longer.
+    let valid = valid.saturating_sub(CLOCK_SKEW).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
     let credentials = locked.fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     locked.save()?;

@@ -516,8 +516,12 @@ impl<N: RosNetwork> Core<N> {
                     }
                     LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
                     LinkClose::Revoked => {
-                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate is revoked; its link is closed");
-                        entry.link.close(CloseReason::Revoked);
+                        let peer = entry.link.peer();
+                        let why = self.credentials.objection(peer, now().unix);
+                        let why = why.unwrap_or(CloseReason::Revoked);
+                        info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                        entry.closed_for = Some(why.to_string());
+                        entry.link.close(why);
                     }
                     LinkClose::Expired => {
                         info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
@@ -960,6 +964,7 @@ impl<N: RosNetwork> Core<N> {
             LinkStatus {
                 id: id.0,
                 peer: entry.link.peer().node_id.to_string(),
+                peer_until: entry.link.peer().not_after.to_string(),
                 remote: entry.link.remote().to_string(),
                 url: entry.url.clone(),
                 kex: stats.key_exchange.label(),

@@ -39,6 +39,8 @@ pub struct LinkStatus {
     pub id: u32,
     /// Node id of the peer.
     pub peer: String,
+    /// Until when the certificate that it showed holds, RFC 3339.
+    pub peer_until: String,
     /// Its address.
     pub remote: String,
     /// The URL dialled, if this node dialled.

@@ -6,19 +6,26 @@
 mod lab;
 mod support;
 
+use std::collections::BTreeSet;
 use std::fs;
-use std::time::Instant;
+use std::os::unix::fs::PermissionsExt as _;
+use std::time::{Duration, Instant};
 
 use lab::*;
+use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
-use sgc_trust::Suite;
+use sgc_node::audit::AuditRecord;
+use sgc_node::config::{Config, TokenSource, UseConfig};
+use sgc_node::partners::{TokenRecord, TokenRecords};
+use sgc_trust::{Identity, ShareToken, Suite, TopicSecret, derive_name};
+use sgc_wire::{Metadata, UnixMillis};
 use support::*;
 
 #[test]
 fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     let lab = Lab::new(&["robot", "desk1", "desk2"]);
     let cloud = lab.cloud();
-    let share_it = |c: &mut sgc_node::config::Config| c.shares = vec![share("/chatter", &["desk1", "desk2"])];
+    let share_it = |c: &mut Config| c.shares = vec![share("/chatter", &["desk1", "desk2"])];
     let robot = lab.start("robot", share_it);
     let desk1 = lab.start("desk1", |c| c.uses = vec![uses("/chatter")]);
     let desk2 = lab.start("desk2", |c| c.uses = vec![uses("/chatter")]);
@@ -34,7 +41,7 @@ fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     let list = lab.revoke("desk1");
     let begun = Instant::now();
     assert_eq!(cloud.ask(&AdminRequest::Crl(list))["ok"], true);
-    let is_closed = |r: &sgc_node::audit::AuditRecord| {
+    let is_closed = |r: &AuditRecord| {
         r.event == "link_closed" && r.peer.as_ref() == Some(&revoked) && r.reason.as_deref().is_some()
     };
     wait("its link is closed", || lab.audit("cloud").iter().any(is_closed));
@@ -98,7 +105,7 @@ fn a_recipient_is_taken_out_and_put_back_and_the_other_loses_nothing() {
     assert_eq!(report["changed"][0], "/chatter: who may subscribe changed");
     wait("a new epoch", || lab.epoch("robot") == 2);
     let (first_mark, desk) = (stream.said(), lab.id("desk2").to_string());
-    let cut = |r: &sgc_node::audit::AuditRecord| r.event == "cut" && r.peer.as_ref() == Some(&desk);
+    let cut = |r: &AuditRecord| r.event == "cut" && r.peer.as_ref() == Some(&desk);
     assert!(lab.audit("robot").iter().any(cut));
     let denied = || desk2.route_state().contains("does not share it with this node");
     wait("it is told", denied);
@@ -172,4 +179,403 @@ fn every_suite_carries_messages() {
             assert!(Instant::now() < deadline, "{suite}: it never comes whole");
         }
     }
+}
+
+#[test]
+fn certificates_and_secrets_are_renewed_while_messages_flow() {
+    let lab = Lab::new(&["robot"]);
+    lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
+    lab.enroll("keeper", |_| {});
+    // Certificates begin ten minutes before they are made: less than a third of their time is left.
+    lab.enroll("robot", |request| request.valid = Duration::from_secs(240));
+    lab.enroll("desk", |request| request.valid = Duration::from_secs(240));
+    lab.enroll("thief", |request| request.valid = Duration::from_secs(240));
+    let cloud = lab.cloud();
+    let share_it = |c: &mut Config| c.shares = vec![share("/chatter", &["desk"])];
+    let use_it = |c: &mut Config| c.uses = vec![uses("/chatter")];
+    let until = |node: &str| lab.identity(node).not_after();
+    let old = lab.identity("desk");
+    let (robot, desk) = (lab.start("robot", share_it), lab.start("desk", use_it));
+    let talker = lab.talker("robot", "/chatter");
+    let listener = lab.listener("desk", "/chatter");
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    let stream = Stream::start(talker);
+    stream.more(100);
+    assert_eq!((until("desk"), lab.identity("desk").chain()), (old.not_after(), old.chain()));
+
+    let keeper = lab.start("keeper", |c| c.authority = Some(lab.fleet_file()));
+    wait("both have new certificates", || {
+        until("desk") > old.not_after() && until("robot") > old.not_after()
+    });
+    let new = lab.identity("desk");
+    assert_eq!(fs::metadata(lab.path("desk.identity")).unwrap().permissions().mode() & 0o7777, 0o600);
+    // Ten minutes are not added to it each time.
+    let lasts = |i: &Identity| i.not_after().0 - i.as_peer().not_before.0;
+    assert!(lasts(&new).abs_diff(lasts(&old)) <= 2000, "{} and {} ms", lasts(&new), lasts(&old));
+    let shown = |node: &str| {
+        let (id, until) = (lab.id(node).to_string(), until(node).to_string());
+        let status = cloud.status();
+        let links: Vec<_> = status["links"].as_array().unwrap().iter().filter(|l| l["peer"] == *id).collect();
+        links.len() == 1 && links[0]["peer_until"] == *until
+    };
+    wait("one link each, with the new certificate", || shown("desk") && shown("robot"));
+    stream.more(300);
+    let known = |node: &str, serial: &[u8]| {
+        let read = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+        read.node(&node.parse().unwrap()).unwrap().certificates.iter().any(|c| *c.serial == *serial)
+    };
+    assert!(known("desk", &new.as_peer().cert.serial) && known("desk", &old.as_peer().cert.serial));
+
+    // Whoever was revoked gets nothing more, although its certificate still lets it in where nobody knows.
+    let list = lab.revoke("thief");
+    let thief = lab.start("thief", use_it);
+    wait("it is refused", || {
+        lab.audit("keeper").iter().any(|r| {
+            r.event == "refused"
+                && r.peer == Some(lab.id("thief").to_string())
+                && r.reason.as_deref().unwrap_or_default().contains("revoked")
+        })
+    });
+    wait("it says why", || thief.status()["drops"]["renewal_refused"].as_u64() >= Some(1));
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    wait("it is cut off", || cloud.refused("revoked") > 0);
+
+    // A revocation covers what was renewed.
+    let (_talker, last) = stream.end();
+    // Two ways are made anew, each within a few round trips; what is said meanwhile is not said again.
+    let lost = hears_some(&listener, 1, last);
+    eprintln!("renewal: {lost} of {last} messages lost while the links were replaced");
+    listener.hears_nothing();
+    let list = lab.revoke("desk");
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    let id = lab.id("desk").to_string();
+    wait("the renewed one is cut off, too", || !cloud.peers().contains(&id));
+    drop((robot, desk, thief));
+}
+
+#[test]
+fn a_new_secret_reaches_everyone_but_the_thief() {
+    let lab = Lab::new(&["thief"]);
+    lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
+    ["keeper", "robot", "desk", "late"].iter().for_each(|node| lab.enroll(node, |_| {}));
+    let cloud = lab.cloud();
+    let keeper = lab.start("keeper", |c| c.authority = Some(lab.fleet_file()));
+    let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["*"])]);
+    let both = |c: &mut Config| c.uses = vec![uses("/chatter"), uses("/later")];
+    let desk = lab.start("desk", both);
+    let thief = lab.start("thief", both);
+    let talker = lab.talker("robot", "/chatter");
+    let listener = lab.listener("desk", "/chatter");
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    let name_of = |node: &Node, topic: &str| {
+        let status = node.status();
+        let routes = status["routes"].as_array().unwrap();
+        let route = routes.iter().find(|r| r["topic"] == *topic && r["name"].is_string());
+        route.map(|r| r["name"].as_str().unwrap().to_owned())
+    };
+    let before = name_of(&robot, "/chatter").unwrap();
+    let stream = Stream::start(talker);
+    stream.more(100);
+
+    let list = lab.revoke("thief");
+    lab.with_fleet(|fleet| fleet.rotate_secret(unix_now(), &mut OsRng.unwrap_err()).unwrap());
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    let generation = |node: &str| lab.identity(node).naming_secrets()[0].generation;
+    wait("robot and desk hold generation 2", || generation("robot") == 2 && generation("desk") == 2);
+    wait("the thief is out", || cloud.refused("revoked") > 0);
+    robot.reload(|c| c.shares.push(share("/later", &["*"])));
+    let later = lab.talker("robot", "/later");
+    let hears_later = lab.listener("desk", "/later");
+    later.wait_for_readers(1);
+    warm_up(&later, &[&hears_later]);
+    stream.more(200);
+    let (_talker, last) = stream.end();
+    hears_each(&listener, 1, last);
+    assert_eq!(name_of(&robot, "/chatter"), Some(before.clone()));
+    assert_eq!(name_of(&desk, "/chatter"), Some(before));
+
+    // The name of the new share follows from the new secret, and not from the old one.
+    let metadata = Metadata::topic("robot", "/later", "std_msgs/msg/String");
+    let derived = |node: &str| {
+        let secret = lab.identity(node).naming_secrets()[0].secret.clone();
+        derive_name(&secret, &lab.id("robot"), &metadata).to_string()
+    };
+    let found = name_of(&robot, "/later").unwrap();
+    assert_eq!((derived("robot"), derived("desk")), (found.clone(), found.clone()));
+    assert_eq!(generation("thief"), 1);
+    assert_ne!(derived("thief"), found);
+    assert_eq!(writers(&lab.net("thief"), "/later"), 0);
+
+    // One that was off meanwhile gets it when it is back.
+    assert_eq!(generation("late"), 1);
+    let _late = lab.start("late", both);
+    wait("it holds generation 2", || generation("late") == 2);
+    let late_hears = lab.listener("late", "/later");
+    warm_up(&later, &[&late_hears]);
+    drop((cloud, keeper, desk, thief));
+}
+
+#[test]
+fn a_member_publishes_on_a_topic_of_another() {
+    let lab = Lab::new(&["robot", "desk1", "desk2", "desk3"]);
+    let share_it = |c: &mut Config| {
+        let mut share = share("/cmd", &["desk2", "desk3"]);
+        share.publish = nodes(&["desk1"]);
+        share.type_name = Some("std_msgs/msg/String".into());
+        c.shares = vec![share];
+    };
+    let publish = |c: &mut Config| c.uses = vec![UseConfig { publish: true, ..uses("/cmd") }];
+    let mut cloud = lab.cloud();
+    let mut robot = lab.start("robot", share_it);
+    let mut desk1 = lab.start("desk1", publish);
+    let _desk2 = lab.start("desk2", |c| c.uses = vec![uses("/cmd")]);
+    let desk3 = lab.start("desk3", publish);
+    let talker = lab.talker("desk1", "/cmd");
+    let [at_home, at_robot, at_desk2] = ["desk1", "robot", "desk2"].map(|node| lab.listener(node, "/cmd"));
+    warm_up(&talker, &[&at_robot, &at_desk2]);
+    let stream = Stream::start(talker);
+    stream.more(300);
+    let (talker, last) = stream.end();
+    hears_each(&at_robot, 1, last);
+    hears_each(&at_desk2, 1, last);
+    hears_each(&at_home, 1, last);
+
+    // Who may subscribe may not publish.
+    let intruder = lab.talker("desk3", "/cmd");
+    wait("it is told", || desk3.route_state().contains("does not let this node publish"));
+    intruder.say("not a number");
+
+    // Whoever comes back, it goes on, and nothing comes twice.
+    let mut talker = Some(talker);
+    let mut first = last + 1;
+    for round in ["robot", "desk1", "cloud"] {
+        match round {
+            "robot" => {
+                robot.kill();
+                robot = lab.start("robot", share_it);
+            }
+            "desk1" => {
+                desk1.kill();
+                desk1 = lab.start("desk1", publish);
+            }
+            _ => {
+                cloud.kill();
+                cloud = lab.cloud();
+            }
+        }
+        let stream = Stream::start_from(talker.take().unwrap(), first);
+        for listener in [&at_robot, &at_desk2] {
+            let n = listener.samples.recv_timeout(PATIENCE);
+            assert!(n.is_ok(), "it does not go on after a restart of {round}");
+        }
+        stream.more(200);
+        let (back, last) = stream.end();
+        hears_some(&at_robot, first, last);
+        hears_some(&at_desk2, first, last);
+        hears_each(&at_home, first, last);
+        (talker, first) = (Some(back), last + 1);
+    }
+    at_home.hears_nothing();
+    drop((cloud, robot, desk1));
+}
+
+/// What the owner makes of one of its shares for a partner, as `sgc share-token` does.
+fn token_for(lab: &Lab, topic: &str, partner: &Lab, node: Option<&str>, recorded: bool) -> (ShareToken, u64) {
+    let owner = lab.identity("robot");
+    let mut share = share(topic, &["desk"]);
+    share.type_name = Some("std_msgs/msg/String".into());
+    let metadata = sgc_node::policy::metadata(&share, "robot");
+    let token = ShareToken {
+        owner: owner.node_id(),
+        owner_name: owner.node_name().clone(),
+        ca: owner.anchors().certificates().next().unwrap().clone(),
+        secret: TopicSecret::derive(&owner.naming_secrets()[0].secret, &metadata),
+        metadata,
+        routers: vec![lab.url()],
+        expires: UnixMillis(unix_now().0 + 3_600_000),
+    };
+    let record = TokenRecord {
+        id: 0,
+        topic: topic.to_owned(),
+        type_name: "std_msgs/msg/String".to_owned(),
+        name: token.name().to_string(),
+        ca: partner.ca().1,
+        ca_pem: fs::read_to_string(partner.ca().0).unwrap(),
+        node: node.map(|node| partner.id(node).to_string()),
+        created: unix_now().0,
+        expires: token.expires.0,
+    };
+    let state = lab.state("robot");
+    let id = recorded.then(|| TokenRecords::change(&state, |r| r.add(record, unix_now())).unwrap());
+    (token, id.unwrap_or(0))
+}
+
+#[test]
+fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let acme = lab.beside("acme");
+    ["arm", "other"].iter().for_each(|node| acme.enroll(node, |_| {}));
+    let cloud = lab.cloud();
+    let robot =
+        lab.start("robot", |c| c.shares = vec![share("/pose", &["desk"]), share("/private", &["desk"])]);
+    let _desk = lab.start("desk", |c| c.uses = vec![uses("/pose")]);
+    let (talker, private) = (lab.talker("robot", "/pose"), lab.talker("robot", "/private"));
+    let (token, id) = token_for(&lab, "/pose", &acme, Some("arm"), true);
+    // As if the secret of another topic had become known: it admits nobody.
+    let (leaked, _) = token_for(&lab, "/private", &acme, Some("arm"), false);
+    assert_eq!(robot.reload(|_| {})["changed"][0], "/pose: who may subscribe changed");
+    let with = |tokens: &[&ShareToken]| {
+        let all: Vec<_> = tokens.iter().map(|t| TokenSource::Text(Box::new((*t).clone()))).collect();
+        move |c: &mut Config| c.tokens = all.clone()
+    };
+    let arm = acme.start("arm", with(&[&token, &leaked]));
+    let other = acme.start("other", with(&[&token]));
+    let (arm_id, other_id) = (acme.id("arm").to_string(), acme.id("other").to_string());
+
+    // A router that does not trust that CA lets nobody in, until it is told to while it runs.
+    wait("they are refused", || cloud.refused("other_ca") >= 2);
+    assert!(cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
+    let report = cloud.reload(|c| c.trust = vec![acme.ca().0]);
+    assert_eq!(report["changed"][0], "nodes of another CA may link to this one");
+    assert_eq!(report["needs_restart"].as_array().map(Vec::len), Some(0));
+    wait("they are let in", || cloud.peers().is_superset(&[arm_id.clone(), other_id.clone()].into()));
+
+    let (at_desk, at_arm) = (lab.listener("desk", "/pose"), acme.listener("arm", "/pose"));
+    let (at_other, peeks) = (acme.listener("other", "/pose"), acme.listener("arm", "/private"));
+    warm_up(&talker, &[&at_desk, &at_arm]);
+    let stream = Stream::start(talker);
+    stream.more(100);
+    private.say("for the fleet alone");
+    let state_of = |node: &Node, topic: &str| {
+        let status = node.status();
+        let route = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == *topic).cloned();
+        route.unwrap()["state"].as_str().unwrap().to_owned()
+    };
+    wait("another node with the token is refused", || other.route_state().starts_with("refused"));
+    wait("another topic is refused", || state_of(&arm, "/private").starts_with("refused"));
+    let refused = |peer: &str| {
+        let by = |r: &AuditRecord| r.event == "refused" && r.peer.as_deref() == Some(peer);
+        lab.audit("robot").iter().any(by)
+    };
+    assert!(refused(&arm_id) && refused(&other_id));
+    stream.more(100);
+
+    // Withdrawn: cut off at once, and nobody else notices.
+    TokenRecords::change(&lab.state("robot"), |records| records.withdraw(id)).unwrap();
+    robot.reload(|_| {});
+    wait("a new epoch", || lab.epoch("robot") >= 2);
+    let mark = stream.said();
+    wait("it is told", || state_of(&arm, "/pose").contains("refused"));
+    stream.more(300);
+    let (_talker, last) = stream.end();
+    hears_each(&at_desk, 1, last);
+    at_desk.hears_nothing();
+    let got = heard(&at_arm);
+    assert!(got.iter().zip(1..).all(|(n, expected)| *n == expected), "{got:?}");
+    assert!((100..=mark).contains(got.last().unwrap()), "it heard {:?}, of {mark}", got.last());
+    at_other.hears_nothing();
+    peeks.hears_nothing();
+
+    // The router forgets that CA: its nodes are cut off, and let in no more.
+    let before = cloud.refused("other_ca");
+    cloud.reload(|c| c.trust = vec![]);
+    wait("they are cut off", || cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
+    wait("they are refused", || cloud.refused("other_ca") > before);
+    let closed = |r: &AuditRecord| r.event == "link_closed" && r.peer.as_deref() == Some(&arm_id);
+    let reason = lab.audit("cloud").into_iter().rfind(closed).unwrap().reason.unwrap();
+    assert!(reason.contains("no longer trusted"), "{reason}");
+}
+
+#[test]
+fn the_audit_log_tells_what_happened_and_no_secret() {
+    let lab = Lab::new(&["robot", "desk1", "desk2", "desk3"]);
+    let acme = lab.beside("acme");
+    acme.enroll("arm", |_| {});
+    let cloud = lab.cloud_with(|c| c.trust = vec![acme.ca().0]);
+    let robot = lab.start("robot", |c| {
+        c.shares = vec![share("/pose", &["desk1", "desk2", "desk3"])];
+        c.trust = vec![acme.ca().0];
+    });
+    let listeners = ["desk1", "desk2", "desk3"].map(|node| {
+        let node_runs = lab.start(node, |c| c.uses = vec![uses("/pose")]);
+        (node_runs, lab.listener(node, "/pose"))
+    });
+    let talker = lab.talker("robot", "/pose");
+    warm_up(&talker, &[&listeners[0].1, &listeners[1].1, &listeners[2].1]);
+    let (token, _) = token_for(&lab, "/pose", &acme, Some("arm"), false);
+    let arm = acme.start("arm", |c| c.tokens = vec![TokenSource::Text(Box::new(token.clone()))]);
+    wait("a refusal", || arm.route_state().starts_with("refused"));
+    robot.reload(|c| c.shares[0].to = nodes(&["desk1", "desk3"]));
+    let list = lab.revoke("desk3");
+    assert_eq!(robot.ask(&AdminRequest::Crl(list))["ok"], true);
+    wait("two new epochs", || lab.epoch("robot") == 3);
+    wait("the router knows", || lab.audit("cloud").iter().any(|r| r.event == "crl"));
+    // What is queued is written once it has stopped.
+    robot.stop();
+    cloud.stop();
+
+    let is = |event: &str, peer: &str| {
+        let is = |r: &AuditRecord| r.event == event && r.peer.as_deref() == Some(peer);
+        assert!(lab.audit("robot").iter().any(is), "{event} {peer} is not in the log");
+    };
+    let [one, two, three] = ["desk1", "desk2", "desk3"].map(|node| lab.id(node).to_string());
+    is("granted", &one);
+    is("granted", &two);
+    is("refused", &acme.id("arm").to_string());
+    is("cut", &two);
+    is("revoked", &three);
+    for event in ["started", "link_up", "epoch", "crl", "reload", "stopped"] {
+        assert!(lab.audit("robot").iter().any(|r| r.event == event), "{event} is not in the log");
+    }
+
+    // Nothing that looks like a key is in it but the names of what is shared and of who is there.
+    let mut known: BTreeSet<String> =
+        ["robot", "cloud", "desk1", "desk2", "desk3"].map(|node| lab.id(node).to_string()).into();
+    known.insert(acme.id("arm").to_string());
+    known.insert(token.name().to_string());
+    for node in ["robot", "cloud"] {
+        let log = fs::read_to_string(lab.state(node).join("audit.jsonl")).unwrap();
+        assert_eq!(
+            fs::metadata(lab.state(node).join("audit.jsonl")).unwrap().permissions().mode() & 0o777,
+            0o600
+        );
+        for line in log.lines() {
+            serde_json::from_str::<serde_json::Value>(line).unwrap();
+        }
+        let is_key = |c: char| c.is_ascii_alphanumeric() || "+/-_=".contains(c);
+        let long = log.split(|c| !is_key(c)).filter(|word| word.len() >= 32);
+        for word in long {
+            assert!(known.contains(word), "{node}: {word}");
+        }
+    }
+}
+
+#[test]
+fn nodes_of_a_post_quantum_fleet_link_and_grant_so() {
+    let lab = Lab::empty("lab", begin());
+    lab.enroll("before", |_| {});
+    lab.with_fleet(|fleet| fleet.set_post_quantum(true, unix_now()).unwrap());
+    lab.enroll("cloud", |request| request.router = true);
+    ["robot", "desk"].iter().for_each(|node| lab.enroll(node, |_| {}));
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["*"])]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/chatter")]);
+    let before = lab.start("before", |c| c.uses = vec![uses("/chatter")]);
+    let talker = lab.talker("robot", "/chatter");
+    let listener = lab.listener("desk", "/chatter");
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    for node in [&robot, &desk, &cloud] {
+        let status = node.status();
+        let links = status["links"].as_array().unwrap();
+        assert!(!links.is_empty() && links.iter().all(|l| l["kex"] == "X25519MLKEM768"), "{links:?}");
+    }
+    // One whose identity does not know of it asks for grants that a recording could tell later.
+    wait("it gets nothing", || {
+        cloud.refused("key_exchange") > 0
+            || before.status()["routes"][0]["state"].as_str().unwrap().contains("refuse")
+    });
+    assert_eq!(writers(&lab.net("before"), "/chatter"), 0);
 }

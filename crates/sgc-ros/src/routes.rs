@@ -685,6 +685,9 @@ impl<R: RngCore> Routes<R> {
             } else if routes.is_empty() {
                 let state = match self.owners.get(&rule.owner) {
                     Some(state) => format!("{} {state}", rule.owner_name),
+                    None if rule.direction == Direction::Publish => {
+                        format!("{} does not let this node publish on it (yet)", rule.owner_name)
+                    }
                     None => format!("{} does not share it with this node (yet)", rule.owner_name),
                 };
                 all.push(status(rule.type_name.clone(), None, state));

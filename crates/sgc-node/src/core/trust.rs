@@ -76,7 +76,8 @@ impl<N: RosNetwork> Core<N> {
     /// Is this from here on: with another certificate, or other secrets for names made later.
     pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
         let now = now();
-        let recertified = identity.chain() != self.identity.chain();
+        // A link shows a certificate and no secret: it stays if that is the same.
+        let shows_another = self.identity.chain() != identity.chain();
         self.identity = identity.clone();
         self.renew_due = Some(renew_at(&identity, now));
         if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
@@ -84,7 +85,7 @@ impl<N: RosNetwork> Core<N> {
         }
         self.credentials.set_identity(identity.clone());
         self.endpoint.set_identity(now, identity);
-        if recertified {
+        if shows_another {
             self.redial.send_replace(());
         }
     }
@@ -94,12 +95,12 @@ impl<N: RosNetwork> Core<N> {
         let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
         self.router.set_anchors(anchors.clone());
         self.set_anchors(anchors);
-        // On new links neighbours say again what they know of nodes that nobody here believed before.
-        self.redial.send_replace(());
     }
 
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        let lists = anchors.crls().count();
+        self.audit.write(AuditRecord::new(AuditEvent::Crl).reason(format!("{lists} lists are in force")));
         self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.endpoint.set_anchors(now(), anchors);

@@ -14,6 +14,8 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::LockedFleet;
 use sgc_node::audit::{self, AuditRecord};
@@ -62,6 +64,16 @@ impl Lab {
 
     pub fn fleet_file(&self) -> PathBuf {
         self.fleet.clone()
+    }
+
+    /// The file with its CA certificate, PEM, and the CA's fingerprint.
+    pub fn ca(&self) -> (PathBuf, String) {
+        let path = self.path("ca.pem");
+        let fleet = sgc_node::read_fleet(&self.fleet).unwrap();
+        let base64 = STANDARD.encode(fleet.ca_certificate());
+        let text = format!("-----BEGIN CERTIFICATE-----\n{base64}\n-----END CERTIFICATE-----\n");
+        fs::write(&path, text).unwrap();
+        (path, fleet.anchors().fingerprints().next().unwrap().to_string())
     }
 
     /// Changes the fleet's file, as `sgc fleet` does.
@@ -173,7 +185,11 @@ pub fn all() -> Qos {
 }
 
 pub fn nodes(names: &[&str]) -> Vec<Recipient> {
-    names.iter().map(|name| Recipient::Node(name.parse().unwrap())).collect()
+    let recipient = |name: &&str| match *name {
+        "*" => Recipient::Everyone,
+        name => Recipient::Node(name.parse().unwrap()),
+    };
+    names.iter().map(recipient).collect()
 }
 
 pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
@@ -254,6 +270,20 @@ fn number(payload: &[u8]) -> u64 {
 /// What was heard so far of a stream.
 pub fn heard(listener: &Listener) -> Vec<u64> {
     listener.drain().iter().map(|b| number(b)).filter(|n| *n > 0).collect()
+}
+
+/// Hears the rest of a stream up to `last`, each number once and in order; how many do not come.
+pub fn hears_some(listener: &Listener, first: u64, last: u64) -> u64 {
+    let (mut next, mut lost) = (first, 0);
+    while next <= last {
+        let n = number(&listener.samples.recv_timeout(PATIENCE).expect("the last one"));
+        if n > 0 {
+            assert!(n >= next, "{n} comes after {}", next - 1);
+            lost += n - next;
+            next = n + 1;
+        }
+    }
+    lost
 }
 
 /// Hears every number from `first` to `last` once and in order.
