@@ -12,7 +12,7 @@ use sgc_wire::{
     Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceOffer, TopicGrant,
 };
 
-use crate::SourceProgress;
+use crate::{SinkProgress, SourceProgress};
 
 /// What to share.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -107,6 +107,8 @@ pub(crate) struct Share {
     pub(crate) rotate_at: Instant,
     /// This node's own sources.
     pub(crate) own: Vec<Arc<SourceProgress>>,
+    /// What this node has heard of others' sources.
+    pub(crate) heard: Option<Arc<SinkProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
     /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
     pub(crate) told_own: bool,
@@ -127,8 +129,11 @@ impl Share {
                 Request::Subscribe { .. } | Request::Renew { .. } => None,
             })
             .collect();
-        let others =
-            others.into_iter().map(|(source, key)| SourceAnnounce { source, key, oldest: 0, next: 0 });
+        // They keep no history; what this node has heard of them is past to whoever is told of them now.
+        let others = others.into_iter().map(|(source, key)| {
+            let next = self.heard.as_ref().map_or(0, |heard| heard.newest(&source)).saturating_add(1);
+            SourceAnnounce { source, key, oldest: next, next }
+        });
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {
             epoch: epoch.number,
