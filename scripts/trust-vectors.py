@@ -4,6 +4,8 @@
 Without arguments it checks crates/sgc-trust/tests/vectors/sealing.json, which the tests of sgc-trust check too.
 With --write it makes that file anew; the packets that Rust signs with RSA are then to be filled in with
     cargo test -p sgc-trust --test vectors -- --ignored --nocapture | scripts/trust-vectors.py --take
+It also checks grants.json beside it, which --write-grants makes: grants sealed with HPKE (RFC 9180, base mode), put
+together here from HKDF, X25519 and AES-GCM. Of X-Wing the shared secret is the draft's own, from xwing.txt.
 Rules: docs/spec/trust.md, docs/spec/wire.md.
 """
 import hashlib
@@ -14,9 +16,11 @@ import struct
 import sys
 
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ed25519, padding, rsa
+from cryptography.hazmat.primitives.asymmetric import ed25519, padding, rsa, x25519
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
+GRANTS = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/grants.json"
+XWING = GRANTS.with_name("xwing.txt")
 FILE = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/sealing.json"
 SUITES = {
     1: ("group", AESGCM, None),
@@ -157,7 +161,81 @@ def check_signed(suite, key, given):
         verify(key, payload[len(rest):], message)
 
 
+class Hpke:
+    """RFC 9180 with HKDF-SHA256 and AES-256-GCM, base mode, one message."""
+
+    def __init__(self, kem):
+        self.kem_id = b"KEM" + struct.pack(">H", kem)
+        self.id = b"HPKE" + struct.pack(">HHH", kem, 1, 2)
+
+    @staticmethod
+    def extract(suite, salt, label, ikm):
+        return hmac.digest(salt or bytes(32), b"HPKE-v1" + suite + label + ikm, "sha256")
+
+    @staticmethod
+    def expand(suite, prk, label, info, length):
+        """At most one block."""
+        info = struct.pack(">H", length) + b"HPKE-v1" + suite + label + info
+        return hmac.digest(prk, info + b"\x01", "sha256")[:length]
+
+    def dh_secret(self, dh, enc, public):
+        """DHKEM's ExtractAndExpand (4.1)."""
+        prk = self.extract(self.kem_id, b"", b"eae_prk", dh)
+        return self.expand(self.kem_id, prk, b"shared_secret", enc + public, 32)
+
+    def seal(self, shared, info, aad, text):
+        """KeySchedule (5.1) and Seal (5.2)."""
+        context = b"\x00" + self.extract(self.id, b"", b"psk_id_hash", b"") + self.extract(self.id, b"", b"info_hash", info)
+        secret = self.extract(self.id, shared, b"secret", b"")
+        key = self.expand(self.id, secret, b"key", context, 32)
+        nonce = self.expand(self.id, secret, b"base_nonce", context, 12)
+        return AESGCM(key).encrypt(nonce, text, aad)
+
+
+def raw_public(private):
+    return private.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
+
+
+def topic_grant():
+    """GrantContent::Topic with one source and no entry."""
+    source = SOURCE + struct.pack(">I", 32) + b"\xdd" * 32 + struct.pack(">QQ", 5, 9)
+    return b"\x00" + struct.pack(">IB", EPOCH, 3) + TOPIC_KEY + struct.pack(">I", 1) + source + b"\x00"
+
+
+def xwing_vector():
+    """The first vector of the draft."""
+    lines = [line.split(" = ") for line in XWING.read_text().splitlines() if " = " in line]
+    return {name: bytes.fromhex(value) for name, value in reversed(lines[:6])}
+
+
+def grants():
+    text, serial = topic_grant(), 0x0102030405060708
+    info, aad = b"sgc grant v1" + NAME + SINK, struct.pack(">Q", serial)
+    ours, fresh = (x25519.X25519PrivateKey.from_private_bytes(bytes([b]) * 32) for b in (0x11, 0x22))
+    enc, public = raw_public(fresh), raw_public(ours)
+    kem = Hpke(0x0020)
+    sealed = kem.seal(kem.dh_secret(fresh.exchange(ours.public_key()), enc, public), info, aad, text)
+    out = [("x25519", b"\x11" * 32, public, enc, sealed)]
+    v = xwing_vector()
+    ek = v["pk"][:1184]
+    private = v["sk_m_s"] + ek + hashlib.sha3_256(ek).digest() + v["sk_m_z"] + v["sk_x"]
+    out.append(("xwing", private, v["pk"], v["ct"], Hpke(0x647A).seal(v["ss"], info, aad, text)))
+    names = ("kem", "private", "public", "enc", "sealed")
+    return {
+        "note": "Keys of tests, which protect nothing.",
+        "serial": serial,
+        "content": text.hex(),
+        "grants": [dict(zip(names, [kem] + [b.hex() for b in rest])) for kem, *rest in out],
+    }
+
+
+def write_grants():
+    GRANTS.write_text(json.dumps(grants(), indent=1) + "\n")
+
+
 def check():
+    assert json.loads(GRANTS.read_text()) == grants(), "grants"
+    print(f"2 kinds of grants agree with {GRANTS.name}")
     content = json.loads(FILE.read_text())
     assert [v["suite"] for v in content["suites"]] == [name for name, _, _ in SUITES.values()]
     for (suite, (name, _, kind)), vector in zip(SUITES.items(), content["suites"]):
@@ -178,4 +256,4 @@ def check():
 
 
 if __name__ == "__main__":
-    {(): check, ("--write",): write, ("--take",): take}[tuple(sys.argv[1:])]()
+    {(): check, ("--write",): write, ("--take",): take, ("--write-grants",): write_grants}[tuple(sys.argv[1:])]()

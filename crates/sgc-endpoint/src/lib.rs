@@ -23,5 +23,5 @@ pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
 pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
 pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
-pub use sink::{Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits};
+pub use sink::{Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};

@@ -13,9 +13,9 @@ use sgc_wire::{
     Role, SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
 };
 
-use crate::SourceProgress;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
+use crate::{SinkProgress, SourceProgress};
 
 /// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
 /// epochs whose packets are still under way.
@@ -43,6 +43,7 @@ impl Endpoint {
             rotation: None,
             rotate_at: now.instant + self.config.limits.rotate_every,
             own: Vec::new(),
+            heard: None,
             sinks: BTreeMap::new(),
             left: BTreeMap::new(),
             told_own: false,
@@ -94,6 +95,14 @@ impl Endpoint {
         }
         share.own = sources;
         self.regrant(*name);
+    }
+
+    /// How far this node's own sink of a share is with the sources of others: who is granted from here on is told
+    /// that what was heard is past.
+    pub fn set_own_sink(&mut self, name: &Name, progress: Arc<SinkProgress>) {
+        if let Some(share) = self.shares.shares.get_mut(name) {
+            share.heard = Some(progress);
+        }
     }
 
     /// Ends a share: withdrawn everywhere, its sinks told.

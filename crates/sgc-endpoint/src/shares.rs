@@ -12,7 +12,7 @@ use sgc_wire::{
     Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::SourceProgress;
+use crate::{SinkProgress, SourceProgress};
 
 /// What to share.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -107,6 +107,8 @@ pub(crate) struct Share {
     pub(crate) rotate_at: Instant,
     /// This node's own sources.
     pub(crate) own: Vec<Arc<SourceProgress>>,
+    /// What this node has heard of others' sources.
+    pub(crate) heard: Option<Arc<SinkProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
     /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
     pub(crate) told_own: bool,
@@ -118,11 +120,19 @@ impl Share {
     /// What is granted of an epoch to one who asked with `request`.
     pub(crate) fn grant(&self, epoch: &Epoch, peer: Option<&GrantedSink>) -> TopicGrant {
         let own = self.own.iter().map(|s| s.announce());
-        let others = self.sinks.values().filter_map(|s| match &s.request {
-            Request::Publish { offer } => {
-                Some(SourceAnnounce { source: offer.source, key: offer.key.clone(), oldest: 0, next: 0 })
-            }
-            Request::Subscribe { .. } | Request::Renew { .. } => None,
+        // By source: one that moved to another way may have two places for a while.
+        let others: BTreeMap<_, _> = self
+            .sinks
+            .values()
+            .filter_map(|s| match &s.request {
+                Request::Publish { offer } => Some((offer.source, offer.key.clone())),
+                Request::Subscribe { .. } | Request::Renew { .. } => None,
+            })
+            .collect();
+        // They keep no history; what this node has heard of them is past to whoever is told of them now.
+        let others = others.into_iter().map(|(source, key)| {
+            let next = self.heard.as_ref().map_or(0, |heard| heard.newest(&source)).saturating_add(1);
+            SourceAnnounce { source, key, oldest: next, next }
         });
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {

@@ -4,6 +4,8 @@
 //! first. A packet that is refused leaves no state.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite, opened_bytes};
@@ -137,6 +139,21 @@ impl SinkDrop {
     }
 }
 
+/// How far a sink is with each source, to be read without its lock.
+#[derive(Debug, Default)]
+pub struct SinkProgress {
+    newest: Mutex<BTreeMap<SourceId, Arc<AtomicU64>>>,
+}
+
+impl SinkProgress {
+    /// The greatest number of a message of the source that was delivered; 0 before any, or if the sink does not
+    /// know the source.
+    pub fn newest(&self, source: &SourceId) -> u64 {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        newest.get(source).map_or(0, |n| n.load(Acquire))
+    }
+}
+
 /// What the next grant may explain.
 enum Unexplained {
     Epoch,
@@ -153,6 +170,8 @@ struct SourceState {
     /// For packets to this sink, of the epoch seen last.
     addressed: Option<SourceKey>,
     window: ReplayWindow,
+    /// The window's newest, for [`SinkProgress`].
+    newest: Arc<AtomicU64>,
     /// Packets to all below it are replays of what was published before this sink was told of the source.
     next: u64,
     /// History below it was given up by the source before this sink was told of it.
@@ -178,6 +197,7 @@ pub struct Sink {
     parking: Parking,
     incomplete: u64,
     scratch: Vec<u8>,
+    progress: Arc<SinkProgress>,
 }
 
 impl Sink {
@@ -194,6 +214,7 @@ impl Sink {
             parking: Parking::default(),
             incomplete: 0,
             scratch: Vec::new(),
+            progress: Arc::default(),
         };
         sink.announce(grant.sources, None);
         sink
@@ -264,6 +285,7 @@ impl Sink {
         self.epochs.retain(|known| known.epoch == newest);
         self.drop_old_keys();
         self.sources.retain(|_, source| source.last_epoch.is_none_or(|last| last >= newest));
+        self.list_progress();
     }
 
     /// The announced sources whose history has not arrived yet.
@@ -307,6 +329,11 @@ impl Sink {
         self.incomplete
     }
 
+    /// How far it is with each source, to be read while another thread feeds it.
+    pub fn progress(&self) -> Arc<SinkProgress> {
+        self.progress.clone()
+    }
+
     /// Packets that wait for a grant.
     pub fn parked(&self) -> usize {
         self.parking.len()
@@ -345,6 +372,13 @@ impl Sink {
                 }
             }
         }
+        self.list_progress();
+    }
+
+    /// Lists the sources that are known by now.
+    fn list_progress(&self) {
+        let newest = self.sources.iter().map(|(id, s)| (*id, s.newest.clone())).collect();
+        *self.progress.newest.lock().unwrap_or_else(PoisonError::into_inner) = newest;
     }
 
     /// Drops a source that is no longer announced, if there are too many.
@@ -489,6 +523,7 @@ impl Sink {
         };
         let Some((head, payload)) = complete else { return Ok(Delivery::Incomplete) };
         source.window.accept(header.seq);
+        source.newest.fetch_max(header.seq, Release);
         if header.reliable {
             // A reliable flow is in order: what is older and incomplete will never be complete.
             self.incomplete += source.partials.give_up(header.seq);
@@ -516,6 +551,7 @@ impl SourceState {
             keys: Vec::new(),
             addressed: None,
             window: ReplayWindow::default(),
+            newest: Arc::default(),
             next: announce.next,
             oldest: announce.oldest,
             partials: Partials::default(),

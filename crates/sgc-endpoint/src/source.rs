@@ -63,6 +63,7 @@ pub struct SourceProgress {
     oldest: AtomicU64,
     /// Messages published before the present epoch.
     epoch_start: AtomicU64,
+    signatures: AtomicU64,
 }
 
 impl SourceProgress {
@@ -93,6 +94,11 @@ impl SourceProgress {
     pub fn published_in_epoch(&self) -> u64 {
         let start = self.epoch_start.load(Acquire);
         self.published().saturating_sub(start)
+    }
+
+    /// Signatures made: one for each batch.
+    pub fn signatures(&self) -> u64 {
+        self.signatures.load(Acquire)
     }
 }
 
@@ -143,6 +149,7 @@ impl Source {
             next: AtomicU64::new(1),
             oldest: AtomicU64::new(1),
             epoch_start: AtomicU64::new(0),
+            signatures: AtomicU64::new(0),
         };
         Some(Self {
             config,
@@ -198,6 +205,7 @@ impl Source {
             return;
         }
         let signed = self.batch.sign(&self.message_key);
+        self.progress.signatures.fetch_add(1, Release);
         for (index, (header, mut payload)) in self.unsigned.drain(..).enumerate() {
             signed.put_trailer(index, &mut payload);
             emit(Packet { header, payload: Bytes::from(payload).into() });

@@ -993,7 +993,8 @@ impl<N: RosNetwork> Core<N> {
                         let published = self.shares.get(&n).map(|s| s.published());
                         published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
                     });
-                    RouteLine::new(route, messages)
+                    let share = route.name.and_then(|n| self.shares.get(&n));
+                    RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()))
                 })
                 .collect(),
             names: names.collect(),

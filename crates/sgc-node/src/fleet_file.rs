@@ -15,7 +15,7 @@ use crate::state;
 #[derive(Debug, thiserror::Error)]
 pub enum FleetFileError {
     /// It cannot be read or locked.
-    #[error("fleet {}: {source}", path.display())]
+    #[error("cannot read {}: {source}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -23,7 +23,7 @@ pub enum FleetFileError {
         source: io::Error,
     },
     /// Others can read it.
-    #[error("fleet {}: others can read it (mode {mode:o}); it holds the key of the CA: chmod 600 it", path.display())]
+    #[error("{}: its mode {mode:04o} lets others at the CA's private key: chmod 600 {}", path.display(), path.display())]
     Exposed {
         /// The file.
         path: PathBuf,
@@ -31,7 +31,7 @@ pub enum FleetFileError {
         mode: u32,
     },
     /// It holds no fleet.
-    #[error("fleet {}: {source}", path.display())]
+    #[error("{}: {source}", path.display())]
     Content {
         /// The file.
         path: PathBuf,
@@ -39,7 +39,7 @@ pub enum FleetFileError {
         source: FleetError,
     },
     /// It cannot be replaced; nothing changed.
-    #[error("fleet {}: it could not be written, and is as it was: {source}", path.display())]
+    #[error("{}: it could not be written, and is as it was: {source}", path.display())]
     Write {
         /// The file.
         path: PathBuf,
@@ -60,24 +60,37 @@ pub struct LockedFleet {
 impl LockedFleet {
     /// Waits for the lock, then reads the file.
     pub fn open(path: &Path) -> Result<Self, FleetFileError> {
-        let failed = |source| FleetFileError::Read { path: path.to_owned(), source };
-        let lock = loop {
-            let file = fs::File::open(path).map_err(failed)?;
-            flock(&file, FlockOperation::LockExclusive).map_err(|e| failed(e.into()))?;
-            // Whoever had the lock may have put another file in the place of this one meanwhile.
-            let locked = file.metadata().map_err(failed)?;
-            let named = fs::metadata(path).map_err(failed)?;
-            if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
-                break file;
-            }
-        };
+        let lock = lock(path).map_err(|source| FleetFileError::Read { path: path.to_owned(), source })?;
         Ok(Self { fleet: read_fleet(path)?, path: path.to_owned(), _lock: lock })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What went wrong with the fleet, said of its file.
+    pub fn error(&self, source: FleetError) -> FleetFileError {
+        FleetFileError::Content { path: self.path.clone(), source }
     }
 
     /// Replaces the file with the fleet as it is now, whole or not at all.
     pub fn save(&self) -> Result<(), FleetFileError> {
         state::replace(&self.path, self.fleet.to_text().as_bytes())
             .map_err(|source| FleetFileError::Write { path: self.path.clone(), source })
+    }
+}
+
+/// Opens a file for changes that no other program makes at the same time: it is locked until it is closed.
+fn lock(path: &Path) -> io::Result<fs::File> {
+    loop {
+        let file = fs::File::open(path)?;
+        flock(&file, FlockOperation::LockExclusive)?;
+        // Whoever had the lock may have put another file in the place of this one meanwhile.
+        let (locked, named) = (file.metadata()?, fs::metadata(path)?);
+        if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
+            return Ok(file);
+        }
     }
 }
 
@@ -92,4 +105,32 @@ pub fn read_fleet(path: &Path) -> Result<Fleet, FleetFileError> {
     let bytes = Zeroizing::new(bytes.ok_or_else(|| failed(io::ErrorKind::NotFound.into()))?);
     let text = std::str::from_utf8(&bytes).map_err(|e| failed(io::Error::other(e)))?;
     Fleet::parse(text).map_err(|source| FleetFileError::Content { path: path.to_owned(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    #[test]
+    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        state::replace(&path, b"1").unwrap();
+        let first = lock(&path).unwrap();
+        let waiting = std::thread::spawn({
+            let path = path.clone();
+            move || lock(&path).unwrap().metadata().unwrap().ino()
+        });
+        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
+        let inode = format!(":{} ", first.metadata().unwrap().ino());
+        let waits = |line: &str| line.contains("->") && line.contains(&inode);
+        while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {
+            std::thread::yield_now();
+        }
+        state::replace(&path, b"2").unwrap();
+        drop(first);
+        assert_eq!(waiting.join().unwrap(), fs::metadata(&path).unwrap().ino());
+    }
 }

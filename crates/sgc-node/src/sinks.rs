@@ -10,7 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{Delivery, Message, Sink, SinkDrop, SinkLimits};
+use sgc_endpoint::{Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 use sgc_ros::{RosError, RosWriter, SampleKind};
 use sgc_router::LinkId;
 use sgc_wire::{MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
@@ -103,6 +103,11 @@ impl LocalSink {
             this.lock().releases -= 1;
             drop(turn);
         });
+    }
+
+    /// How far it is with each source; `None` before the first grant.
+    pub(crate) fn progress(&self) -> Option<Arc<SinkProgress>> {
+        self.lock().sink.as_ref().map(Sink::progress)
     }
 
     /// Drops the keys of all epochs but the present one.

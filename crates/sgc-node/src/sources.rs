@@ -309,6 +309,11 @@ impl LocalShare {
         self.closed.store(true, Relaxed);
     }
 
+    /// Signatures that its present sources made: one for each batch of packets.
+    pub(crate) fn signatures(&self) -> u64 {
+        self.map.load().slots().map(|slot| slot.progress.signatures()).sum()
+    }
+
     /// Messages published.
     pub(crate) fn published(&self) -> u64 {
         self.published.load(Relaxed)

@@ -73,10 +73,13 @@ pub struct RouteLine {
     pub state: String,
     /// Messages published or delivered.
     pub messages: u64,
+    /// Signatures made for what its present publishers published; less than messages under load, since one covers a
+    /// batch. 0 in the `group` suites.
+    pub signatures: u64,
 }
 
 impl RouteLine {
-    pub(crate) fn new(route: RouteStatus, messages: Option<u64>) -> Self {
+    pub(crate) fn new(route: RouteStatus, messages: Option<u64>, signatures: u64) -> Self {
         Self {
             direction: route.direction,
             topic: route.topic,
@@ -85,6 +88,7 @@ impl RouteLine {
             owner: route.owner,
             state: route.state,
             messages: messages.unwrap_or(0),
+            signatures,
         }
     }
 }

@@ -98,6 +98,9 @@ impl Running {
             Some(sink) => sink.regrant(own, grant, |delivery| released.push(delivery)),
             None => local.sink = Some(Sink::new(name, own, grant, false, SinkLimits::default())),
         }
+        if let Some(sink) = &local.sink {
+            self.endpoint.set_own_sink(&name, sink.progress());
+        }
         local.retire_at = Some(now.instant + EPOCH_GRACE);
         for delivery in released {
             self.delivered(now, name, delivery);

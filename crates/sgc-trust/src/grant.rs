@@ -1,5 +1,6 @@
 //! Answers to joins: a grant's content sealed to the fresh key that the request carried (HPKE, RFC 9180).
 
+use aws_lc_rs::agreement;
 use bytes::Bytes;
 use rustls::crypto::aws_lc_rs::hpke::DH_KEM_X25519_HKDF_SHA256_AES_256 as HPKE;
 use rustls::crypto::hpke::{EncapsulatedSecret, Hpke, HpkePrivateKey, HpkePublicKey};
@@ -75,6 +76,22 @@ impl ReplyKey {
                 let (private, public) =
                     xwing::PrivateKey::generate().expect("the provider makes X-Wing keys or aborts");
                 Self { public: public.into(), private: Private::XWing(Box::new(private)) }
+            }
+        }
+    }
+
+    /// A key that is known beforehand, for tests and vectors; joins make fresh ones. X25519: its 32 bytes. X-Wing: the
+    /// decapsulation key of ML-KEM-768 (FIPS 203, 7.1; 2400 bytes), then the 32 of X25519. `None` if it is no such key.
+    pub fn from_private(kem: Kem, private: &[u8]) -> Option<Self> {
+        match kem {
+            Kem::X25519 => {
+                let key = agreement::PrivateKey::from_private_key(&agreement::X25519, private).ok()?;
+                let public = Bytes::copy_from_slice(key.compute_public_key().ok()?.as_ref());
+                Some(Self { public, private: Private::X25519(private.to_vec().into()) })
+            }
+            Kem::XWing => {
+                let (key, public) = xwing::PrivateKey::from_bytes(private)?;
+                Some(Self { public: public.into(), private: Private::XWing(Box::new(key)) })
             }
         }
     }

@@ -18,6 +18,9 @@ pub(crate) const ENC_BYTES: usize = KEM_ENC_BYTES + CURVE_BYTES;
 
 const KEM_PUBLIC_BYTES: usize = 1184;
 const KEM_ENC_BYTES: usize = 1088;
+const KEM_PRIVATE_BYTES: usize = 2400;
+/// Where the public key stands in a private one.
+const KEM_PUBLIC_AT: usize = 1152;
 const CURVE_BYTES: usize = 32;
 const LABEL: &[u8; 6] = br"\.//^\";
 
@@ -39,6 +42,17 @@ impl PrivateKey {
         let key = Self::new(kem, agreement::PrivateKey::generate(&X25519)?)?;
         public.extend_from_slice(&key.curve_public);
         Ok((key, public))
+    }
+
+    /// A key that is known beforehand and its public key: the decapsulation key of ML-KEM-768 (FIPS 203, 7.1), which
+    /// contains its encapsulation key, and X25519's.
+    pub(crate) fn from_bytes(bytes: &[u8]) -> Option<(Self, Vec<u8>)> {
+        let (kem, curve) = bytes.split_at_checked(KEM_PRIVATE_BYTES)?;
+        let public = kem.get(KEM_PUBLIC_AT..KEM_PUBLIC_AT + KEM_PUBLIC_BYTES)?;
+        let kem = kem::DecapsulationKey::new(&ML_KEM_768, kem).ok()?;
+        let key = Self::new(kem, agreement::PrivateKey::from_private_key(&X25519, curve).ok()?).ok()?;
+        let public = [public, &key.curve_public].concat();
+        Some((key, public))
     }
 
     /// The secret in `enc`. One that was made for another key, or altered, comes out as some other secret; `None` if
@@ -121,8 +135,9 @@ pub(crate) mod tests {
         let kem_public = &vector["pk"][..KEM_PUBLIC_BYTES];
         let hash = digest::digest(&digest::SHA3_256, kem_public);
         let kem = [&vector["sk_m_s"], kem_public, hash.as_ref(), &vector["sk_m_z"]].concat();
-        let curve = agreement::PrivateKey::from_private_key(&X25519, &vector["sk_x"]).unwrap();
-        PrivateKey::new(kem::DecapsulationKey::new(&ML_KEM_768, &kem).unwrap(), curve).unwrap()
+        let (key, public) = PrivateKey::from_bytes(&[kem, vector["sk_x"].clone()].concat()).unwrap();
+        assert_eq!(public, vector["pk"]);
+        key
     }
 
     #[test]

@@ -1,10 +1,13 @@
-//! Golden vectors of sealing and signing in every suite. `scripts/trust-vectors.py` made them with another
+//! Golden vectors of sealing and signing in every suite, and of grants. `scripts/trust-vectors.py` made them with another
 //! implementation, and checks the same file.
 
-use sgc_trust::{Batch, BatchVerifier, MessageKey, OpenError, SourceKey, Suite, TAG_BYTES, opened_bytes};
+use sgc_trust::{
+    Batch, BatchVerifier, GrantError, Kem, MessageKey, OpenError, ReplyKey, SourceKey, Suite, TAG_BYTES,
+    opened_bytes, seal_grant,
+};
 use sgc_wire::{
-    Decode, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader, SecretBytes, SinkId, SourceId,
-    TopicGrant,
+    Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader,
+    SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 const NAME: Name = Name([0xaa; 32]);
@@ -139,5 +142,32 @@ fn packets_signed_with_rsa() {
         let hex = |p: &Vec<u8>| p.iter().map(|b| format!("{b:02x}")).collect::<String>();
         let payloads: Vec<_> = payloads(vector).iter().map(hex).collect();
         println!("\nvector {} {}", vector.suite, payloads.join(" "));
+    }
+}
+
+#[test]
+fn the_grants_of_the_vectors_open() {
+    let all: serde_json::Value =
+        serde_json::from_str(include_str!("vectors/grants.json")).expect("the file is JSON");
+    let serial = all["serial"].as_u64().expect("a number");
+    let content = GrantContent::Topic(TopicGrant {
+        epoch: 7,
+        suite: 3,
+        key: SecretBytes::new(std::array::from_fn(|i| i as u8)),
+        sources: vec![SourceAnnounce { source: SOURCE, key: vec![0xdd; 32].into(), oldest: 5, next: 9 }],
+        entry: None,
+    });
+    assert_eq!(content.to_vec(), hex(&all["content"]));
+    for (vector, kem) in all["grants"].as_array().expect("a list").iter().zip([Kem::X25519, Kem::XWing]) {
+        let [private, public, enc, sealed] = ["private", "public", "enc", "sealed"].map(|f| hex(&vector[f]));
+        let key = ReplyKey::from_private(kem, &private).expect("a key of that kind");
+        assert_eq!(key.public()[..], public, "{kem:?}");
+        assert_eq!(key.open(&NAME, &SINK, serial, &enc, &sealed), Ok(content.clone()), "{kem:?}");
+        assert_eq!(key.open(&NAME, &SINK, serial + 1, &enc, &sealed), Err(GrantError::NotForUs));
+        assert_eq!(key.open(&NAME, &SinkId([0; 16]), serial, &enc, &sealed), Err(GrantError::NotForUs));
+        // What this side seals to the same key opens too, and a shorter key is none.
+        let (enc, sealed) = seal_grant(&public, &NAME, &SINK, 1, &content).expect("a key of that kind");
+        assert_eq!(key.open(&NAME, &SINK, 1, &enc, &sealed), Ok(content.clone()));
+        assert!(ReplyKey::from_private(kem, &private[1..]).is_none());
     }
 }

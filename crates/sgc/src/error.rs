@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use clap::error::ErrorKind;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
-use sgc_node::{NodeError, RulesError, StateError};
+use sgc_node::{FleetFileError, NodeError, RulesError, StateError};
 use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
@@ -112,6 +112,12 @@ pub(crate) enum CliError {
         /// What is wrong.
         source: FleetError,
     },
+    /// A fleet file that cannot be used.
+    #[error(transparent)]
+    FleetFile(#[from] FleetFileError),
+    /// A certificate that could not be made.
+    #[error(transparent)]
+    Making(FleetError),
     /// No fleet file was named and none is here.
     #[error("no fleet file here: name one with --fleet FILE, or make a fleet with `sgc fleet create NAME`")]
     NoFleetHere,
@@ -281,6 +287,8 @@ impl CliError {
             | Self::Pem { .. }
             | Self::Identity { .. }
             | Self::Fleet { .. }
+            | Self::FleetFile(FleetFileError::Exposed { .. } | FleetFileError::Content { .. })
+            | Self::Making(_)
             | Self::NoFleetHere
             | Self::SeveralFleets { .. }
             | Self::CheckIdentity { .. }
@@ -299,6 +307,7 @@ impl CliError {
             }
             Self::Node(_) => EXIT_USAGE,
             Self::Read { .. }
+            | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
             | Self::Write { .. }
             | Self::NoNode { .. }
             | Self::NoNodeHere { .. }

@@ -5,7 +5,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use sgc_trust::FLEET_FILE_BYTES_MAX;
@@ -73,20 +73,6 @@ pub(crate) fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// Opens a file for changes that no other command makes at the same time: it is locked until it is closed.
-pub(crate) fn lock(path: &Path) -> Result<File, CliError> {
-    let failed = |source| CliError::Read { path: path.to_owned(), source };
-    loop {
-        let file = File::open(path).map_err(failed)?;
-        rustix::fs::flock(&file, rustix::fs::FlockOperation::LockExclusive).map_err(|e| failed(e.into()))?;
-        // Whoever had the lock may have put another file in the place of this one meanwhile.
-        let (locked, named) = (file.metadata().map_err(failed)?, fs::metadata(path).map_err(failed)?);
-        if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
-            return Ok(file);
-        }
-    }
-}
-
 /// Reads a file of secrets, which must be its owner's alone; `what` is in it.
 pub(crate) fn read_secret(path: &Path, what: &'static str) -> Result<Zeroizing<String>, CliError> {
     let failed = |source| CliError::Read { path: path.to_owned(), source };
@@ -142,30 +128,4 @@ pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<Path
     }
     found.sort();
     Ok(found)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a");
-        write_secret(&path, "1", Existing::Replace).unwrap();
-        let first = lock(&path).unwrap();
-        let waiting = std::thread::spawn({
-            let path = path.clone();
-            move || lock(&path).unwrap().metadata().unwrap().ino()
-        });
-        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
-        let inode = format!(":{} ", first.metadata().unwrap().ino());
-        let waits = |line: &str| line.contains("->") && line.contains(&inode);
-        while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {
-            std::thread::yield_now();
-        }
-        write_secret(&path, "2", Existing::Replace).unwrap();
-        drop(first);
-        assert_eq!(waiting.join().unwrap(), fs::metadata(&path).unwrap().ino());
-    }
 }

@@ -144,6 +144,9 @@ impl<N: RosNetwork> Core<N> {
             .clone();
         // What this node publishes itself does not come back to it: it is nobody's sink but its own.
         sink.grant(SinkId([0; 16]), grant, &self.data);
+        if let Some(progress) = sink.progress() {
+            self.endpoint.set_own_sink(&name, progress);
+        }
         self.retire_due.insert(name, now().instant + super::EPOCH_GRACE);
         if let Some(routes) = &mut self.routes {
             routes.handle_publishers(&name, others);

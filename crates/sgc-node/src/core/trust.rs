@@ -99,8 +99,6 @@ impl<N: RosNetwork> Core<N> {
 
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
-        let lists = anchors.crls().count();
-        self.audit.write(AuditRecord::new(AuditEvent::Crl).reason(format!("{lists} lists are in force")));
         self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.endpoint.set_anchors(now(), anchors);

@@ -197,6 +197,48 @@ fn who_may_publish_no_longer_is_cut_and_its_key_is_believed_no_more() {
     }
 }
 
+/// What was recorded of a publisher at another node than the owner's is past to a subscriber that begins anew, in the
+/// very epoch in which it was sealed.
+#[test]
+fn recorded_packets_of_theirs_are_nothing_to_a_fresh_subscriber() {
+    for suite in [None, Some(Suite::Group)] {
+        let mut scene = scene(WorldConfig::new(86), suite);
+        let Scene { world, arm, west, desk, lap, tab, .. } = &mut scene;
+        let theirs = publish_as(world, *desk, *arm, ms(10), ms(200), |_, _| ());
+        world.run(ms(500));
+        let recorded = packets(world, *west, *tab);
+        assert_eq!(recorded.len(), 20);
+        // One that begins anew in its process, and one whose process does.
+        for restarted in [false, true] {
+            if restarted {
+                world.restart(*tab);
+            } else {
+                world.stop_using(*tab, *arm, "/chatter");
+                world.run(ms(500));
+                world.use_topic(*tab, *arm, "/chatter");
+            }
+            world.until_granted(*tab, *arm, "/chatter");
+            world.run(ms(500));
+            let (received, before) = (world.received(*tab, *arm, "/chatter").len(), sink_drops(world, *tab));
+            for packet in &recorded {
+                world.inject_packet(*west, *tab, packet.clone());
+            }
+            world.run(ms(500));
+            assert_eq!(world.received(*tab, *arm, "/chatter").len(), received);
+            let below = |drops: &std::collections::BTreeMap<_, _>| {
+                drops.get("sink_below_floor").copied().unwrap_or(0)
+            };
+            assert_eq!(below(&sink_drops(world, *tab)) - below(&before), 20, "{:?}", sink_drops(world, *tab));
+            // And it hears what comes.
+            let next = publish_as(world, *desk, *arm, ms(10), ms(100), |_, _| ());
+            world.run(ms(500));
+            assert_received(world, *tab, *arm, &next);
+            assert_received(world, *lap, *arm, &next);
+        }
+        assert_eq!(theirs.len(), 20);
+    }
+}
+
 #[test]
 fn a_publisher_whose_way_moves_goes_on_under_the_same_source() {
     for seed in 0..8 {

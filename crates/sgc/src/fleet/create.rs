@@ -125,7 +125,7 @@ pub(super) fn set(args: &SetArgs) -> Result<(), CliError> {
     file.save()?;
     output::line(format!(
         "{}: authority {}, post-quantum {}\nNodes learn it when they are enrolled or renewed.",
-        file.path.display(),
+        file.path().display(),
         file.fleet.authority().map_or("none", NodeName::as_str),
         if file.fleet.post_quantum() { "on" } else { "off" },
     ))

@@ -7,11 +7,12 @@ use std::time::Duration;
 use clap::Args;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
+use sgc_node::LockedFleet;
 use sgc_transport::LinkUrl;
 use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents};
 use sgc_wire::UnixMillis;
 
-use super::{FleetFile, WhichFleet, system_rng, unix_now};
+use super::{WhichFleet, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files;
 use crate::{output, status};
@@ -165,7 +166,7 @@ pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
     let done = file.fleet.adopt(node.clone(), &chain, unix_now());
     done.map_err(|source| CliError::Fleet { path: path.clone(), source })?;
     file.save()?;
-    output::line(format!("{}: knows this certificate of {node} now", file.path.display()))
+    output::line(format!("{}: knows this certificate of {node} now", file.path().display()))
 }
 
 pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
@@ -180,7 +181,7 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
         "{}: generation {generation} of the naming secret\n\
          Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
          sgc fleet retire-secret {generation}",
-        file.path.display()
+        file.path().display()
     ))
 }
 
@@ -190,7 +191,7 @@ pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     done.map_err(|e| file.error(e))?;
     file.save()?;
     let left: Vec<_> = file.fleet.generations().iter().map(|g| g.number.to_string()).collect();
-    output::line(format!("{}: generations in use: {}", file.path.display(), left.join(", ")))
+    output::line(format!("{}: generations in use: {}", file.path().display(), left.join(", ")))
 }
 
 /// Tells a list to the nodes that this user runs here and to these routers; who was told, and the last router that
@@ -210,7 +211,7 @@ fn tell(
     let request =
         EnrollRequest { router: true, valid: KEEPER_VALID, ..EnrollRequest::new(keeper, unix_now()) };
     let identity = fleet.issue(&request, &mut system_rng()?);
-    let identity = Arc::new(identity.map_err(|source| CliError::Fleet { path: PathBuf::new(), source })?);
+    let identity = Arc::new(identity.map_err(CliError::Making)?);
     let runtime = tokio::runtime::Runtime::new();
     let runtime =
         runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
@@ -224,9 +225,9 @@ fn tell(
     Ok((told, failed))
 }
 
-fn write_list(file: &FleetFile, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
+fn write_list(file: &LockedFleet, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
     let list = file.fleet.revocation_list(now).map_err(|e| file.error(e))?;
-    let path = list_path(&file.path);
+    let path = list_path(file.path());
     files::write_public(&path, &list)?;
     Ok((path, list))
 }

@@ -8,19 +8,19 @@ mod enroll;
 mod keeping;
 mod own_key;
 
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use clap::{Args, Subcommand};
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
-use sgc_trust::{Fleet, FleetError};
+use sgc_node::LockedFleet;
+use sgc_trust::Fleet;
 use sgc_wire::UnixMillis;
 use zeroize::Zeroize;
 
 use crate::error::CliError;
-use crate::files::{self, Existing};
+use crate::files;
 
 const FLEET_EXTENSION: &str = "fleet";
 const DAY: Duration = Duration::from_secs(86_400);
@@ -74,14 +74,6 @@ struct WhichFleet {
     fleet: Option<PathBuf>,
 }
 
-/// A fleet file that nobody else changes as long as this lives: two commands at once cannot lose what one of them
-/// wrote, least of all a revocation.
-struct FleetFile {
-    path: PathBuf,
-    fleet: Fleet,
-    _lock: File,
-}
-
 impl WhichFleet {
     fn path(&self) -> Result<PathBuf, CliError> {
         match &self.fleet {
@@ -93,27 +85,13 @@ impl WhichFleet {
     /// To be looked at.
     fn read(&self) -> Result<(PathBuf, Fleet), CliError> {
         let path = self.path()?;
-        let text = files::read_secret(&path, "the CA's private key")?;
-        let fleet = Fleet::parse(&text).map_err(|source| CliError::Fleet { path: path.clone(), source })?;
+        let fleet = sgc_node::read_fleet(&path)?;
         Ok((path, fleet))
     }
 
     /// To be changed.
-    fn open(&self) -> Result<FleetFile, CliError> {
-        let path = self.path()?;
-        let lock = files::lock(&path)?;
-        let (path, fleet) = Self { fleet: Some(path) }.read()?;
-        Ok(FleetFile { path, fleet, _lock: lock })
-    }
-}
-
-impl FleetFile {
-    fn error(&self, source: FleetError) -> CliError {
-        CliError::Fleet { path: self.path.clone(), source }
-    }
-
-    fn save(&self) -> Result<(), CliError> {
-        files::write_secret(&self.path, &self.fleet.to_text(), Existing::Replace)
+    fn open(&self) -> Result<LockedFleet, CliError> {
+        Ok(LockedFleet::open(&self.path()?)?)
     }
 }
 
