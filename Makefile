@@ -38,8 +38,9 @@ deps-test:
 peers:
 	@scripts/build-peers.sh
 
-# The golden vectors of sealing, against an implementation that is not ours.
+# The golden vectors of names, identities, tokens, sealing and grants, against an implementation that is not ours.
 vectors: peers
+	.venv/bin/python -B scripts/check-vectors.py
 	.venv/bin/python -B scripts/trust-vectors.py
 
 lint: fmt clippy
