@@ -112,6 +112,8 @@ pub(crate) enum CoreEvent {
         /// What.
         answer: Result<Credentials, RefuseReason>,
     },
+    /// What the fleet's file holds for this authority itself.
+    OwnRenewal(Result<Credentials, RefuseReason>),
     /// The user wants something else from now on; answered when it is under way.
     Reload {
         /// What is shared.
@@ -374,6 +376,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
+            CoreEvent::OwnRenewal(answer) => self.own_renewal(answer),
             CoreEvent::Crl { der, reply } => {
                 let _ = reply.send(self.router.add_crl(now(), &der));
                 // Whoever brings a list may have changed the fleet's file.

@@ -13,6 +13,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
 use crate::stats::DataDrop;
@@ -40,6 +41,11 @@ impl ControlTx {
         self.frames.try_send(frame).is_ok()
     }
 }
+
+/// Refused peers that come into the audit log in each [`REFUSALS_WINDOW`].
+const REFUSALS_WRITTEN_MAX: u32 = 60;
+/// For how long they count.
+const REFUSALS_WINDOW: Duration = Duration::from_secs(60);
 
 /// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
 ///
@@ -144,8 +150,11 @@ async fn keep_renewed(
 pub(crate) async fn keep_accepting(
     mut listener: Listener,
     core: mpsc::Sender<CoreEvent>,
+    audit: Audit,
     mut stop: oneshot::Receiver<()>,
 ) {
+    let mut written = 0;
+    let mut since = Instant::now();
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
@@ -160,7 +169,18 @@ pub(crate) async fn keep_accepting(
                     info!(%remote, "link ended: {end}");
                 });
             }
-            Some(Err(refused)) => warn!("{refused}"),
+            Some(Err(refused)) => {
+                warn!("{refused}");
+                if since.elapsed() >= REFUSALS_WINDOW {
+                    (since, written) = (Instant::now(), 0);
+                }
+                // Anybody can knock: the log is not to be filled with it. All are counted in the status.
+                written += 1;
+                if written <= REFUSALS_WRITTEN_MAX {
+                    let record = AuditRecord::new(AuditEvent::LinkRefused);
+                    audit.write(record.remote(refused.remote).reason(&refused.reason));
+                }
+            }
             None => return listener.close(CloseReason::Goodbye).await,
         }
     }
@@ -430,7 +450,7 @@ mod tests {
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            tokio::spawn(keep_accepting(listener, far_core, stopped));
+            tokio::spawn(keep_accepting(listener, far_core, Audit::default(), stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));

@@ -322,7 +322,8 @@ pub async fn run_on<N: RosNetwork>(
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        accepting.push((tokio::spawn(keep_accepting(listener, events.clone(), stopped)), stop));
+        let accept = keep_accepting(listener, events.clone(), audit.clone(), stopped);
+        accepting.push((tokio::spawn(accept), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     let reloader = Arc::new(Reloader {

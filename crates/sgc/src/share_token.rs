@@ -165,7 +165,7 @@ fn share(args: &ShareTokenArgs, topic: &str, config: &Config) -> Result<ShareCon
 
 /// What names of new shares follow from.
 fn naming_secret(identity: &Identity) -> Option<&FleetSecret> {
-    identity.fleet_secret()
+    identity.naming_secrets().first().map(|newest| &newest.secret)
 }
 
 fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
