@@ -7,7 +7,9 @@ use rand_core::RngCore;
 use sgc_trust::{ReplyKey, VerifiedPeer};
 use sgc_wire::{NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer};
 
-/// Shortest wait before asking again.
+/// Wait before asking again for what was granted until now: the way may be another by now.
+const RETRY_FIRST: Duration = Duration::from_millis(20);
+/// Shortest wait before asking again after that.
 const RETRY_MIN: Duration = Duration::from_millis(200);
 /// Longest wait before asking again.
 const RETRY_MAX: Duration = Duration::from_secs(10);
@@ -164,6 +166,7 @@ impl Join {
     pub(crate) fn retry(&mut self, now: Instant, refused: Option<RefusedBy>, rng: &mut impl RngCore) {
         let wait = match refused {
             Some(RefusedBy::Owner(_)) => REFUSED_RETRY,
+            None if self.attempts == 0 => RETRY_FIRST,
             _ => (RETRY_MIN * 2u32.saturating_pow(self.attempts.saturating_sub(1).min(16))).min(RETRY_MAX),
         };
         let jitter = wait.mul_f64(f64::from(rng.next_u32() % 1000) / 2000.0);

@@ -5,11 +5,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use rand_core::{OsRng, TryRngCore};
-use sgc_trust::{CLOCK_SKEW, FleetError, VerifiedPeer};
+use sgc_trust::{FleetError, VerifiedPeer};
 use sgc_wire::{Credentials, Now, RefuseReason};
 use tracing::{error, info, warn};
 
-use crate::credentials::is_due;
+use crate::credentials::{is_due, lasts};
 use crate::fleet_file::{FleetFileError, LockedFleet};
 
 /// Shortest time for which a new certificate holds.
@@ -64,9 +64,7 @@ fn try_answer(file: &Path, peer: &VerifiedPeer, csr: &[u8], now: Now) -> Result<
     if !is_due(peer, now) {
         return Ok(locked.fleet.credentials_for(&node, Vec::new())?);
     }
-    let valid = Duration::from_millis(peer.not_after.0.saturating_sub(peer.not_before.0));
-    // Certificates begin so long before they are made; counted once more each time, they would last ever longer.
-    let valid = valid.saturating_sub(CLOCK_SKEW).max(VALID_MIN);
+    let valid = Duration::from_millis(lasts(peer)).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
     let credentials = locked.fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     locked.save()?;

@@ -105,6 +105,8 @@ pub(crate) enum CoreEvent {
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
     },
+    /// What the fleet's file holds for this authority itself.
+    OwnRenewal(Result<Credentials, RefuseReason>),
     /// The user wants something else from now on; answered when it is under way.
     Reload {
         /// What is shared.
@@ -374,6 +376,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
+            CoreEvent::OwnRenewal(answer) => self.own_renewal(answer),
             CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
                 self.add_message_keys(message_keys);
                 self.reconfigure(shares, uses, anchors);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_trust::{Identity, TrustAnchors};
+use sgc_trust::{CLOCK_SKEW, Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{CRL_BYTES_MAX, Credentials, Now};
 use tokio::sync::{mpsc, watch};
 use tracing::{debug, warn};
@@ -117,17 +117,25 @@ fn keep_identity(file: &Path, identity: &Identity) {
     }
 }
 
+/// How long a certificate was made to hold, milliseconds. Fleets let theirs begin [`CLOCK_SKEW`] early, which is not of
+/// that time: counted in, short ones would be due from their first moment on.
+pub(crate) fn lasts(peer: &VerifiedPeer) -> u64 {
+    let whole = peer.not_after.0.saturating_sub(peer.not_before.0);
+    let early = CLOCK_SKEW.as_millis() as u64;
+    if whole > early { whole - early } else { whole }
+}
+
 /// When to ask for the next certificate: when a third of the time of this one is left.
 pub(crate) fn renew_at(identity: &Identity, now: Now) -> Instant {
     let own = identity.as_peer();
-    let due = own.not_after.0 - own.not_after.0.saturating_sub(own.not_before.0) / RENEW_PART;
-    now.instant + Duration::from_millis(due.saturating_sub(now.unix.0)).max(RENEW_MIN)
+    let due = own.not_after.0.saturating_sub(lasts(own) / RENEW_PART);
+    let wait_min = RENEW_MIN.min(Duration::from_millis(lasts(own) / (2 * RENEW_PART)));
+    now.instant + Duration::from_millis(due.saturating_sub(now.unix.0)).max(wait_min)
 }
 
 /// True if a certificate that holds from and until then has less than a third of its time left.
-pub(crate) fn is_due(peer: &sgc_trust::VerifiedPeer, now: Now) -> bool {
-    peer.not_after.0.saturating_sub(now.unix.0)
-        < peer.not_after.0.saturating_sub(peer.not_before.0) / RENEW_PART
+pub(crate) fn is_due(peer: &VerifiedPeer, now: Now) -> bool {
+    peer.not_after.0.saturating_sub(now.unix.0) < lasts(peer) / RENEW_PART
 }
 
 /// The identity with what its authority sent; `None` if that is what it has already. An empty chain stands for the

@@ -272,3 +272,64 @@ fn throughput_of_the_suites() {
         eprintln!("{burst} at a time: group {group:.0}/s, standard {standard:.0}/s, {:.2}", standard / group);
     }
 }
+
+/// Carries datagrams between one node and the router, and keeps all of them.
+struct Tap {
+    port: u16,
+    seen: std::sync::Arc<std::sync::Mutex<Vec<Vec<u8>>>>,
+}
+
+impl Tap {
+    fn before(router: u16) -> Self {
+        let near = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let port = near.local_addr().unwrap().port();
+        let far = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        far.connect(("127.0.0.1", router)).unwrap();
+        let seen = std::sync::Arc::<std::sync::Mutex<Vec<Vec<u8>>>>::default();
+        let client = std::sync::Arc::new(std::sync::OnceLock::new());
+        let (near_too, far_too) = (near.try_clone().unwrap(), far.try_clone().unwrap());
+        let (seen_too, client_too) = (seen.clone(), client.clone());
+        std::thread::spawn(move || {
+            let mut buffer = [0; 65_536];
+            while let Ok((n, from)) = near.recv_from(&mut buffer) {
+                let _ = client.set(from);
+                seen.lock().unwrap().push(buffer[..n].to_vec());
+                let _ = far.send(&buffer[..n]);
+            }
+        });
+        let kept = seen_too.clone();
+        std::thread::spawn(move || {
+            let mut buffer = [0; 65_536];
+            while let Ok(n) = far_too.recv(&mut buffer) {
+                kept.lock().unwrap().push(buffer[..n].to_vec());
+                let _ = near_too.send_to(&buffer[..n], client_too.get().unwrap());
+            }
+        });
+        Self { port, seen: seen_too }
+    }
+}
+
+#[test]
+fn nothing_that_crosses_the_wire_tells_payload_topic_type_or_node() {
+    const SECRET: &str = "the quick brown payload that nobody on the way may read";
+    let mut trio = Trio::new();
+    let cloud = trio.cloud();
+    let past = trio.port;
+    let tap = Tap::before(past);
+    trio.port = tap.port;
+    let _robot = trio.robot(&["/wire/tapped"], "desk");
+    let talker = Talker::new(&trio.robot_net, "/wire/tapped", latched());
+    talker.say(SECRET);
+    // The desk goes to the router past the tap.
+    trio.port = past;
+    let _desk = trio.desk(&["/wire/tapped"]);
+    Listener::new(&trio.desk_net, "/wire/tapped", latched()).hears(SECRET);
+    let seen = tap.seen.lock().unwrap();
+    assert!(seen.len() > 10, "the tap carried {} datagrams", seen.len());
+    // Nothing shorter: noise spells any three letters now and then.
+    for needle in [SECRET, "/wire/tapped", "tapped", "std_msgs", "String", "robot", "nobody"] {
+        let found = seen.iter().any(|d| d.windows(needle.len()).any(|w| w == needle.as_bytes()));
+        assert!(!found, "{needle:?} is readable on the wire");
+    }
+    drop(cloud);
+}

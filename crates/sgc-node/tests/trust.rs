@@ -53,6 +53,10 @@ fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     let mark = stream.said();
     wait("its branches are gone", || cloud.status()["router"]["branches"] == 2);
     wait("it is refused when it dials again", || cloud.refused("revoked") > 0);
+    let refusal = |r: &AuditRecord| {
+        r.event == "link_refused" && r.reason.as_ref().is_some_and(|reason| reason.contains("revoked"))
+    };
+    wait("which the log says", || lab.audit("cloud").iter().any(refusal));
     assert!(!cloud.peers().contains(&revoked));
     stream.more(500);
     let (talker, last) = stream.end();
@@ -185,16 +189,19 @@ fn every_suite_carries_messages() {
 fn certificates_and_secrets_are_renewed_while_messages_flow() {
     let lab = Lab::new(&["robot"]);
     lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
-    lab.enroll("keeper", |_| {});
-    // Certificates begin ten minutes before they are made: less than a third of their time is left.
-    lab.enroll("robot", |request| request.valid = Duration::from_secs(240));
-    lab.enroll("desk", |request| request.valid = Duration::from_secs(240));
-    lab.enroll("thief", |request| request.valid = Duration::from_secs(240));
+    // Made ten minutes ago for fifteen: less than a third of their time is left.
+    for node in ["keeper", "robot", "desk", "thief"] {
+        lab.enroll(node, |request| {
+            request.valid = Duration::from_secs(900);
+            request.now.0 -= 630_000;
+        });
+    }
     let cloud = lab.cloud();
     let share_it = |c: &mut Config| c.shares = vec![share("/chatter", &["desk"])];
     let use_it = |c: &mut Config| c.uses = vec![uses("/chatter")];
     let until = |node: &str| lab.identity(node).not_after();
-    let old = lab.identity("desk");
+    let (old, old_keeper) = (lab.identity("desk"), lab.identity("keeper"));
+    let old_robot = lab.identity("robot");
     let (robot, desk) = (lab.start("robot", share_it), lab.start("desk", use_it));
     let talker = lab.talker("robot", "/chatter");
     let listener = lab.listener("desk", "/chatter");
@@ -206,8 +213,9 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
 
     let keeper = lab.start("keeper", |c| c.authority = Some(lab.fleet_file()));
     wait("both have new certificates", || {
-        until("desk") > old.not_after() && until("robot") > old.not_after()
+        lab.identity("desk").chain() != old.chain() && lab.identity("robot").chain() != old_robot.chain()
     });
+    wait("the authority renews its own", || lab.identity("keeper").chain() != old_keeper.chain());
     let new = lab.identity("desk");
     assert_eq!(fs::metadata(lab.path("desk.identity")).unwrap().permissions().mode() & 0o7777, 0o600);
     // Ten minutes are not added to it each time.
@@ -226,6 +234,15 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
         read.node(&node.parse().unwrap()).unwrap().certificates.iter().any(|c| *c.serial == *serial)
     };
     assert!(known("desk", &new.as_peer().cert.serial) && known("desk", &old.as_peer().cert.serial));
+
+    // What is new is not renewed again.
+    let certificates = || {
+        let read = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+        read.nodes().map(|n| n.certificates.len()).collect::<Vec<_>>()
+    };
+    let before = certificates();
+    stream.more(500);
+    assert_eq!(certificates(), before);
 
     // Whoever was revoked gets nothing more, although its certificate still lets it in where nobody knows.
     let list = lab.revoke("thief");
@@ -284,6 +301,7 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
     assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
     let generation = |node: &str| lab.identity(node).naming_secrets()[0].generation;
     wait("robot and desk hold generation 2", || generation("robot") == 2 && generation("desk") == 2);
+    wait("the authority, too", || generation("keeper") == 2);
     wait("the thief is out", || cloud.refused("revoked") > 0);
     robot.reload(|c| c.shares.push(share("/later", &["*"])));
     let later = lab.talker("robot", "/later");

@@ -14,10 +14,13 @@ use crate::authority;
 use crate::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
-    /// Asks the authority for what this node needs, if its identity names one.
+    /// Asks the authority for what this node needs, if its identity names one or it is the authority itself.
     pub(super) fn ask_renewal(&mut self) {
         let now = now();
-        if self.endpoint.renew(now, self.identity.csr().into()) {
+        if self.authority.is_some() {
+            self.renew_own();
+            self.renew_due = Some(renew_at(&self.identity, now));
+        } else if self.endpoint.renew(now, self.identity.csr().into()) {
             self.renew_due = Some(renew_at(&self.identity, now));
         }
     }
@@ -31,6 +34,28 @@ impl<N: RosNetwork> Core<N> {
             let answer = authority::answer(&file, &peer, &csr, now());
             let _ = events.blocking_send(CoreEvent::RenewalReady { sink, answer });
         });
+    }
+
+    /// Looks this authority itself up: no way leads from a node to itself.
+    fn renew_own(&self) {
+        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
+        let (alive, identity) = (self.alive.clone(), self.identity.clone());
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let answer = authority::answer(&file, identity.as_peer(), &identity.csr(), now());
+            let _ = events.blocking_send(CoreEvent::OwnRenewal(answer));
+        });
+    }
+
+    pub(super) fn own_renewal(&mut self, answer: Result<Credentials, RefuseReason>) {
+        match answer {
+            Ok(credentials) => self.take_credentials(credentials),
+            Err(reason) => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(%reason, "the fleet's file has no credentials for this node; asking again later");
+                }
+            }
+        }
     }
 
     /// Gives a member what the fleet's file says.
@@ -53,6 +78,7 @@ impl<N: RosNetwork> Core<N> {
         for (sink, peer, csr) in asked {
             self.answer_renewal(sink, peer, csr);
         }
+        self.renew_own();
     }
 
     pub(super) fn take_credentials(&mut self, credentials: Credentials) {

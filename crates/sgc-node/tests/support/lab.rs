@@ -23,7 +23,7 @@ use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig}
 use sgc_testkit::FakeDomain;
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, Identity, Suite};
-use sgc_wire::{Class, History, NodeId, Qos};
+use sgc_wire::{Class, History, NodeId, Qos, UnixMillis};
 
 use crate::support::{Listener, Node, PATIENCE, Talker, begin, unix_now, wait};
 
@@ -48,7 +48,9 @@ impl Lab {
     pub fn empty(name: &str, port: u16) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let fleet = dir.path().join("lab.fleet");
-        let new = Fleet::create(name.parse().unwrap(), unix_now(), &mut OsRng.unwrap_err()).unwrap();
+        // A day old, so that certificates of it can be.
+        let made = UnixMillis(unix_now().0 - 86_400_000);
+        let new = Fleet::create(name.parse().unwrap(), made, &mut OsRng.unwrap_err()).unwrap();
         write_secret(&fleet, &new.to_text());
         Self { dir, fleet, port, nets: Mutex::default() }
     }

@@ -151,7 +151,7 @@ pub struct Trio {
     pub robot_net: FakeDomain,
     pub desk_net: FakeDomain,
     dir: tempfile::TempDir,
-    port: u16,
+    pub port: u16,
     starts: std::cell::Cell<u32>,
 }
 
