@@ -145,3 +145,51 @@ impl DataPlane {
         &self.shards[usize::from(name.0[0]) % SHARDS]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use sgc_wire::{Class, HOP_LIMIT, PacketHeader, Payload, SourceId};
+
+    use super::*;
+
+    #[tokio::test]
+    async fn payloads_go_to_all_links_in_the_memory_they_came_in() {
+        let name = Name([1; 32]);
+        let [up, near, far] = [1, 2, 3].map(LinkId);
+        let outs = [near, far].map(|link| (link, OutFlow::idle()));
+        let ways = outs.iter().map(|(link, flow)| (*link, Out::Link(flow.clone()))).collect();
+        let entry = FibEntry {
+            up,
+            down: [near, far].as_slice().into(),
+            publishers: [].as_slice().into(),
+            sinks: vec![],
+        };
+        let data = DataPlane::default();
+        data.set(name, Some(Forward::new(entry, ways, Arc::default())));
+        for reliable in [true, false] {
+            let header = PacketHeader {
+                reliable,
+                class: Class::Default,
+                hops: HOP_LIMIT,
+                suite: 1,
+                epoch: 1,
+                name,
+                source: SourceId([2; 16]),
+                seq: 1,
+                total: 1000,
+                index: 0,
+                grid: 16_384,
+                to: None,
+            };
+            let payload = Payload([Bytes::from(vec![7; 600]), Bytes::from(vec![7; 400])].into());
+            let places = |p: &Payload| p.0.iter().map(|b| (b.as_ptr(), b.len())).collect::<Vec<_>>();
+            let came_in = places(&payload);
+            data.forward(up, Packet { header, payload }).await;
+            for (_, flow) in &outs {
+                let sent = flow.queued().await;
+                assert_eq!((places(&sent.payload), sent.header.hops), (came_in.clone(), HOP_LIMIT - 1));
+            }
+        }
+    }
+}

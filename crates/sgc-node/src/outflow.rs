@@ -65,6 +65,22 @@ impl OutFlow {
         flow
     }
 
+    /// One that nobody empties but [`Self::queued`].
+    #[cfg(test)]
+    pub(crate) fn idle() -> Arc<Self> {
+        Arc::new(Self {
+            queue: Queue::new(OUTFLOW_PACKETS_MAX),
+            complete: AtomicUsize::new(0),
+            ended: watch::Sender::new(true),
+        })
+    }
+
+    /// The oldest packet that waits; it must be there.
+    #[cfg(test)]
+    pub(crate) async fn queued(&self) -> Packet {
+        self.queue.pop().await.expect("it is open").0
+    }
+
     /// Queues a packet; says what was dropped instead, and how many.
     pub(crate) async fn push(&self, packet: Packet) -> Option<(DataDrop, u64)> {
         let bytes = packet.encoded_bytes();

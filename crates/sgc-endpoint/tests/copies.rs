@@ -1,0 +1,171 @@
+//! How often a payload is copied on its way: once at the source, into the packets, and once at the sink, into the message.
+//!
+//! A copy needs a place. An allocator that counts sees each that is made, on this thread; so what a message takes beyond
+//! its own length says whether there is a second one. `-- --nocapture` prints it.
+#![allow(unsafe_code, reason = "an allocator is unsafe by its nature; this one counts and hands on")]
+#![allow(clippy::print_stderr, reason = "what was counted is of use")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use bytes::Bytes;
+use sgc_endpoint::{Delivery, FRAGMENT_BYTES, Message, Sink, SinkLimits, Source, SourceConfig};
+use sgc_trust::{MessageKey, Suite, trailer_bytes_max};
+use sgc_wire::{
+    Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
+};
+
+struct Counting;
+
+thread_local! {
+    static TAKEN: Cell<usize> = const { Cell::new(0) };
+}
+
+fn count(bytes: usize) {
+    // After the thread's end nobody counts any more.
+    let _ = TAKEN.try_with(|taken| taken.set(taken.get() + bytes));
+}
+
+// SAFETY: every call is handed on to the system's allocator as it is.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout.size());
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count(layout.size());
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    // One that grows may move, so all of it counts again.
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count(new_size);
+        // SAFETY: the caller's promise.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// Bytes that were allocated meanwhile.
+fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
+    let before = TAKEN.get();
+    let result = work();
+    (TAKEN.get() - before, result)
+}
+
+const NAME: Name = Name([1; 32]);
+const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+
+/// What a packet and a message take besides their payload: header, head, tag, counters of references, a signature and
+/// the hashes of a batch; bytes. Less than the smallest payload here, so that a second copy of any shows.
+const ASIDE: usize = 700;
+/// What a key, a window and a verifier take, once for each source; bytes.
+const ONCE: usize = 40_000;
+
+fn ends(suite: Suite, history_depth: usize) -> (Source, Sink) {
+    let config = SourceConfig {
+        name: NAME,
+        id: SourceId([5; 16]),
+        class: Class::Default,
+        reliable: true,
+        history_depth,
+        history_bytes_max: 100 << 20,
+    };
+    let key = SecretBytes::new([3; 32]);
+    let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+    let source = Source::new(config, &grant, MessageKey::generate(suite)).expect("the key is of the suite");
+    grant.sources = vec![source.announce()];
+    (source, Sink::new(NAME, SinkId([9; 16]), grant, false, SinkLimits::default()))
+}
+
+fn publish(source: &mut Source, payload: &Bytes, n: usize, packets: &mut Vec<Packet>) {
+    for i in 1..=n {
+        source.publish(&HEAD, payload.clone(), i < n, |p| packets.push(p)).expect("it is small enough");
+    }
+}
+
+fn deliver(sink: &mut Sink, packets: &[Packet]) -> Vec<Bytes> {
+    let payload = |p| match sink.handle_packet(p) {
+        Ok(Delivery::Message(Message { payload, .. })) => Some(payload),
+        _ => None,
+    };
+    packets.iter().filter_map(payload).collect()
+}
+
+/// Bytes taken at the source and at the sink, a message.
+fn measure(suite: Suite, bytes: usize, at_once: usize, history: usize) -> (usize, usize) {
+    let (mut source, mut sink) = ends(suite, history);
+    let payload = Bytes::from(vec![7; bytes]);
+    let mut packets = Vec::with_capacity(1000);
+    publish(&mut source, &payload, at_once, &mut packets);
+    deliver(&mut sink, &packets);
+    packets.clear();
+    let (sealing, ()) = taken(|| publish(&mut source, &payload, at_once, &mut packets));
+    let (opening, heard) = taken(|| deliver(&mut sink, &packets));
+    assert_eq!(heard, vec![payload; at_once]);
+    let each = (sealing / at_once, opening / at_once);
+    eprintln!("{suite}, {bytes} bytes, {at_once} at once: source {} sink {}", each.0, each.1);
+    each
+}
+
+#[test]
+fn a_payload_is_copied_once_at_each_end() {
+    for suite in [Suite::Group, Suite::Standard, Suite::StandardChacha] {
+        let aside = ASIDE + trailer_bytes_max(suite);
+        for (bytes, at_once) in [(1000usize, 1), (1000, 32), (16_000, 1), (1 << 20, 1), (13 << 20, 1)] {
+            // A source with a history keeps the payload that it was given.
+            for history in [0, 8] {
+                let packets = bytes.div_ceil(FRAGMENT_BYTES.into());
+                let (source, sink) = measure(suite, bytes, at_once, history);
+                assert!(source >= bytes && sink >= bytes, "the allocator counts");
+                assert!(
+                    source < bytes + packets * aside,
+                    "{suite}: {source} bytes for {bytes} at the source"
+                );
+                assert!(sink < bytes + packets * aside, "{suite}: {sink} bytes for {bytes} at the sink");
+            }
+        }
+    }
+}
+
+/// The first fragment of a large message is opened aside, into memory that is used again and counts the first time.
+#[test]
+fn a_large_message_takes_one_fragment_more_the_first_time() {
+    let bytes = 1 << 20;
+    let (mut source, mut sink) = ends(Suite::Standard, 0);
+    let mut packets = Vec::with_capacity(1000);
+    let payload = Bytes::from(vec![7; bytes]);
+    publish(&mut source, &payload, 1, &mut packets);
+    let (first, heard) = taken(|| deliver(&mut sink, &packets));
+    assert_eq!(heard, [payload]);
+    assert!(first > bytes && first < bytes + ONCE, "{first}");
+}
+
+/// What the transport received in two pieces is joined first: a copy more.
+#[test]
+fn a_packet_in_pieces_is_copied_once_more() {
+    let (mut source, mut sink) = ends(Suite::Standard, 0);
+    let payload = Bytes::from(vec![7; 10_000]);
+    let mut packets = Vec::with_capacity(10);
+    publish(&mut source, &payload, 1, &mut packets);
+    deliver(&mut sink, &packets);
+    packets.clear();
+    publish(&mut source, &payload, 1, &mut packets);
+    for packet in &mut packets {
+        let all = packet.payload.0[0].clone();
+        packet.payload = Payload([all.slice(..4000), all.slice(4000..)].into());
+    }
+    let (joined, heard) = taken(|| deliver(&mut sink, &packets));
+    assert_eq!(heard, [payload]);
+    assert!((20_000..21_000).contains(&joined), "{joined}");
+}

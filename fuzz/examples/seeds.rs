@@ -1,0 +1,213 @@
+//! Writes seeds for the fuzz targets to `corpus/`: `cargo run --example seeds` in this folder. Valid input of each kind,
+//! from which a fuzzer gets farther than from nothing.
+
+use std::path::Path;
+use std::{fs, io};
+
+use bytes::Bytes;
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng;
+use sgc_endpoint::{Source, SourceConfig};
+use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
+use sgc_wire::{
+    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control, Encode,
+    GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, Qos, Recover, RefuseReason, RejectReason,
+    Request, SecretBytes, Signed, SinkId, SourceId, SourceOffer, TopicGrant, UnixMillis,
+};
+
+/// The time of the targets.
+const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
+const NAME: Name = Name([1; 32]);
+const SINK: SinkId = SinkId([9; 16]);
+
+fn main() -> io::Result<()> {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
+    let write = |target: &str, seeds: Vec<Vec<u8>>| -> io::Result<()> {
+        fs::create_dir_all(corpus.join(target))?;
+        for (n, seed) in seeds.iter().enumerate() {
+            fs::write(corpus.join(target).join(format!("seed-{n}")), seed)?;
+        }
+        println!("{target}: {}", seeds.len());
+        Ok(())
+    };
+    write("control", control())?;
+    write("bodies", bodies())?;
+    write("packet", packets(Suite::ALL.as_slice()))?;
+    write("certs", certs())?;
+    write("sink", sink())?;
+    write("grants", grants())
+}
+
+fn control() -> Vec<Vec<u8>> {
+    let (name, sink, source) = (NAME, SINK, SourceId([3; 16]));
+    let signed = Signed { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) };
+    let frames = [
+        Control::Hello(Hello { minor: 0, incarnation: 5, transit: true }),
+        Control::Advert { hops: 1, signed: signed.clone() },
+        Control::Unreach { names: vec![name; 3] },
+        Control::Interest { names: vec![name; 2] },
+        Control::Uninterest { names: vec![name] },
+        Control::Join { signed: signed.clone() },
+        Control::Leave { name, sink },
+        Control::Answer { signed },
+        Control::Reject { name, sink, reason: RejectReason::Limit },
+        Control::Recover(Recover { name, sink, source, from: 1, to: 9 }),
+        Control::Goodbye,
+    ];
+    frames.map(|f| f.to_vec()).into()
+}
+
+fn bodies() -> Vec<Vec<u8>> {
+    let chain = vec![Bytes::from_static(&[0x30; 40]); 2];
+    let advert = AdvertBody {
+        chain: chain.clone(),
+        seq: 9,
+        issued_at: NOW,
+        lease_ms: 60_000,
+        withdraw: false,
+        blinds: vec![Blind([4; 32]); 3],
+    };
+    let offer = SourceOffer { source: SourceId([3; 16]), key: Bytes::from_static(&[5; 32]) };
+    let reply_key = Bytes::from_static(&[5; 32]);
+    let joins = [Request::Subscribe { describe: true }, Request::Publish { offer }].map(|request| JoinBody {
+        name: NAME,
+        sink: SINK,
+        request,
+        issued_at: NOW,
+        chain: chain.clone(),
+        reply_key: reply_key.clone(),
+    });
+    let answers = [
+        Answer::Grant { enc: Bytes::from_static(&[6; 32]), sealed: Bytes::from_static(&[7; 80]) },
+        Answer::Refuse { reason: RefuseReason::NotPermitted },
+    ]
+    .map(|answer| AnswerBody { name: NAME, sink: SINK, serial: 3, answer });
+    let metadata = Metadata::topic("arm-1", "/camera", "sensor_msgs/msg/Image");
+    let entry = CatalogueEntry {
+        metadata: metadata.clone(),
+        blind: Blind([4; 32]),
+        subscribe: true,
+        publish: false,
+        suite: 1,
+        keyless: true,
+        type_hash: Some("RIHS01_ab".into()),
+        qos: Qos { partitions: vec!["p".into()], ..Qos::default() },
+        class: Class::Realtime,
+        sources: vec![CatalogueSource { source: SourceId([8; 16]), qos: Qos::default() }],
+    };
+    let contents = [
+        GrantContent::Topic(TopicGrant { entry: Some(Box::new(entry.clone())), ..grant(Suite::Standard) }),
+        GrantContent::Catalogue(Catalogue { version: 2, entries: vec![entry] }),
+    ];
+    let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+    let mut all = vec![(0, advert.to_vec())];
+    all.extend(joins.map(|j| (1, j.to_vec())));
+    all.extend(answers.map(|a| (2, a.to_vec())));
+    all.extend(contents.map(|c| (3, c.to_vec())));
+    all.extend([(4, metadata.to_vec()), (5, head.to_vec())]);
+    all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
+}
+
+/// Of another key than the target of sinks grants: what is sealed under that one is genuine there in suites without
+/// signatures, though its source did not make it.
+fn grant(suite: Suite) -> TopicGrant {
+    let key = SecretBytes::new([4; 32]);
+    TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None }
+}
+
+/// To all, and addressed, in several fragments and in one, of each suite.
+fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
+    let mut out = Vec::new();
+    for suite in suites {
+        let config = SourceConfig {
+            name: NAME,
+            id: SourceId([5; 16]),
+            class: Class::Default,
+            reliable: true,
+            history_depth: 2,
+            history_bytes_max: 1 << 20,
+        };
+        let mut source = Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");
+        let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+        let mut emit = |packet: sgc_wire::Packet| {
+            let mut bytes = packet.header.to_vec();
+            packet.payload.copy_into(&mut bytes);
+            bytes.truncate(2000);
+            out.push(bytes);
+        };
+        source.publish(&head, Bytes::from(vec![1; 20_000]), true, &mut emit).expect("small");
+        source.publish(&head, Bytes::from_static(b"ten bytes!"), false, &mut emit).expect("small");
+        source.replay(SINK, 2, 2, &mut emit);
+    }
+    out
+}
+
+fn certs() -> Vec<Vec<u8>> {
+    let rng = &mut ChaCha20Rng::seed_from_u64(3);
+    let mut fleet = Fleet::create("acme".parse().expect("a name"), NOW, rng).expect("a fleet");
+    let request = EnrollRequest::new("arm-1".parse().expect("a name"), NOW);
+    let arm = fleet.enroll(&request, rng).expect("an identity");
+    fleet.rotate_secret(NOW, rng).expect("a secret");
+    fleet.revoke(&["arm-1".parse().expect("a name")], NOW).expect("a list");
+    let list = fleet.revocation_list(NOW).expect("a list");
+    let csr = KeyRequest::generate(None, rng).expect("a request").csr_text();
+    let seeds: [(u8, Vec<u8>); 9] = [
+        (0, arm.to_text().as_bytes().to_vec()),
+        (1, arm.to_text().as_bytes().to_vec()),
+        (2, fleet.to_text().as_bytes().to_vec()),
+        (3, arm.to_text().as_bytes().to_vec()),
+        (3, csr.into_bytes()),
+        (4, list),
+        (5, arm.chain()[0].to_vec()),
+        (5, fleet.ca_certificate().to_vec()),
+        (6, arm.csr()),
+    ];
+    seeds.into_iter().map(|(which, seed)| [&[which], &seed[..]].concat()).collect()
+}
+
+/// Suite, size, cut, and what is altered: nothing, a byte of the header, one of the payload, a cut.
+fn sink() -> Vec<Vec<u8>> {
+    let edits: [&[u8]; 4] = [&[], &[0, 1, 1], &[0, 90, 1], &[0, 100, 0]];
+    let mut out: Vec<_> = (0..Suite::ALL.len() as u8)
+        .flat_map(|suite| edits.map(|edits| [&[suite, 1, 3], edits].concat()))
+        .collect();
+    out.extend(edits.map(|edits| [&[2, 200, 50], edits].concat()));
+    for (n, packet) in packets(&Suite::ALL[..4]).into_iter().enumerate() {
+        out.push([&[n as u8 / 5, 0, 0], &packet[..]].concat());
+    }
+    out
+}
+
+fn grants() -> Vec<Vec<u8>> {
+    let rng = &mut ChaCha20Rng::seed_from_u64(4);
+    let mut fleet = Fleet::create("acme".parse().expect("a name"), NOW, rng).expect("a fleet");
+    let arm = fleet.enroll(&EnrollRequest::new("arm-1".parse().expect("a name"), NOW), rng).expect("an identity");
+    let token = ShareToken {
+        owner: arm.node_id(),
+        owner_name: "arm-1".parse().expect("a name"),
+        ca: fleet.ca_certificate().clone(),
+        metadata: Metadata::topic("arm-1", "/tf", "tf2_msgs/msg/TFMessage"),
+        secret: TopicSecret::from_bytes([8; 32]),
+        routers: vec!["quic://router:1".into()],
+        expires: NOW,
+    };
+    let mut out = Vec::new();
+    for which in [1, 2, 4, 6, 7] {
+        for kind in 0..3 {
+            for edits in [&[][..], &[0, 40, 1], &[0, 200, 0], &[1, 4, 0x80, 0, 3, 2]] {
+                out.push([&[which, kind], edits].concat());
+            }
+        }
+    }
+    for kind in 0..2 {
+        out.push([&[0, kind][..], &[7; 1300]].concat());
+        out.push([&[2, kind][..], &[9; 1216]].concat());
+    }
+    out.push([&[5, 0], token.to_text().as_bytes()].concat());
+    out.push([&[6, 200], fleet.ca_certificate().as_ref()].concat());
+    for body in bodies().into_iter().filter(|b| b[0] < 3) {
+        out.push([&[3, body[0]], &body[1..], &[1; 70]].concat());
+    }
+    out.push([&[6, 1], &token.metadata.to_vec()[..]].concat());
+    out
+}
