@@ -1,0 +1,226 @@
+//! What router and endpoint want done, and what happened that somebody has to know.
+
+use sgc_endpoint::{Event, Output as EndpointOutput};
+use sgc_ros::RosNetwork;
+use sgc_router::{LinkClose, LinkId, Output as RouterOutput};
+use sgc_transport::{CloseReason, Link};
+use sgc_wire::{Now, RefuseReason, Role};
+use tracing::{debug, info, warn};
+
+use super::{Core, EPOCH_GRACE, SUPERSEDED_MAX, now};
+use crate::audit::{AuditEvent, AuditRecord};
+
+impl<N: RosNetwork> Core<N> {
+    pub(super) fn router_output(&mut self, output: RouterOutput) {
+        match output {
+            RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
+            RouterOutput::Send { link, frame } => {
+                let Some(entry) = self.links.get(&link) else { return };
+                if !entry.control.send(frame) {
+                    warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
+                    self.control_drops.count_from("control_queue_full", link);
+                    entry.link.close(CloseReason::Overloaded);
+                }
+            }
+            RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
+            RouterOutput::Close { link, reason } => {
+                let Some(entry) = self.links.get_mut(&link) else { return };
+                entry.closed_for = Some(reason.to_string());
+                if matches!(reason, LinkClose::Revoked) {
+                    let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
+                }
+                match &reason {
+                    LinkClose::Superseded => {
+                        let peer = entry.link.peer().node_id.to_string();
+                        if self.superseded.len() >= SUPERSEDED_MAX {
+                            self.superseded.clear();
+                        }
+                        if !self.superseded.insert(peer.clone()) {
+                            warn!(%peer, "connects again and again from new runs: do two processes use one identity?");
+                        }
+                        entry.link.close(CloseReason::Replaced);
+                    }
+                    LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
+                    LinkClose::Revoked => {
+                        let peer = entry.link.peer();
+                        let why = self.credentials.objection(peer, now().unix);
+                        let why = why.unwrap_or(CloseReason::Revoked);
+                        info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                        entry.closed_for = Some(why.to_string());
+                        entry.link.close(why);
+                    }
+                    LinkClose::Expired => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
+                        entry.link.close(CloseReason::Expired);
+                    }
+                    LinkClose::TooMany | LinkClose::Forgeries => {
+                        warn!(%link, remote = %entry.link.remote(), peer = %entry.link.peer().node_id.short(), "{reason}; its link is closed");
+                        entry.link.close(CloseReason::Denied(reason.to_string()));
+                    }
+                    LinkClose::Greeting | LinkClose::Loop => {
+                        warn!(%link, remote = %entry.link.remote(), "{reason}");
+                        entry.link.close(CloseReason::Protocol(reason.to_string()));
+                    }
+                }
+            }
+            RouterOutput::Trust(anchors) => {
+                let lists = anchors.crls().count();
+                let record =
+                    AuditRecord::new(AuditEvent::Crl).reason(format!("in force, {lists} lists in all"));
+                self.audit.write(record);
+                self.set_anchors(anchors);
+            }
+            RouterOutput::Dropped(dropped) => {
+                let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
+                if first && dropped.reason.is_suspicious() {
+                    let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
+                    warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
+                } else {
+                    debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
+                }
+            }
+            RouterOutput::Timeout(_) => {}
+        }
+    }
+
+    pub(super) fn endpoint_output(&mut self, output: EndpointOutput) {
+        let now = now();
+        match output {
+            EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
+            EndpointOutput::Dropped(dropped) => {
+                if self.control_drops.count(dropped.key()) {
+                    warn!(reason = %dropped, "refused; counted from here on");
+                } else {
+                    debug!(reason = %dropped, "refused");
+                }
+            }
+            EndpointOutput::Event(event) => self.endpoint_event(now, event),
+            EndpointOutput::Timeout(_) => {}
+        }
+    }
+
+    pub(super) fn endpoint_event(&mut self, now: Now, event: Event) {
+        self.audit_event(&event);
+        match event {
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name) {
+                    share.replay(recover, &self.replays);
+                }
+            }
+            Event::Granted { name, sink, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
+                if self.publishing_granted(now, name, &grant) {
+                    debug!(name = %name.short(), "publishing under it");
+                } else if let Some(local) = self.sinks.get(&name) {
+                    local.grant(sink, grant, &self.data);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                }
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_granted(&name, entry);
+                }
+                self.ask_histories(name);
+            }
+            event => self.route_event(now, event),
+        }
+    }
+
+    /// What concerns the routes alone.
+    pub(super) fn route_event(&mut self, now: Now, event: Event) {
+        let Some(routes) = &mut self.routes else { return };
+        match event {
+            Event::SinkJoined { name, sink, peer, role } => {
+                info!(peer = %peer.short(), "granted a subscriber");
+                debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
+                if role == Role::Subscribe {
+                    routes.handle_sink_joined(&name, sink);
+                }
+            }
+            Event::SinkLeft { name, sink, peer } => {
+                debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
+                routes.handle_sink_left(now.instant, &name, &sink);
+            }
+            Event::SinkCut { name, sink, peer, reason } => {
+                info!(peer = %peer.short(), %reason, "took a grant back; a new epoch begins");
+                debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
+                routes.handle_sink_left(now.instant, &name, &sink);
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                if self.control_drops.count_from("join_refused", peer.short()) {
+                    warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
+                }
+            }
+            Event::Refused { name, by } => {
+                warn!(reason = %by, "a topic is refused to this node; asking again later");
+                debug!(name = %name.short(), reason = %by, "refused");
+                routes.handle_refused(&name, by);
+            }
+            Event::Lost { name, reason } => {
+                debug!(name = %name.short(), ?reason, "interrupted; waiting for the way to come back");
+                routes.handle_lost(now.instant, &name);
+            }
+            Event::Catalogue { owner, catalogue } => {
+                debug!(owner = %owner.short(), entries = catalogue.entries.len(), "catalogue");
+                routes.handle_catalogue(owner, catalogue);
+            }
+            Event::OwnerLost { owner, reason } => {
+                info!(owner = %owner.short(), ?reason, "owner out of reach");
+                routes.handle_owner_lost(now.instant, owner, reason);
+            }
+            Event::OwnerRefused { owner, by } => {
+                warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
+                routes.handle_owner_refused(owner, by);
+            }
+            Event::RenewAsked { .. }
+            | Event::Renewed { .. }
+            | Event::RenewRefused { .. }
+            | Event::Rekeyed { .. }
+            | Event::OwnGrant { .. }
+            | Event::Recover(_)
+            | Event::Granted { .. } => {}
+        }
+    }
+
+    /// Keeps what concerns who gets what of this node.
+    pub(super) fn audit_event(&self, event: &Event) {
+        let about = |event, name| {
+            let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));
+            AuditRecord::new(event).topic(topic).name(name)
+        };
+        match event {
+            Event::SinkJoined { name, peer, .. } => {
+                let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
+                self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
+            }
+            Event::SinkLeft { name, peer, .. } => self.audit.write(about(AuditEvent::Left, name).peer(peer)),
+            Event::SinkCut { name, peer, reason, .. } => {
+                let revoked = *reason == RefuseReason::Revoked;
+                let event = if revoked { AuditEvent::Revoked } else { AuditEvent::Cut };
+                self.audit.write(about(event, name).peer(peer).reason(reason));
+            }
+            Event::Rekeyed { name, grant } => {
+                self.audit.write(about(AuditEvent::Epoch, name).epoch(grant.epoch));
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
+            }
+            _ => {}
+        }
+    }
+}
