@@ -40,7 +40,7 @@ fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     let revoked = lab.id("desk1").to_string();
     let list = lab.revoke("desk1");
     let begun = Instant::now();
-    assert_eq!(cloud.ask(&AdminRequest::Crl(list))["ok"], true);
+    assert_eq!(cloud.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     let is_closed = |r: &AuditRecord| {
         r.event == "link_closed" && r.peer.as_ref() == Some(&revoked) && r.reason.as_deref().is_some()
     };
@@ -255,7 +255,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
         })
     });
     wait("it says why", || thief.status()["drops"]["renewal_refused"].as_u64() >= Some(1));
-    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     wait("it is cut off", || cloud.refused("revoked") > 0);
 
     // A revocation covers what was renewed.
@@ -265,7 +265,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     eprintln!("renewal: {lost} of {last} messages lost while the links were replaced");
     listener.hears_nothing();
     let list = lab.revoke("desk");
-    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     let id = lab.id("desk").to_string();
     wait("the renewed one is cut off, too", || !cloud.peers().contains(&id));
     drop((robot, desk, thief));
@@ -298,7 +298,7 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
 
     let list = lab.revoke("thief");
     lab.with_fleet(|fleet| fleet.rotate_secret(unix_now(), &mut OsRng.unwrap_err()).unwrap());
-    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"], true);
+    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     let generation = |node: &str| lab.identity(node).naming_secrets()[0].generation;
     wait("robot and desk hold generation 2", || generation("robot") == 2 && generation("desk") == 2);
     wait("the authority, too", || generation("keeper") == 2);
@@ -527,7 +527,7 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
     wait("a refusal", || arm.route_state().starts_with("refused"));
     robot.reload(|c| c.shares[0].to = nodes(&["desk1", "desk3"]));
     let list = lab.revoke("desk3");
-    assert_eq!(robot.ask(&AdminRequest::Crl(list))["ok"], true);
+    assert_eq!(robot.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     wait("two new epochs", || lab.epoch("robot") == 3);
     wait("the router knows", || lab.audit("cloud").iter().any(|r| r.event == "crl"));
     // What is queued is written once it has stopped.
