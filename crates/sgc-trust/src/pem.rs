@@ -127,6 +127,11 @@ pub(crate) fn write(comment: &str, blocks: &[(&str, &[u8])]) -> Zeroizing<String
     out
 }
 
+/// One block as text; for content that is no secret.
+pub fn pem_text(label: &str, content: &[u8]) -> String {
+    write("", &[(label, content)]).to_string()
+}
+
 fn marker<'a>(line: &'a str, prefix: &str) -> Option<&'a str> {
     line.strip_prefix(prefix)?.strip_suffix("-----")
 }

@@ -5,14 +5,12 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use sgc_node::config::{self, Config, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
 use sgc_transport::LinkUrl;
-use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors};
+use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors, pem_text};
 use sgc_wire::{NodeId, UnixMillis};
 
 use crate::error::CliError;
@@ -111,7 +109,7 @@ fn give(
         type_name: share.type_name.unwrap_or_default(),
         name: token.name().to_string(),
         ca: fingerprint,
-        ca_pem: pem(&ca),
+        ca_pem: pem_text("CERTIFICATE", &ca),
         node: node.map(|node| node.to_string()),
         created: now.0,
         expires: token.expires.0,
@@ -235,17 +233,6 @@ fn reload_node(
 ) -> Result<(), CliError> {
     let socket = sgc_node::admin_socket_path(config, node);
     reload::after_change(&socket)?.into_iter().try_for_each(&mut say)
-}
-
-fn pem(der: &[u8]) -> String {
-    let base64 = STANDARD.encode(der);
-    let mut text = String::from("-----BEGIN CERTIFICATE-----\n");
-    for line in base64.as_bytes().chunks(64) {
-        text.push_str(&String::from_utf8_lossy(line));
-        text.push('\n');
-    }
-    text.push_str("-----END CERTIFICATE-----\n");
-    text
 }
 
 fn valid(text: &str) -> Result<Duration, String> {

@@ -385,3 +385,13 @@ fn a_certificate_of_a_ca_that_keeps_its_key() {
     assert!(said.contains("names no SGC node") && said.contains("sgc fleet request"), "{said}");
     assert!(!Path::new(&place.path("other.identity")).exists());
 }
+
+#[test]
+fn the_ca_is_shown_and_nothing_else() {
+    let place = Place::with_fleet();
+    let shown = place.good(&["fleet", "ca"]);
+    let blocks = sgc_trust::pem_contents(&shown, &["CERTIFICATE"]).unwrap();
+    assert_eq!(blocks.len(), 1);
+    assert_eq!(blocks[0].as_slice(), place.fleet().ca_certificate().as_ref());
+    assert_eq!(shown.matches("-----BEGIN").count(), 1, "{shown}");
+}

@@ -9,7 +9,7 @@ use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_node::LockedFleet;
 use sgc_transport::LinkUrl;
-use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents};
+use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents, pem_text};
 use sgc_wire::UnixMillis;
 
 use super::{WhichFleet, system_rng, unix_now};
@@ -31,6 +31,13 @@ pub(super) struct ListArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
+}
+
+/// Print the certificate of a fleet's CA, PEM: no secret, and what partners and their routers trust.
+#[derive(Debug, Args)]
+pub(super) struct CaArgs {
+    #[command(flatten)]
+    which: WhichFleet,
 }
 
 /// Revoke nodes: all of their certificates, for good.
@@ -124,6 +131,12 @@ pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
         return output::line(json);
     }
     output::line(table(&fleet, unix_now()))
+}
+
+pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
+    let (_, fleet) = args.which.read()?;
+    let text = pem_text("CERTIFICATE", fleet.ca_certificate());
+    output::line(text.trim_end())
 }
 
 pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
