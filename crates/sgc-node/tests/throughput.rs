@@ -288,7 +288,7 @@ fn busiest(before: &BTreeMap<(u32, String), f64>, messages: f64) -> (String, f64
     };
     let mut all: Vec<_> = after.iter().map(spent).collect();
     all.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let named: Vec<_> = all.iter().take(9).map(|(t, name)| format!("{name} {t:.1}")).collect();
+    let named: Vec<_> = all.iter().take(14).map(|(t, name)| format!("{name} {t:.1}")).collect();
     (named.join(", "), all.iter().map(|(t, _)| t).sum())
 }
 
