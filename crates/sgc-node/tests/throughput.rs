@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
 use std::sync::mpsc::{Receiver, channel};
@@ -74,8 +75,12 @@ struct Node {
 
 impl Node {
     fn start(config: Config, identity: Arc<Identity>, network: Option<Arc<CycloneNetwork>>) -> Self {
-        let runtime =
-            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name(identity.node_name().to_string())
+            .enable_all()
+            .build()
+            .unwrap();
         let (stop, stopped) = oneshot::channel::<()>();
         let (ready, is_ready) = oneshot::channel();
         let (done, ended) = channel();
@@ -227,7 +232,8 @@ impl Way {
                     self.robot.status(),
                     self.desk.status()
                 );
-                std::thread::yield_now();
+                // Short beside the time that what is under way takes.
+                std::thread::sleep(Duration::from_micros(500));
             }
         }
         let (arrived, took) = (self.arrived.load(SeqCst) - start, begun.elapsed());
@@ -261,6 +267,31 @@ impl Way {
     }
 }
 
+/// CPU time that the threads of this process took until now, by thread and name, microseconds.
+fn cpu_times() -> BTreeMap<(u32, String), f64> {
+    let mut times = BTreeMap::new();
+    for task in std::fs::read_dir("/proc/self/task").unwrap().flatten() {
+        let Ok(stat) = std::fs::read_to_string(task.path().join("schedstat")) else { continue };
+        let Ok(name) = std::fs::read_to_string(task.path().join("comm")) else { continue };
+        let ns: f64 = stat.split(' ').next().and_then(|n| n.parse().ok()).unwrap_or(0.0);
+        let id = task.file_name().to_string_lossy().parse().unwrap_or(0);
+        times.insert((id, name.trim().to_owned()), ns / 1000.0);
+    }
+    times
+}
+
+/// The busiest threads between two looks: microseconds a message; and of all threads together.
+fn busiest(before: &BTreeMap<(u32, String), f64>, messages: f64) -> (String, f64) {
+    let after = cpu_times();
+    let spent = |(thread, t): (&(u32, String), &f64)| {
+        ((t - before.get(thread).unwrap_or(&0.0)) / messages, thread.1.clone())
+    };
+    let mut all: Vec<_> = after.iter().map(spent).collect();
+    all.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let named: Vec<_> = all.iter().take(14).map(|(t, name)| format!("{name} {t:.1}")).collect();
+    (named.join(", "), all.iter().map(|(t, _)| t).sum())
+}
+
 fn median(all: &mut [f64]) -> f64 {
     all.sort_unstable_by(f64::total_cmp);
     all[all.len() / 2]
@@ -270,7 +301,8 @@ fn median(all: &mut [f64]) -> f64 {
 #[ignore = "measures"]
 fn with_dds_at_both_ends() {
     let suites = [Suite::Group, Suite::Standard];
-    let (mut rates, mut delays, mut batches) = ([vec![], vec![]], [vec![], vec![]], vec![]);
+    let (mut rates, mut delays, mut costs) = ([vec![], vec![]], [vec![], vec![]], [vec![], vec![]]);
+    let mut batches = vec![];
     let mut ratios = vec![];
     let dir = tempfile::tempdir().unwrap();
     for round in 0..ROUNDS {
@@ -279,9 +311,12 @@ fn with_dds_at_both_ends() {
             let at = (round + turn) % 2;
             let way = Way::new(suites[at], dir.path());
             delays[at].extend(way.delays());
-            let before = way.published();
+            let (before, cpu) = (way.published(), cpu_times());
             rates[at].push(way.rate());
             let after = way.published();
+            let (threads, all) = busiest(&cpu, (after.0 - before.0) as f64);
+            costs[at].push(all);
+            eprintln!("  {} takes {all:.1} µs of CPU a message: {threads}", suites[at]);
             if after.1 > before.1 {
                 batches.push((after.0 - before.0) as f64 / (after.1 - before.1) as f64);
             }
@@ -298,5 +333,7 @@ fn with_dds_at_both_ends() {
         median(&mut ratios),
         median(&mut batches)
     );
+    let [group, standard] = costs.map(|mut all| median(&mut all));
+    eprintln!("CPU a message: group {group:.1} µs, standard {standard:.1} µs, ratio {:.2}", group / standard);
     eprintln!("one at a time, {MESSAGE_BYTES} bytes: group {near:.0} µs, standard {far:.0} µs");
 }
