@@ -10,9 +10,10 @@ use rand_core::SeedableRng;
 use sgc_endpoint::{Source, SourceConfig};
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control, Encode,
-    GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, Qos, Recover, RefuseReason, RejectReason,
-    Request, SecretBytes, Signed, SinkId, SourceId, SourceOffer, TopicGrant, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
+    Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, Qos, Recover,
+    RefuseReason, RejectReason, Request, SecretBytes, Signed, SinkId, SourceId, SourceOffer, TopicGrant,
+    UnixMillis,
 };
 
 /// The time of the targets.
@@ -127,7 +128,8 @@ fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
             history_depth: 2,
             history_bytes_max: 1 << 20,
         };
-        let mut source = Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");
+        let mut source =
+            Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");
         let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
         let mut emit = |packet: sgc_wire::Packet| {
             let mut bytes = packet.header.to_vec();
@@ -181,7 +183,8 @@ fn sink() -> Vec<Vec<u8>> {
 fn grants() -> Vec<Vec<u8>> {
     let rng = &mut ChaCha20Rng::seed_from_u64(4);
     let mut fleet = Fleet::create("acme".parse().expect("a name"), NOW, rng).expect("a fleet");
-    let arm = fleet.enroll(&EnrollRequest::new("arm-1".parse().expect("a name"), NOW), rng).expect("an identity");
+    let arm =
+        fleet.enroll(&EnrollRequest::new("arm-1".parse().expect("a name"), NOW), rng).expect("an identity");
     let token = ShareToken {
         owner: arm.node_id(),
         owner_name: "arm-1".parse().expect("a name"),

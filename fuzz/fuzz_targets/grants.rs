@@ -9,12 +9,12 @@ use libfuzzer_sys::fuzz_target;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_trust::{
-    EnrollRequest, Fleet, Identity, Kem, ReplyKey, ShareToken, TOKEN_PREFIX, TopicSecret, seal_grant, verify_advert,
-    verify_answer, verify_join,
+    EnrollRequest, Fleet, Identity, Kem, ReplyKey, ShareToken, TOKEN_PREFIX, TopicSecret, seal_grant,
+    verify_advert, verify_answer, verify_join,
 };
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Decode, GrantContent, JoinBody, Metadata, Name, Request, SecretBytes,
-    Signed, SinkId, TopicGrant, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, Decode, GrantContent, JoinBody, Metadata, Name, Request,
+    SecretBytes, Signed, SinkId, TopicGrant, UnixMillis,
 };
 
 const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
@@ -66,7 +66,8 @@ fn cast() -> &'static Cast {
             reply_key: grants[0].0.public().clone(),
         };
         let (enc, sealed) = (grants[0].1.clone(), grants[0].2.clone());
-        let answer = AnswerBody { name: NAME, sink: SINK, serial: SERIAL, answer: Answer::Grant { enc, sealed } };
+        let answer =
+            AnswerBody { name: NAME, sink: SINK, serial: SERIAL, answer: Answer::Grant { enc, sealed } };
         let signed = [arm.sign_advert(&advert), arm.sign_join(&join), arm.sign_answer(&answer)];
         let metadata = Metadata::topic("arm-1", "/tf", "tf2_msgs/msg/TFMessage");
         let token = ShareToken {
@@ -132,7 +133,8 @@ fuzz_target!(|input: &[u8]| {
         }
         3 => {
             let (body, signature) = input.split_at(input.len().saturating_sub(70));
-            let signed = Signed { body: Bytes::copy_from_slice(body), signature: Bytes::copy_from_slice(signature) };
+            let signed =
+                Signed { body: Bytes::copy_from_slice(body), signature: Bytes::copy_from_slice(signature) };
             assert!(!check_signed(kind % 3, &signed));
         }
         4 => {
@@ -142,7 +144,8 @@ fuzz_target!(|input: &[u8]| {
             let signed = Signed { body, signature: good.signature.clone() };
             assert_eq!(check_signed(kind % 3, &signed), same);
             let signature = Bytes::from(alter(&good.signature, input));
-            let verified = check_signed(kind % 3, &Signed { body: good.body.clone(), signature: signature.clone() });
+            let verified =
+                check_signed(kind % 3, &Signed { body: good.body.clone(), signature: signature.clone() });
             assert_eq!(verified, signature == good.signature);
         }
         5 => {
