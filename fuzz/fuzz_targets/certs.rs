@@ -14,7 +14,9 @@ const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
 
 fn fleet() -> &'static Fleet {
     static FLEET: OnceLock<Fleet> = OnceLock::new();
-    FLEET.get_or_init(|| Fleet::create("acme".parse().unwrap(), NOW, &mut ChaCha20Rng::seed_from_u64(1)).unwrap())
+    FLEET.get_or_init(|| {
+        Fleet::create("acme".parse().unwrap(), NOW, &mut ChaCha20Rng::seed_from_u64(1)).unwrap()
+    })
 }
 
 fuzz_target!(|input: &[u8]| {
