@@ -19,7 +19,7 @@ const TOKENS_DIR: &str = "tokens";
 
 /// Use a topic of another fleet, by the token that its owner gave.
 ///
-/// The token is kept in the node's state directory, and a [[use]] that names it is added to the configuration. What is in
+/// The token is kept in the node's state directory, and a `[[use]]` that names it is added to the configuration. What is in
 /// the file already stays as it is.
 #[derive(Debug, Args)]
 pub(crate) struct UseArgs {
