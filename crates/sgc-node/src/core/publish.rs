@@ -5,10 +5,9 @@ use std::time::{Duration, Instant};
 
 use sgc_endpoint::{Source, SourceConfig, Wish};
 use sgc_ros::RosNetwork;
+use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
 use tracing::warn;
-
-use sgc_trust::{MessageKey, Suite};
 
 use super::{Core, CoreEvent, now};
 use crate::message_keys::MessageKeys;
