@@ -484,7 +484,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// What the user wants from now on; nothing of it if the CAs cannot be trusted.
+    /// What the user wants from now on, and whom the node trusts if that changed.
     fn reconfigure(&mut self, shares: Vec<ShareRule>, uses: Vec<UseRule>, anchors: Option<TrustAnchors>) {
         if let Some(routes) = &mut self.routes {
             routes.reconfigure(Instant::now(), shares, uses);

@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
@@ -97,8 +97,7 @@ fn lock(path: &Path) -> io::Result<fs::File> {
 /// Reads a fleet's file, which must be its owner's alone.
 pub fn read_fleet(path: &Path) -> Result<Fleet, FleetFileError> {
     let failed = |source| FleetFileError::Read { path: path.to_owned(), source };
-    let mode = fs::metadata(path).map_err(failed)?.permissions().mode() & 0o7777;
-    if mode & 0o077 != 0 {
+    if let Some(mode) = state::exposed(&fs::metadata(path).map_err(failed)?) {
         return Err(FleetFileError::Exposed { path: path.to_owned(), mode });
     }
     let bytes = state::read(path, FLEET_FILE_BYTES_MAX as u64).map_err(failed)?;

@@ -3,7 +3,6 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -146,8 +145,7 @@ pub struct RunOptions {
 /// Reads an identity file, which must be its owner's alone.
 pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
     let file = |source| NodeError::IdentityFile { path: path.to_owned(), source };
-    let mode = fs::metadata(path).map_err(file)?.permissions().mode() & 0o7777;
-    if mode & 0o077 != 0 {
+    if let Some(mode) = state::exposed(&fs::metadata(path).map_err(file)?) {
         return Err(NodeError::IdentityExposed { path: path.to_owned(), mode });
     }
     let text = zeroize::Zeroizing::new(fs::read_to_string(path).map_err(file)?);

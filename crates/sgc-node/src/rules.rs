@@ -4,7 +4,6 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use sgc_ros::{Direction, ShareRule, UseRule};
@@ -15,7 +14,7 @@ use sgc_wire::{NodeId, UnixMillis};
 use crate::audit::PeerNames;
 use crate::config::{Config, Recipient, TokenSource, UseConfig};
 use crate::partners::{PartnerError, Partners};
-use crate::policy;
+use crate::{policy, state};
 
 /// Most routers that tokens may add.
 const TOKEN_ROUTERS_MAX: usize = 16;
@@ -119,8 +118,7 @@ impl Rules {
 pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
     let failed = |source| RulesError::TokenFile { path: path.to_owned(), source };
     let file = fs::File::open(path).map_err(failed)?;
-    let mode = file.metadata().map_err(failed)?.permissions().mode() & 0o7777;
-    if mode & 0o077 != 0 {
+    if let Some(mode) = state::exposed(&file.metadata().map_err(failed)?) {
         return Err(failed(io::Error::other(format!("its mode {mode:04o} lets others at it; chmod 600 it"))));
     }
     let mut text = zeroize::Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX + 2));

@@ -13,6 +13,7 @@ use rustix::fs::{FlockOperation, OFlags, flock};
 use crate::config::Config;
 
 const LOCK_FILE: &str = "lock";
+const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
 /// Where a node with this name keeps its state: as configured, or in the user's state directory. `None` where the
@@ -31,14 +32,19 @@ pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
     let failed = |source| StateError::Directory { path: dir.to_owned(), source };
     fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
     let metadata = fs::metadata(dir).map_err(failed)?;
-    let mode = metadata.permissions().mode() & 0o7777;
-    if mode & OTHERS_BITS != 0 {
+    if let Some(mode) = exposed(&metadata) {
         return Err(StateError::Exposed { path: dir.to_owned(), mode });
     }
     if metadata.uid() != rustix::process::geteuid().as_raw() {
         return Err(StateError::NotOurs { path: dir.to_owned() });
     }
     Ok(())
+}
+
+/// The mode of a file or directory that others than its owner may read, change or enter.
+pub(crate) fn exposed(metadata: &fs::Metadata) -> Option<u32> {
+    let mode = metadata.permissions().mode() & PERMISSION_BITS;
+    (mode & OTHERS_BITS != 0).then_some(mode)
 }
 
 /// Replaces a file whole or not at all: 0600, on the disk before it has its name.

@@ -4,17 +4,13 @@
 
 use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
 use super::error::Mistake;
 use super::resolve::{FileChecks, IdentityFile};
-use crate::partners;
-
-const PERMISSION_BITS: u32 = 0o7777;
-const OTHERS_BITS: u32 = 0o077;
+use crate::{partners, state};
 
 /// The checks of [`super::load`].
 pub(super) const FILES: FileChecks =
@@ -63,10 +59,9 @@ fn private(key: &'static str, path: &Path, what: &'static str) -> Result<(), Mis
         },
         expected: "a file that this user may read",
     })?;
-    let mode = metadata.permissions().mode() & PERMISSION_BITS;
-    match mode & OTHERS_BITS {
-        0 => Ok(()),
-        _ => Err(Mistake::FileExposed { key, path: path.to_owned(), mode, what }),
+    match state::exposed(&metadata) {
+        None => Ok(()),
+        Some(mode) => Err(Mistake::FileExposed { key, path: path.to_owned(), mode, what }),
     }
 }
 
@@ -84,8 +79,7 @@ fn check_identity(file: &IdentityFile<'_>) -> Result<(), Mistake> {
     if !metadata.is_file() {
         return Err(unreadable("not a file".to_owned()));
     }
-    let mode = metadata.permissions().mode() & PERMISSION_BITS;
-    if mode & OTHERS_BITS != 0 {
+    if let Some(mode) = state::exposed(&metadata) {
         return Err(Mistake::IdentityExposed { key, path: path.to_owned(), mode });
     }
     fs::File::open(path).map(drop).map_err(|error| unreadable(error.to_string()))

@@ -9,7 +9,7 @@ use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
 use tracing::warn;
 
-use super::{Core, CoreEvent, now};
+use super::{Core, CoreEvent, EPOCH_GRACE, now};
 use crate::message_keys::MessageKeys;
 use crate::sinks::LocalSink;
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
@@ -146,7 +146,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(progress) = sink.progress() {
             self.endpoint.set_own_sink(&name, progress);
         }
-        self.retire_due.insert(name, now().instant + super::EPOCH_GRACE);
+        self.retire_due.insert(name, now().instant + EPOCH_GRACE);
         if let Some(routes) = &mut self.routes {
             routes.handle_publishers(&name, others);
         }

@@ -1,6 +1,7 @@
 //! Trust that changes while the node runs: its own credentials, those of members if it is the authority, and
 //! revocations.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use sgc_ros::RosNetwork;
@@ -17,33 +18,40 @@ impl<N: RosNetwork> Core<N> {
     /// Asks the authority for what this node needs, if its identity names one or it is the authority itself.
     pub(super) fn ask_renewal(&mut self) {
         let now = now();
-        if self.authority.is_some() {
+        let asked = if self.authority.is_some() {
             self.renew_own();
-            self.renew_due = Some(renew_at(&self.identity, now));
-        } else if self.endpoint.renew(now, self.identity.csr().into()) {
+            true
+        } else {
+            self.endpoint.renew(now, self.identity.csr().into())
+        };
+        if asked {
             self.renew_due = Some(renew_at(&self.identity, now));
         }
     }
 
-    /// Looks a member up in the fleet's file, where that may block.
+    /// Looks a member up in the fleet's file.
     pub(super) fn answer_renewal(&self, sink: SinkId, peer: VerifiedPeer, csr: bytes::Bytes) {
-        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
-        let alive = self.alive.clone();
-        tokio::task::spawn_blocking(move || {
-            let _alive = alive;
-            let answer = authority::answer(&file, &peer, &csr, now());
-            let _ = events.blocking_send(CoreEvent::RenewalReady { sink, answer });
+        self.look_up(move |file| {
+            let answer = authority::answer(file, &peer, &csr, now());
+            CoreEvent::RenewalReady { sink, answer }
         });
     }
 
     /// Looks this authority itself up: no way leads from a node to itself.
     fn renew_own(&self) {
+        let identity = self.identity.clone();
+        self.look_up(move |file| {
+            CoreEvent::OwnRenewal(authority::answer(file, identity.as_peer(), &identity.csr(), now()))
+        });
+    }
+
+    /// Reads the fleet's file where that may block; nothing if this node is not the authority.
+    fn look_up(&self, read: impl FnOnce(&Path) -> CoreEvent + Send + 'static) {
         let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
-        let (alive, identity) = (self.alive.clone(), self.identity.clone());
+        let alive = self.alive.clone();
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
-            let answer = authority::answer(&file, identity.as_peer(), &identity.csr(), now());
-            let _ = events.blocking_send(CoreEvent::OwnRenewal(answer));
+            let _ = events.blocking_send(read(&file));
         });
     }
 
