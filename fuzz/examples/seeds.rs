@@ -44,7 +44,7 @@ fn control() -> Vec<Vec<u8>> {
     let signed = Signed { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) };
     let frames = [
         Control::Hello(Hello { minor: 0, incarnation: 5, transit: true }),
-        Control::Advert { hops: 1, signed: signed.clone() },
+        Control::Advert { cost: 1, signed: signed.clone() },
         Control::Unreach { names: vec![name; 3] },
         Control::Interest { names: vec![name; 2] },
         Control::Uninterest { names: vec![name] },

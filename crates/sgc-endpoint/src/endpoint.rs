@@ -18,6 +18,9 @@ use sgc_wire::{
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
 
+/// How often it is looked for certificates that have ended, which happens without anything else.
+const ENFORCE_EVERY: Duration = Duration::from_secs(20);
+
 /// Bounds and timers of an endpoint.
 #[derive(Clone, Debug)]
 pub struct Limits {
@@ -41,7 +44,7 @@ impl Default for Limits {
             shares_max: 1024,
             sinks_per_name_max: 4096,
             sinks_per_peer_max: 16,
-            lease: Duration::from_secs(60),
+            lease: Duration::from_secs(300),
             rotate_every: Duration::from_secs(3600),
             rotate_wait: Duration::from_secs(1),
         }
@@ -257,6 +260,8 @@ pub struct Endpoint {
     pub(crate) withdrawn: BTreeSet<Blind>,
     advert_seq: u64,
     pub(crate) renew_at: Option<Instant>,
+    /// When to look for certificates that have ended.
+    pub(crate) enforce_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
     pub(crate) now: Now,
 }
@@ -287,6 +292,7 @@ impl Endpoint {
             withdrawn: BTreeSet::new(),
             advert_seq: 0,
             renew_at: None,
+            enforce_at: None,
             outputs: VecDeque::new(),
             now,
         }
@@ -327,6 +333,7 @@ impl Endpoint {
         self.now = now;
         match frame {
             Control::Advert { signed, .. } => self.handle_advert(&signed),
+            Control::Reroute { name, sink } => self.handle_reroute(name, sink),
             Control::Unreach { names } => {
                 for name in names {
                     self.lose(name, LostReason::Unreachable, false);
@@ -342,6 +349,8 @@ impl Endpoint {
             Control::Interest { .. } | Control::Uninterest { .. } => self.unexpected("interest"),
             Control::Goodbye => self.unexpected("goodbye"),
             Control::Crl { .. } => self.unexpected("revocation list"),
+            Control::LinkState { .. } => self.unexpected("link state"),
+            Control::Query { .. } => self.unexpected("query"),
         }
     }
 
@@ -351,7 +360,9 @@ impl Endpoint {
         if self.renew_at.is_some_and(|at| at <= now.instant) {
             self.advertise_all();
             self.renew_at = None;
-            // Certificates end without anything else happening.
+        }
+        if self.enforce_at.is_some_and(|at| at <= now.instant) {
+            self.enforce_at = Some(now.instant + ENFORCE_EVERY);
             self.enforce();
         }
         self.rotate_due();
@@ -366,7 +377,9 @@ impl Endpoint {
         }
         self.outputs.pop_front().unwrap_or_else(|| {
             let joins = self.joins.values().filter_map(Join::deadline);
-            Output::Timeout(joins.chain(self.renew_at).chain(self.rotation_deadline()).min())
+            Output::Timeout(
+                joins.chain(self.renew_at).chain(self.enforce_at).chain(self.rotation_deadline()).min(),
+            )
         })
     }
 
@@ -414,9 +427,10 @@ impl Endpoint {
                     blinds: blinds.to_vec(),
                 };
                 let signed = self.config.identity.sign_advert(&body);
-                self.outputs.push_back(Output::Send(Control::Advert { hops: 0, signed }));
+                self.outputs.push_back(Output::Send(Control::Advert { cost: 0, signed }));
                 if !withdraw {
                     self.renew_at.get_or_insert(self.now.instant + self.config.limits.lease / 3);
+                    self.enforce_at.get_or_insert(self.now.instant + ENFORCE_EVERY);
                 }
             }
         }

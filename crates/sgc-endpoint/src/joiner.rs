@@ -12,8 +12,8 @@ use sgc_wire::{
     RefuseReason, RejectReason, Signed, SinkId, SourceId,
 };
 
-use crate::endpoint::{Dropped, Endpoint, Event};
-use crate::joins::{Join, JoinState, LostReason, RefusedBy, Wish};
+use crate::endpoint::{Dropped, Endpoint, Event, Output};
+use crate::joins::{Join, JoinState, LostReason, RefusedBy, Rerouting, Wish};
 
 impl Endpoint {
     /// Follows a fleet member's catalogue; false if this identity holds no fleet secret to find it with.
@@ -79,7 +79,7 @@ impl Endpoint {
         self.now = now;
         let Some(join) = self.joins.remove(name) else { return };
         self.followed.remove(name);
-        if let Some(sink) = join.sink() {
+        for sink in join.sink().into_iter().chain(join.rerouted_sink()) {
             self.send(Control::Leave { name: *name, sink });
         }
         self.send(Control::Uninterest { names: vec![*name] });
@@ -142,11 +142,62 @@ impl Endpoint {
             .map(|(n, _)| *n)
             .collect();
         for name in due {
-            if let Some(Join { state: JoinState::ExpectAnswer { sink, .. }, .. }) = self.joins.get(&name) {
-                let sink = *sink;
+            let Some(join) = self.joins.get(&name) else { continue };
+            if let JoinState::Granted { .. } = join.state {
+                if let Some(sink) = join.rerouted_sink() {
+                    self.send(Control::Leave { name, sink });
+                }
+                self.ask_beside(name);
+                continue;
+            }
+            if let JoinState::ExpectAnswer { sink, .. } = join.state {
                 self.send(Control::Leave { name, sink });
             }
             self.ask(name);
+        }
+    }
+
+    /// A router knows a better way than the one that this sink's data takes.
+    pub(crate) fn handle_reroute(&mut self, name: Name, sink: SinkId) {
+        let Some(join) = self.joins.get(&name).filter(|j| j.sink() == Some(sink)) else {
+            return self.unexpected("reroute");
+        };
+        let asks = matches!((&join.state, &join.rerouting), (JoinState::Granted { .. }, Rerouting::No));
+        // An authority's answer is for good: there is nothing that flows.
+        if asks && !matches!(join.wish, Wish::Renew(_)) {
+            self.ask_beside(name);
+        }
+    }
+
+    fn ask_beside(&mut self, name: Name) {
+        let identity = self.config.identity.clone();
+        let Some(join) = self.joins.get_mut(&name) else { return };
+        let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
+        let (sink, reply_key) = join.ask_beside(self.now.instant, reply_key, &mut self.rng);
+        let wish = join.wish.clone();
+        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        self.send(frame);
+    }
+
+    /// Gives up what was asked beside a grant.
+    fn leave_beside(&mut self, name: &Name) {
+        let Some(join) = self.joins.get_mut(name) else { return };
+        let sink = join.rerouted_sink();
+        join.rerouting = Rerouting::No;
+        if let Some(sink) = sink {
+            self.send(Control::Leave { name: *name, sink });
+        }
+    }
+
+    /// What was asked beside a grant takes the place of that grant, which is gone; true if there was something.
+    fn fall_back(&mut self, name: &Name) -> bool {
+        let Some(join) = self.joins.get_mut(name) else { return false };
+        match std::mem::replace(&mut join.rerouting, Rerouting::No) {
+            Rerouting::ExpectAnswer { sink, reply_key, deadline } => {
+                join.state = JoinState::ExpectAnswer { sink, reply_key, deadline };
+                true
+            }
+            Rerouting::No | Rerouting::ExpectRetry { .. } => false,
         }
     }
 
@@ -173,8 +224,13 @@ impl Endpoint {
 
     /// The way to a name's owner is gone.
     pub(crate) fn lose(&mut self, name: Name, reason: LostReason, withdrawn: bool) {
+        self.leave_beside(&name);
         let Some(join) = self.joins.get_mut(&name) else { return };
         join.reachable = None;
+        // Routers keep a branch for as long as its links are there.
+        if let Some(sink) = join.sink() {
+            self.outputs.push_back(Output::Send(Control::Leave { name, sink }));
+        }
         let was = std::mem::replace(&mut join.state, JoinState::ExpectAdvert);
         join.succeeded();
         if let JoinState::Granted { .. } = was {
@@ -244,9 +300,13 @@ impl Endpoint {
 
     fn handle_verified_answer(&mut self, owner: &VerifiedPeer, body: AnswerBody) {
         let AnswerBody { name, sink, serial, answer } = body;
-        let Some(join) = self.joins.get_mut(&name).filter(|j| j.sink() == Some(sink)) else {
+        let Some(join) = self.joins.get_mut(&name) else { return self.unexpected("answer") };
+        if join.rerouted_sink() == Some(sink) {
+            return self.handle_answer_beside(owner, AnswerBody { name, sink, serial, answer });
+        }
+        if join.sink() != Some(sink) {
             return self.unexpected("answer");
-        };
+        }
         let state = std::mem::replace(&mut join.state, JoinState::ExpectAdvert);
         let (reply_key, last, was_granted) = match state {
             JoinState::ExpectAnswer { reply_key, .. } => (reply_key, 0, false),
@@ -265,6 +325,7 @@ impl Endpoint {
             Answer::Refuse { reason } => {
                 let by = RefusedBy::Owner(reason);
                 join.retry(self.now.instant, Some(by), &mut self.rng);
+                self.leave_beside(&name);
                 if was_granted {
                     self.lost(name, LostReason::Refused(reason));
                 }
@@ -283,6 +344,37 @@ impl Endpoint {
             }
             Err(why) => {
                 join.retry(self.now.instant, None, &mut self.rng);
+                self.leave_beside(&name);
+                self.send(Control::Leave { name, sink });
+                self.drop_frame(why.into());
+            }
+        }
+    }
+
+    /// The answer to what was asked over a better way: it takes the place of what was granted before.
+    fn handle_answer_beside(&mut self, owner: &VerifiedPeer, body: AnswerBody) {
+        let AnswerBody { name, sink, serial, answer } = body;
+        let Some(join) = self.joins.get_mut(&name) else { return };
+        let Rerouting::ExpectAnswer { reply_key, .. } = std::mem::replace(&mut join.rerouting, Rerouting::No)
+        else {
+            return;
+        };
+        let (enc, sealed) = match answer {
+            Answer::Grant { enc, sealed } => (enc, sealed),
+            // Whoever is refused now will lose what it has by the owner's own doing.
+            Answer::Refuse { .. } => return,
+        };
+        match reply_key.open(&name, &sink, serial, &enc, &sealed) {
+            Ok(content) => {
+                let old = join.sink();
+                join.state = JoinState::Granted { sink, reply_key, serial };
+                self.granted_content(owner.node_id, name, sink, serial, content);
+                if let Some(old) = old {
+                    self.send(Control::Leave { name, sink: old });
+                }
+            }
+            Err(why) => {
+                join.retry_beside(self.now.instant, &mut self.rng);
                 self.send(Control::Leave { name, sink });
                 self.drop_frame(why.into());
             }
@@ -317,13 +409,23 @@ impl Endpoint {
     }
 
     pub(crate) fn handle_reject(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
-        let Some(join) = self.joins.get_mut(&name).filter(|j| j.sink() == Some(sink)) else {
+        let Some(join) = self.joins.get_mut(&name) else { return self.unexpected("reject") };
+        if join.rerouted_sink() == Some(sink) {
+            // What is granted still serves; if it does not, the answer is there already or will be asked for.
+            return join.retry_beside(self.now.instant, &mut self.rng);
+        }
+        if join.sink() != Some(sink) {
             return self.unexpected("reject");
-        };
+        }
         let was_granted = matches!(join.state, JoinState::Granted { .. });
         let by = RefusedBy::Router(reason);
         // A broken way mends by itself; anything else the user should see while it is retried.
         let visible = !matches!(reason, RejectReason::RouteLost | RejectReason::NoRoute);
+        if was_granted && !visible && self.fall_back(&name) {
+            return self.lost(name, LostReason::Cut(reason));
+        }
+        self.leave_beside(&name);
+        let Some(join) = self.joins.get_mut(&name) else { return };
         join.retry(self.now.instant, visible.then_some(by), &mut self.rng);
         if was_granted {
             self.lost(name, LostReason::Cut(reason));

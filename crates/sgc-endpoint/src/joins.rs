@@ -10,7 +10,9 @@ use sgc_wire::{NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer}
 /// Wait before asking again for what was granted until now: the way may be another by now.
 const RETRY_FIRST: Duration = Duration::from_millis(20);
 /// Shortest wait before asking again after that.
-const RETRY_MIN: Duration = Duration::from_millis(200);
+const RETRY_MIN: Duration = Duration::from_millis(50);
+/// Longest wait before asking again over a better way, while the old one still serves.
+const REROUTE_RETRY: Duration = Duration::from_millis(500);
 /// Longest wait before asking again.
 const RETRY_MAX: Duration = Duration::from_secs(10);
 /// Wait before asking an owner again that refused.
@@ -102,6 +104,17 @@ pub(crate) enum JoinState {
     Granted { sink: SinkId, reply_key: ReplyKey, serial: u64 },
 }
 
+/// Asking again over a better way, while what was granted goes on.
+#[derive(Debug)]
+pub(crate) enum Rerouting {
+    /// It does not.
+    No,
+    /// The owner's answer.
+    ExpectAnswer { sink: SinkId, reply_key: ReplyKey, deadline: Instant },
+    /// The time to ask again.
+    ExpectRetry { at: Instant },
+}
+
 /// A joined name.
 #[derive(Debug)]
 pub(crate) struct Join {
@@ -111,12 +124,15 @@ pub(crate) struct Join {
     /// The owner as its last advertisement proved it; `None` while there is none.
     pub(crate) reachable: Option<VerifiedPeer>,
     pub(crate) state: JoinState,
+    /// Only while granted.
+    pub(crate) rerouting: Rerouting,
     attempts: u32,
 }
 
 impl Join {
     pub(crate) fn new(owner: NodeId, wish: Wish) -> Self {
-        Self { owner, wish, reachable: None, state: JoinState::ExpectAdvert, attempts: 0 }
+        let (state, rerouting) = (JoinState::ExpectAdvert, Rerouting::No);
+        Self { owner, wish, reachable: None, state, rerouting, attempts: 0 }
     }
 
     pub(crate) fn status(&self) -> JoinStatus {
@@ -137,13 +153,27 @@ impl Join {
         }
     }
 
+    /// The sink that asks again over a better way.
+    pub(crate) fn rerouted_sink(&self) -> Option<SinkId> {
+        match &self.rerouting {
+            Rerouting::ExpectAnswer { sink, .. } => Some(*sink),
+            Rerouting::No | Rerouting::ExpectRetry { .. } => None,
+        }
+    }
+
     /// When to act if nothing happens.
     pub(crate) fn deadline(&self) -> Option<Instant> {
-        match &self.state {
+        let state = match &self.state {
             JoinState::ExpectAnswer { deadline, .. } => Some(*deadline),
             JoinState::ExpectRetry { at, .. } => Some(*at),
             _ => None,
-        }
+        };
+        let rerouting = match (&self.state, &self.rerouting) {
+            (JoinState::Granted { .. }, Rerouting::ExpectAnswer { deadline, .. }) => Some(*deadline),
+            (JoinState::Granted { .. }, Rerouting::ExpectRetry { at }) => Some(*at),
+            _ => None,
+        };
+        state.into_iter().chain(rerouting).min()
     }
 
     /// Asks now: a fresh sink id and reply key.
@@ -153,13 +183,30 @@ impl Join {
         reply_key: ReplyKey,
         rng: &mut impl RngCore,
     ) -> (SinkId, Bytes) {
-        let mut id = [0; 16];
-        rng.fill_bytes(&mut id);
-        let sink = SinkId(id);
+        let sink = fresh_sink(rng);
         let public = reply_key.public().clone();
         self.attempts = self.attempts.saturating_add(1);
         self.state = JoinState::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };
         (sink, public)
+    }
+
+    /// Asks over a better way, beside what is granted.
+    pub(crate) fn ask_beside(
+        &mut self,
+        now: Instant,
+        reply_key: ReplyKey,
+        rng: &mut impl RngCore,
+    ) -> (SinkId, Bytes) {
+        let sink = fresh_sink(rng);
+        let public = reply_key.public().clone();
+        self.rerouting = Rerouting::ExpectAnswer { sink, reply_key, deadline: now + ANSWER_WAIT };
+        (sink, public)
+    }
+
+    /// Asks over a better way a little later: the way may not be there yet.
+    pub(crate) fn retry_beside(&mut self, now: Instant, rng: &mut impl RngCore) {
+        let wait = REROUTE_RETRY.mul_f64(0.5 + f64::from(rng.next_u32() % 1000) / 2000.0);
+        self.rerouting = Rerouting::ExpectRetry { at: now + wait };
     }
 
     /// Asks again later: soon and then ever more patiently, with jitter so that many do not ask at once.
@@ -177,4 +224,10 @@ impl Join {
     pub(crate) fn succeeded(&mut self) {
         self.attempts = 0;
     }
+}
+
+fn fresh_sink(rng: &mut impl RngCore) -> SinkId {
+    let mut id = [0; 16];
+    rng.fill_bytes(&mut id);
+    SinkId(id)
 }

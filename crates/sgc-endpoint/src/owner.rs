@@ -142,6 +142,7 @@ impl Endpoint {
             self.withdrawn.insert(blind);
         }
         self.renew_at = None;
+        self.enforce_at = None;
     }
 
     /// Answers [`Event::RenewAsked`], once or again when something changed.

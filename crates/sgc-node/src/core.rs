@@ -5,6 +5,7 @@
 
 mod outputs;
 mod publish;
+mod quality;
 mod ros;
 mod trust;
 
@@ -25,6 +26,7 @@ use tracing::debug;
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::publish::{Offer, Publishing};
+use crate::core::quality::Pulse;
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
 use crate::links::ControlTx;
@@ -148,6 +150,7 @@ struct LinkEntry {
     flows: HashMap<Name, Arc<OutFlow>>,
     /// Why this node closed it, if it did.
     closed_for: Option<String>,
+    pulse: Pulse,
 }
 
 /// The control task's state. `N` is the local network; a pure router has none.
@@ -159,6 +162,8 @@ pub(crate) struct Core<N: RosNetwork> {
     network: Option<Arc<N>>,
     data: Arc<DataPlane>,
     links: BTreeMap<LinkId, LinkEntry>,
+    /// When to look at them.
+    look_due: Option<Instant>,
     next_link: u32,
     entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
     shares: HashMap<Name, Arc<LocalShare>>,
@@ -248,6 +253,7 @@ impl<N: RosNetwork> Core<N> {
             network: parts.network,
             data: Arc::default(),
             links: BTreeMap::new(),
+            look_due: None,
             next_link: 1,
             entries: HashMap::new(),
             shares: HashMap::new(),
@@ -329,15 +335,17 @@ impl<N: RosNetwork> Core<N> {
                 let remote = link.remote();
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                self.links
-                    .insert(id, LinkEntry { link, url, control, flows: HashMap::new(), closed_for: None });
+                let (flows, pulse) = (HashMap::new(), Pulse::new(&link));
+                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, pulse });
+                self.begin_to_look();
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
                 self.router.handle_link_up(now(), id, neighbour);
+                self.look_at_link(id);
             }
             CoreEvent::LinkDown { id } => {
-                self.router.handle_link_down(id);
+                self.router.handle_link_down(now(), id);
                 if let Some(entry) = self.links.remove(&id) {
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
                     let record = record.remote(entry.link.remote());
@@ -419,6 +427,7 @@ impl<N: RosNetwork> Core<N> {
 
     fn handle_timeouts(&mut self) {
         let now = now();
+        self.look_at_links(now.instant);
         self.router.handle_timeout(now);
         self.endpoint.handle_timeout(now);
         if let Some(routes) = &mut self.routes {
@@ -478,7 +487,7 @@ impl<N: RosNetwork> Core<N> {
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
-                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due];
+                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due, self.look_due];
                 return all.into_iter().flatten().min();
             }
         }
@@ -537,6 +546,8 @@ impl<N: RosNetwork> Core<N> {
                 url: entry.url.clone(),
                 kex: stats.key_exchange.label(),
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                cost: self.router.link_cost(*id).map_or(0, |(cost, _)| cost),
+                silent: self.router.link_cost(*id).is_some_and(|(_, silent)| silent),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
             }
@@ -573,6 +584,7 @@ impl<N: RosNetwork> Core<N> {
                 .filter(|(_, n)| *n > 0)
                 .collect(),
             router: RouterLine {
+                nodes: router.nodes,
                 names: router.names,
                 routed_names: router.routed_names,
                 branches: router.branches,

@@ -149,6 +149,7 @@ impl DataPlane {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
+    use sgc_router::Tree;
     use sgc_wire::{Class, HOP_LIMIT, PacketHeader, Payload, SourceId};
 
     use super::*;
@@ -159,12 +160,8 @@ mod tests {
         let [up, near, far] = [1, 2, 3].map(LinkId);
         let outs = [near, far].map(|link| (link, OutFlow::idle()));
         let ways = outs.iter().map(|(link, flow)| (*link, Out::Link(flow.clone()))).collect();
-        let entry = FibEntry {
-            up,
-            down: [near, far].as_slice().into(),
-            publishers: [].as_slice().into(),
-            sinks: vec![],
-        };
+        let (down, publishers) = ([near, far].as_slice().into(), [].as_slice().into());
+        let entry = FibEntry { trees: [Tree { up, down, publishers }].into(), sinks: vec![] };
         let data = DataPlane::default();
         data.set(name, Some(Forward::new(entry, ways, Arc::default())));
         for reliable in [true, false] {

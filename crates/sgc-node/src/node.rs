@@ -241,13 +241,18 @@ pub async fn run_on<N: RosNetwork>(
     let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
 
     let mut rng = system_rng()?;
-    let router = Router::new(RouterConfig {
+    let started = now();
+    let router_config = RouterConfig {
         node: identity.node_id(),
+        identity: identity.clone(),
         transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
+        started: started.unix,
+        mapping: sgc_router::MappingKind::Flood,
         anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
-    });
+    };
+    let router = Router::new(router_config, started);
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
         authority: config.authority.is_some(),

@@ -49,6 +49,10 @@ pub struct LinkStatus {
     pub kex: &'static str,
     /// Smoothed round-trip time, microseconds.
     pub rtt_us: u64,
+    /// What the link costs where ways are weighed, microseconds of round trip.
+    pub cost: u32,
+    /// True while nothing comes over it although something should.
+    pub silent: bool,
     /// Bytes sent.
     pub sent_bytes: u64,
     /// Bytes received.
@@ -120,6 +124,8 @@ impl NameStatus {
 /// How much the router knows.
 #[derive(Clone, Debug, Serialize)]
 pub struct RouterLine {
+    /// Nodes that described their links.
+    pub nodes: usize,
     /// Names in any state.
     pub names: usize,
     /// Names with a route.

@@ -2,7 +2,7 @@
 //!
 //! A pure machine. The driver calls `handle_*` with what happened and the time, and after each call drains
 //! [`Router::poll_output`] until it says [`Output::Timeout`]; that is the contract. The machine knows links by
-//! number, never by address; it sees no payload and holds no key but the fleet's public ones. The data path
+//! number, never by address; it sees no payload and holds no key but the one that its node signs with. The data path
 //! reads [`FibEntry`]s and never calls the machine. The normative text is `docs/spec/routing.md`.
 //!
 //! Every node has one, proxies too: a proxy is a router that carries nobody else's names, with its own
@@ -10,13 +10,18 @@
 #![forbid(unsafe_code)]
 
 mod fib;
+mod limits;
 mod links;
-mod rib;
+mod mapping;
+mod names;
 mod router;
-mod routes;
+mod spf;
+mod topology;
 mod tree;
 mod trust;
 
-pub use fib::FibEntry;
+pub use fib::{FibEntry, Tree};
+pub use limits::Limits;
 pub use links::Neighbour;
-pub use router::{DropReason, Dropped, Limits, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats};
+pub use mapping::MappingKind;
+pub use router::{DropReason, Dropped, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats};

@@ -1,16 +1,24 @@
-//! One neighbour: who it is, what it said of itself, and what depends on it.
+//! One neighbour: who it is, what it said of itself, what its link costs, and what depends on it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
-use sgc_wire::{Hello, Name, NodeId, Now, UnixMillis};
+use sgc_wire::{Hello, Name, NodeId, Now, SinkId, UnixMillis};
 
-use crate::Limits;
+use crate::names::RecordId;
 
-/// How many times as many requests a router may bring as a proxy.
-const ROUTER_FACTOR: u32 = 16;
+/// What every link costs besides its round trip: among ways that are as quick, the one with fewer links is better.
+const COST_OF_LINK: u32 = 1000;
+/// Cost of a link whose round trip is not known.
+const COST_UNKNOWN: u32 = 10_000;
+/// What a link costs besides while it seems dead: it is a way only where there is no other.
+pub(crate) const COST_SUSPECT: u32 = 1 << 28;
+/// A measured round trip counts when it has been that far from the one that counts: by a quarter and by this.
+const COST_CHANGE_MIN: u32 = 2000;
+/// For how long it must have been so.
+const COST_CHANGE_AFTER: Duration = Duration::from_secs(5);
 
 /// What the handshake proved of the node at the other end of a link.
 #[derive(Clone, Debug)]
@@ -23,14 +31,19 @@ pub struct Neighbour {
     pub may_route: bool,
     /// Last moment at which its certificate holds.
     pub not_after: UnixMillis,
+    /// What the link is to cost, microseconds of round trip; `None` if that is to be measured.
+    pub cost: Option<u32>,
 }
 
 impl From<&VerifiedPeer> for Neighbour {
     fn from(peer: &VerifiedPeer) -> Self {
         let VerifiedPeer { node_id, path, may_route, not_after, .. } = peer;
-        Self { node: *node_id, certs: path.clone(), may_route: *may_route, not_after: *not_after }
+        Self { node: *node_id, certs: path.clone(), may_route: *may_route, not_after: *not_after, cost: None }
     }
 }
+
+/// What a link was told of a name that it asked for: the record's number, and the cost.
+pub(crate) type Told = Option<(RecordId, u32)>;
 
 /// State of a link that is up.
 #[derive(Debug)]
@@ -44,44 +57,46 @@ pub(crate) struct LinkState {
     pub(crate) expires: Option<Instant>,
     /// Its greeting; nothing else is accepted before it.
     pub(crate) hello: Option<Hello>,
-    /// Names with a route or a branch over this link.
-    pub(crate) names: BTreeSet<Name>,
-    /// Names that it wants to hear of.
-    pub(crate) interests: BTreeSet<Name>,
-    /// Number of routes learned over it.
-    pub(crate) routes: usize,
-    /// Number of branches over it.
-    pub(crate) branches: usize,
-    joins: Budget,
-    forgeries: Budget,
+    pub(crate) cost: Cost,
+    /// Branches that it is an end of.
+    pub(crate) branches: BTreeSet<(Name, SinkId)>,
+    /// Names that it wants to hear of, and what it heard.
+    pub(crate) interests: BTreeMap<Name, Told>,
+    /// Names that its node asked for and nobody knew, and until when it is to be told. Routers only.
+    pub(crate) asks: BTreeMap<Name, Instant>,
+    /// Owners of names that its node asked for, and until when it is to be told of changes. Routers only.
+    pub(crate) follows: BTreeMap<NodeId, Instant>,
+    /// Names that are known over it.
+    pub(crate) names: usize,
 }
 
 impl LinkState {
-    pub(crate) fn new(now: Now, neighbour: Neighbour, limits: &Limits) -> Self {
+    pub(crate) fn new(now: Now, neighbour: Neighbour) -> Self {
         let left = Duration::from_millis(neighbour.not_after.0.saturating_sub(now.unix.0));
         Self {
             certs: neighbour.certs,
             may_route: neighbour.may_route,
             // One that outlasts the clock never ends.
             expires: now.instant.checked_add(left),
-            ..Self::local(neighbour.node, limits)
+            cost: Cost::new(neighbour.cost),
+            ..Self::local(neighbour.node)
         }
     }
 
     /// The link to this node's own endpoint.
-    pub(crate) fn local(node: NodeId, limits: &Limits) -> Self {
+    pub(crate) fn local(node: NodeId) -> Self {
         Self {
             node,
             certs: Arc::new([]),
             may_route: false,
             expires: None,
             hello: None,
-            names: BTreeSet::new(),
-            interests: BTreeSet::new(),
-            routes: 0,
-            branches: 0,
-            joins: Budget::new(limits.joins_burst, limits.joins_burst / 8),
-            forgeries: Budget::new(limits.forgeries_max, 1),
+            cost: Cost::new(Some(0)),
+            branches: BTreeSet::new(),
+            interests: BTreeMap::new(),
+            asks: BTreeMap::new(),
+            follows: BTreeMap::new(),
+            names: 0,
         }
     }
 
@@ -89,43 +104,54 @@ impl LinkState {
     pub(crate) fn is_transit(&self) -> bool {
         self.may_route && self.hello.is_some_and(|h| h.transit)
     }
-
-    /// Takes one from what the link may ask for; false if there is none left. This node asks as it likes.
-    pub(crate) fn may_ask(&mut self, now: Instant) -> bool {
-        let factor = if self.is_transit() { ROUTER_FACTOR } else { 1 };
-        self.certs.is_empty() || self.joins.take(now, factor)
-    }
-
-    /// Takes one from what the link may get wrong; false if there is none left.
-    pub(crate) fn may_err(&mut self, now: Instant) -> bool {
-        self.forgeries.take(now, 1)
-    }
 }
 
-/// A bucket of tokens that refills with time.
+/// What a link costs: a set figure, or its round trip, damped so that jitter moves nothing.
 #[derive(Debug)]
-struct Budget {
-    burst: u32,
-    /// Tokens a second.
-    rate: u32,
-    used: f64,
-    at: Option<Instant>,
+pub(crate) struct Cost {
+    set: Option<u32>,
+    /// Smoothed round trip, microseconds.
+    smoothed: Option<u32>,
+    /// The round trip that counts.
+    counts: Option<u32>,
+    /// Since when the smoothed one is far from it.
+    differs_since: Option<Instant>,
+    /// True while nothing at all comes over the link.
+    suspect: bool,
 }
 
-impl Budget {
-    fn new(burst: u32, rate: u32) -> Self {
-        Self { burst, rate: rate.max(1), used: 0.0, at: None }
+impl Cost {
+    fn new(set: Option<u32>) -> Self {
+        Self { set, smoothed: None, counts: None, differs_since: None, suspect: false }
     }
 
-    fn take(&mut self, now: Instant, factor: u32) -> bool {
-        let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
-        self.at = Some(now);
-        self.used = (self.used - elapsed.as_secs_f64() * f64::from(self.rate) * f64::from(factor)).max(0.0);
-        let room = self.used + 1.0 <= f64::from(self.burst) * f64::from(factor);
-        if room {
-            self.used += 1.0;
+    /// What it is now.
+    pub(crate) fn now(&self) -> u32 {
+        let measured = || self.counts.map_or(COST_UNKNOWN, |rtt| rtt.saturating_add(COST_OF_LINK));
+        let cost = self.set.unwrap_or_else(measured);
+        if self.suspect { cost.saturating_add(COST_SUSPECT) } else { cost }
+    }
+
+    /// True while nothing at all comes over the link.
+    pub(crate) fn is_suspect(&self) -> bool {
+        self.suspect
+    }
+
+    /// Takes a measurement; true if that changes the cost.
+    pub(crate) fn measure(&mut self, now: Instant, rtt: Duration, suspect: bool) -> bool {
+        let before = self.now();
+        self.suspect = suspect;
+        let rtt = u32::try_from(rtt.as_micros()).unwrap_or(u32::MAX).min(COST_SUSPECT / 2);
+        let smoothed = self.smoothed.map_or(rtt, |old| old - old / 8 + rtt / 8);
+        self.smoothed = Some(smoothed);
+        let counts = *self.counts.get_or_insert(smoothed);
+        if smoothed.abs_diff(counts) <= (counts / 4).max(COST_CHANGE_MIN) {
+            self.differs_since = None;
+        } else if now.saturating_duration_since(*self.differs_since.get_or_insert(now)) >= COST_CHANGE_AFTER {
+            self.counts = Some(smoothed);
+            self.differs_since = None;
         }
-        room
+        self.now() != before
     }
 }
 
@@ -133,17 +159,37 @@ impl Budget {
 mod tests {
     use super::*;
 
+    fn ms(n: u64) -> Duration {
+        Duration::from_millis(n)
+    }
+
     #[test]
-    fn a_budget_is_spent_and_comes_back_with_time() {
+    fn jitter_does_not_move_a_cost_and_a_lasting_change_does() {
         #[allow(clippy::disallowed_methods)]
         let start = Instant::now();
-        let mut budget = Budget::new(4, 2);
-        let taken = |budget: &mut Budget, at| (0..10).filter(|_| budget.take(at, 1)).count();
-        assert_eq!(taken(&mut budget, start), 4);
-        assert_eq!(taken(&mut budget, start + Duration::from_secs(1)), 2);
-        assert_eq!(taken(&mut budget, start + Duration::from_secs(60)), 4);
-        assert_eq!((0..100).filter(|_| Budget::new(4, 2).take(start, 16)).count(), 100);
-        let mut shared = Budget::new(4, 2);
-        assert_eq!((0..100).filter(|_| shared.take(start, 16)).count(), 64);
+        let mut cost = Cost::new(None);
+        assert_eq!(cost.now(), COST_UNKNOWN);
+        assert!(cost.measure(start, ms(20), false));
+        let first = cost.now();
+        assert_eq!(first, 20_000 + COST_OF_LINK);
+        for n in 0..600 {
+            let rtt = ms([12, 30, 21, 19, 25, 14][n as usize % 6]);
+            assert!(!cost.measure(start + ms(100 * n), rtt, false), "moved by jitter");
+        }
+        let later = start + ms(60_000);
+        let moved = (0..600).find(|n| cost.measure(later + ms(100 * n), ms(60), false)).unwrap();
+        assert!(moved * 100 >= 5000, "moved after {moved} tenths of a second");
+        assert!(cost.now() > 2 * first && (0..600).all(|n| !cost.measure(later + ms(n), ms(60), false)));
+    }
+
+    #[test]
+    fn a_link_that_seems_dead_is_the_last_choice_and_a_set_cost_is_not_measured() {
+        #[allow(clippy::disallowed_methods)]
+        let start = Instant::now();
+        let mut cost = Cost::new(Some(7));
+        assert!(!cost.measure(start, ms(900), false));
+        assert_eq!(cost.now(), 7);
+        assert!(cost.measure(start, ms(900), true) && cost.now() == 7 + COST_SUSPECT);
+        assert!(cost.measure(start, ms(900), false) && cost.now() == 7);
     }
 }

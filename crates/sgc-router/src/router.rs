@@ -1,18 +1,22 @@
 //! The machine: frames and link changes in, frames and forwarding entries out.
 //!
-//! Routes are in `routes.rs`, trees in `tree.rs`, whom to believe in `trust.rs`.
+//! The network is in `topology.rs`, names are in `names.rs`, trees in `tree.rs`, whom to believe in `trust.rs`.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_trust::{CrlError, SignedError, TrustAnchors};
-use sgc_wire::{Control, Hello, Name, NodeId, Now, RejectReason, SinkId};
+use sgc_trust::{CrlError, Identity, SignedError, TrustAnchors};
+use sgc_wire::{Control, Hello, Name, NodeId, Now, SinkId, UnixMillis};
 
 use crate::FibEntry;
+use crate::limits::{Allowance, Limits};
 use crate::links::{LinkState, Neighbour};
-use crate::rib::NameState;
+use crate::mapping::{Mapping, MappingKind};
+use crate::names::Names;
+use crate::topology::Topology;
+use crate::tree::Tree;
 
 /// A link of this node, by number. Numbers are never used again while the process lives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -29,61 +33,24 @@ impl fmt::Display for LinkId {
     }
 }
 
-/// Bounds on what neighbours may make this node remember.
-#[derive(Clone, Debug)]
-pub struct Limits {
-    /// Routes learned over a link to a router.
-    pub routes_per_router_max: usize,
-    /// Routes learned over a link to a proxy (its own names).
-    pub routes_per_proxy_max: usize,
-    /// Branches over one link.
-    pub branches_per_link_max: usize,
-    /// Branches of one name.
-    pub branches_per_name_max: usize,
-    /// Names that one link may ask for.
-    pub interests_per_link_max: usize,
-    /// Withdrawn names remembered against replay, and as many lost ones against circles.
-    pub tombstones_max: usize,
-    /// How long an owner may take to answer a join.
-    pub answer_wait: Duration,
-    /// Longest lease of an advertisement that is honoured.
-    pub lease_max: Duration,
-    /// Links of one node at one time.
-    pub links_per_node_max: usize,
-    /// Requests to join that a proxy's link may bring at once; refilled by an eighth of it a second. A router's, which
-    /// speaks for many, may bring sixteen times as many.
-    pub joins_burst: u32,
-    /// Things that do not verify which a link may bring before it is closed; one is forgiven a second.
-    pub forgeries_max: u32,
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self {
-            routes_per_router_max: 1_000_000,
-            routes_per_proxy_max: 16_384,
-            branches_per_link_max: 65_536,
-            branches_per_name_max: 4096,
-            interests_per_link_max: 65_536,
-            tombstones_max: 100_000,
-            answer_wait: Duration::from_secs(10),
-            lease_max: Duration::from_secs(600),
-            links_per_node_max: 8,
-            joins_burst: 1024,
-            forgeries_max: 64,
-        }
-    }
-}
+/// Links of one node; each must fit into what it says of itself.
+const LINKS_MAX: usize = sgc_wire::ADJACENCIES_MAX + sgc_wire::ATTACHED_MAX;
 
 /// What a router is made of.
 #[derive(Clone, Debug)]
 pub struct RouterConfig {
-    /// This node.
+    /// This node, and what it signs with.
+    pub identity: Arc<Identity>,
+    /// The same, by its id.
     pub node: NodeId,
     /// True if it carries others' names.
     pub transit: bool,
     /// Random number of this run.
     pub incarnation: u64,
+    /// When this run began: what the node advertised before is void.
+    pub started: UnixMillis,
+    /// How it becomes known where names are; of no meaning unless `transit`.
+    pub mapping: MappingKind,
     /// Whose certificates it believes.
     pub anchors: Arc<TrustAnchors>,
     /// Bounds.
@@ -260,6 +227,8 @@ pub struct RouterStats {
     pub routed_names: usize,
     /// Names in any state.
     pub names: usize,
+    /// Nodes that described their links.
+    pub nodes: usize,
     /// Branches, pending ones included.
     pub branches: usize,
     /// Withdrawn names remembered.
@@ -270,49 +239,50 @@ pub struct RouterStats {
 #[derive(Debug)]
 pub struct Router {
     pub(crate) config: RouterConfig,
+    pub(crate) mapping: Box<dyn Mapping>,
     pub(crate) links: BTreeMap<LinkId, LinkState>,
-    pub(crate) names: BTreeMap<Name, NameState>,
-    /// Withdrawn names: the withdrawal's sequence number, and until when a replay would still verify.
-    pub(crate) tombstones: BTreeMap<Name, (u64, Instant)>,
-    pub(crate) forgets: BTreeSet<(Instant, Name)>,
-    /// Names without a route whose feasible distance is remembered, and until when.
-    pub(crate) memories: BTreeSet<(Instant, Name)>,
-    pub(crate) expiries: BTreeSet<(Instant, Name, LinkId)>,
-    pub(crate) pending: BTreeSet<(Instant, Name, SinkId)>,
-    /// Names that neighbours are to be told are out of reach, gathered into few frames; always sent before any other
-    /// frame to the same neighbour.
-    pub(crate) unreached: BTreeMap<LinkId, Vec<Name>>,
+    allowances: BTreeMap<NodeId, Allowance>,
+    pub(crate) topology: Topology,
+    pub(crate) names: Names,
+    pub(crate) trees: BTreeMap<Name, Tree>,
+    /// Branches that wait for something, and until when.
+    pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
     pub(crate) outputs: VecDeque<Output>,
+    /// As the driver said last.
+    pub(crate) now: Now,
 }
 
 impl Router {
     /// A router with nothing but its local link.
-    pub fn new(config: RouterConfig) -> Self {
-        let mut local = LinkState::local(config.node, &config.limits);
+    pub fn new(config: RouterConfig, now: Now) -> Self {
+        let mut local = LinkState::local(config.node);
         local.hello = Some(Hello { minor: 0, incarnation: config.incarnation, transit: false });
+        let mut topology = Topology::default();
+        topology.touch_own(now.instant);
         Self {
+            mapping: config.mapping.build(),
             config,
             links: BTreeMap::from([(LinkId::LOCAL, local)]),
-            names: BTreeMap::new(),
-            tombstones: BTreeMap::new(),
-            forgets: BTreeSet::new(),
-            memories: BTreeSet::new(),
-            expiries: BTreeSet::new(),
-            pending: BTreeSet::new(),
-            unreached: BTreeMap::new(),
+            allowances: BTreeMap::new(),
+            topology,
+            names: Names::default(),
+            trees: BTreeMap::new(),
+            deadlines: BTreeSet::new(),
             outputs: VecDeque::new(),
+            now,
         }
     }
 
     /// A link to an authenticated node is up; greets it.
     pub fn handle_link_up(&mut self, now: Now, link: LinkId, neighbour: Neighbour) {
         debug_assert_ne!(link, LinkId::LOCAL);
+        self.now = now;
         let of_node = self.links.values().filter(|l| l.node == neighbour.node).count();
         let refused = if neighbour.node == self.config.node {
             Some(LinkClose::Loop)
         } else if self.is_untrusted(&neighbour.certs) {
             Some(LinkClose::Revoked)
-        } else if of_node >= self.config.limits.links_per_node_max {
+        } else if of_node >= self.config.limits.links_per_node_max || self.links.len() >= LINKS_MAX {
             Some(LinkClose::TooMany)
         } else {
             None
@@ -321,7 +291,7 @@ impl Router {
             self.outputs.push_back(Output::Close { link, reason });
             return;
         }
-        self.links.insert(link, LinkState::new(now, neighbour, &self.config.limits));
+        self.links.insert(link, LinkState::new(now, neighbour));
         let hello = Hello { minor: 0, incarnation: self.config.incarnation, transit: self.config.transit };
         self.send(link, Control::Hello(hello));
         // Before anything that they bear on.
@@ -331,13 +301,25 @@ impl Router {
     }
 
     /// A link is down; everything that depended on it is taken back.
-    pub fn handle_link_down(&mut self, link: LinkId) {
+    pub fn handle_link_down(&mut self, now: Now, link: LinkId) {
         debug_assert_ne!(link, LinkId::LOCAL);
+        self.now = now;
         self.forget_link(link);
+    }
+
+    /// What is measured of a link: its round trip, and whether nothing at all comes over it although something should.
+    /// Such a link is used only where there is no other way.
+    pub fn handle_link_quality(&mut self, now: Now, link: LinkId, round_trip: Duration, suspect: bool) {
+        self.now = now;
+        let Some(state) = self.links.get_mut(&link) else { return };
+        if state.cost.measure(now.instant, round_trip, suspect) {
+            self.links_changed(now.instant);
+        }
     }
 
     /// A frame came over a link.
     pub fn handle_frame(&mut self, now: Now, link: LinkId, frame: Control) {
+        self.now = now;
         let Some(state) = self.links.get(&link) else {
             self.drop_frame(link, DropReason::NoLink);
             return;
@@ -349,9 +331,9 @@ impl Router {
         }
         match frame {
             Control::Hello(hello) => self.handle_hello(link, hello),
-            Control::Advert { hops, signed } => self.handle_advert(now, link, hops, signed),
+            Control::Advert { cost, signed } => self.handle_advert(now, link, cost, signed),
             Control::Unreach { names } => self.handle_unreach(link, &names),
-            Control::Interest { names } => self.handle_interest(link, &names),
+            Control::Interest { names } => self.handle_interest(now, link, &names),
             Control::Uninterest { names } => self.handle_uninterest(link, &names),
             Control::Join { signed } => self.handle_join(now, link, signed),
             Control::Leave { name, sink } => self.handle_leave(link, name, sink),
@@ -360,6 +342,9 @@ impl Router {
             Control::Recover(recover) => self.handle_recover(link, recover),
             Control::Crl { der } => self.handle_crl(now, link, &der),
             Control::Ack { name, sink, serial } => self.handle_ack(link, name, sink, serial),
+            Control::LinkState { signed } => self.handle_link_state(now, link, signed),
+            Control::Query { hops, names } => self.handle_query(now, link, hops, &names),
+            Control::Reroute { name, sink } => self.handle_reroute(link, name, sink),
             Control::Goodbye => {
                 self.outputs.push_back(Output::Close { link, reason: LinkClose::Goodbye });
                 self.forget_link(link);
@@ -369,65 +354,59 @@ impl Router {
 
     /// Time passed.
     pub fn handle_timeout(&mut self, now: Now) {
-        while let Some(&(at, name, link)) = self.expiries.first().filter(|(at, ..)| *at <= now.instant) {
-            self.expiries.remove(&(at, name, link));
-            if self.names.get(&name).and_then(|s| s.route_over(link)).is_some_and(|r| r.expires == at) {
-                self.lose_route(name, link);
-            }
-        }
-        while let Some(&(at, name, sink)) = self.pending.first().filter(|(at, ..)| *at <= now.instant) {
-            if let Some(branch) = self.remove_branch(name, sink) {
-                let reason = RejectReason::TimedOut;
-                self.send(branch.link, Control::Reject { name, sink, reason });
-                self.send_up(name, Control::Leave { name, sink });
-                self.tidy(name);
-            } else {
-                self.pending.remove(&(at, name, sink));
-            }
-        }
-        while let Some(&(at, name)) = self.forgets.first().filter(|(at, _)| *at <= now.instant) {
-            self.forgets.remove(&(at, name));
-            self.tombstones.remove(&name);
-        }
+        self.now = now;
         self.close_expired(now);
-        while let Some(&(_, name)) = self.memories.first().filter(|(at, _)| *at <= now.instant) {
-            self.forget(name);
-        }
+        self.expire_nodes(now);
+        self.names_timeout(now);
+        self.branches_timeout(now);
     }
 
     /// The next thing to do; call until it is [`Output::Timeout`].
     pub fn poll_output(&mut self) -> Output {
         if self.outputs.is_empty() {
-            while let Some(link) = self.unreached.keys().next().copied() {
-                self.flush_unreached(link);
-            }
+            self.originate_due(self.now);
+            self.search_due(self.now);
+            self.ask_due(self.now);
         }
         self.outputs.pop_front().unwrap_or_else(|| {
-            let expiry = self.expiries.first().map(|(at, ..)| *at);
-            let pending = self.pending.first().map(|(at, ..)| *at);
-            let forget = self.forgets.first().map(|(at, _)| *at);
-            let memory = self.memories.first().map(|(at, _)| *at);
-            let links = self.links.values().filter_map(|l| l.expires).min();
-            Output::Timeout([expiry, pending, forget, memory, links].into_iter().flatten().min())
+            let branch = self.deadlines.first().map(|(at, ..)| *at);
+            let links = self.links.values().filter_map(|l| l.expires);
+            let topology = [self.topology.search_at, self.topology.originate_at, self.topology.next_expiry()];
+            let all = topology.into_iter().flatten().chain(branch).chain(links).chain(self.names.deadlines());
+            Output::Timeout(all.min())
         })
+    }
+
+    /// Another certificate of this node: it describes itself anew.
+    pub fn set_identity(&mut self, now: Now, identity: Arc<Identity>) {
+        self.now = now;
+        self.config.identity = identity;
+        self.topology.touch_own(now.instant);
     }
 
     /// How much is known.
     pub fn stats(&self) -> RouterStats {
         RouterStats {
-            routed_names: self.names.values().filter(|s| s.route().is_some()).count(),
-            names: self.names.len(),
-            branches: self.links.values().map(|l| l.branches).sum(),
-            tombstones: self.tombstones.len(),
+            routed_names: self.routed_names(),
+            names: self.names.known(),
+            nodes: self.topology.len(),
+            branches: self.trees.values().map(|t| t.branches.len()).sum(),
+            tombstones: self.names.tombstones(),
         }
     }
 
-    /// The link towards the owner of `name`, and how far it is in links.
-    pub fn route(&self, name: &Name) -> Option<(LinkId, u8)> {
-        self.names.get(name)?.route().map(|r| (r.link, r.distance()))
+    /// The link towards the owner of `name`, and the cost of the way, microseconds of round trip.
+    pub fn route(&self, name: &Name) -> Option<(LinkId, u32)> {
+        self.way(name)
     }
 
-    pub(crate) fn handle_hello(&mut self, link: LinkId, hello: Hello) {
+    /// What a link costs, microseconds of round trip, and whether it seems dead.
+    pub fn link_cost(&self, link: LinkId) -> Option<(u32, bool)> {
+        let cost = &self.links.get(&link)?.cost;
+        Some((cost.now(), cost.is_suspect()))
+    }
+
+    fn handle_hello(&mut self, link: LinkId, hello: Hello) {
         let Some(state) = self.links.get_mut(&link) else { return };
         state.hello = Some(hello);
         let (node, to_router) = (state.node, state.is_transit());
@@ -458,48 +437,37 @@ impl Router {
             return;
         }
         if to_router {
-            self.send_routes(link);
+            self.send_topology(link);
+            self.send_names(link);
         }
         self.send_interests(link);
+        self.links_changed(self.now.instant);
     }
 
     /// Takes back everything that came over or goes over `link`.
     pub(crate) fn forget_link(&mut self, link: LinkId) {
         let Some(state) = self.links.remove(&link) else { return };
-        for name in state.names.union(&state.interests).copied() {
-            let Some(entry) = self.names.get_mut(&name) else { continue };
-            entry.interested.remove(&link);
-            let sinks: Vec<_> =
-                entry.branches.iter().filter(|(_, b)| b.link == link).map(|(s, _)| *s).collect();
-            for sink in sinks {
-                self.remove_branch(name, sink);
-                self.send_up(name, Control::Leave { name, sink });
-            }
-            self.lose_route(name, link);
-            self.tidy(name);
+        for name in state.interests.keys() {
+            self.unwatch(link, name);
         }
+        self.cut_link(link, state.branches);
+        self.unhear(link);
+        if state.hello.is_some() {
+            self.links_changed(self.now.instant);
+        }
+        let now = self.now.instant;
+        let links = &self.links;
+        self.allowances
+            .retain(|node, allowance| !allowance.is_whole(now) || links.values().any(|l| l.node == *node));
     }
 
-    /// Forgets that `name` depends on `link` if it no longer does.
-    pub(crate) fn release(&mut self, name: Name, link: LinkId) {
-        let depends = self
-            .names
-            .get(&name)
-            .is_some_and(|s| s.route_over(link).is_some() || s.branches.values().any(|b| b.link == link));
-        if !depends && let Some(state) = self.links.get_mut(&link) {
-            state.names.remove(&name);
-        }
-    }
-
-    /// Forgets a name of which nothing is known any more.
-    pub(crate) fn tidy(&mut self, name: Name) {
-        if self.names.get(&name).is_some_and(NameState::is_idle) {
-            self.names.remove(&name);
-        }
+    /// What a node may still do here.
+    pub(crate) fn allowance(&mut self, node: &NodeId) -> &mut Allowance {
+        let limits = &self.config.limits;
+        self.allowances.entry(*node).or_insert_with(|| Allowance::new(limits))
     }
 
     pub(crate) fn send(&mut self, link: LinkId, frame: Control) {
-        self.flush_unreached(link);
         if self.links.contains_key(&link) {
             self.outputs.push_back(Output::Send { link, frame });
         }

@@ -1,17 +1,101 @@
 //! Trees: who receives what, over which branches.
+//!
+//! A branch is pinned to the link towards the owner that its request took. When the way to the owner changes, the
+//! branches that are there go on while their sinks ask again over the new way; those whose link is gone are cut.
 
-use sgc_trust::{SignedError, verify_answer, verify_join};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use sgc_trust::{CertId, SignedError, verify_answer, verify_join};
 use sgc_wire::{
-    Answer, AnswerBody, Control, Decode, JoinBody, Name, Now, Recover, RejectReason, Signed, SinkId,
+    Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role, Signed,
+    SinkId,
 };
+use smallvec::SmallVec;
 
-use crate::rib::{Branch, NameState};
+use crate::fib::{self, FibEntry};
 use crate::router::{DropReason, LinkId, Output, Router};
+
+/// What a branch waits for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Stage {
+    /// The owner's answer.
+    ExpectAnswer { until: Instant },
+    /// Nothing.
+    Granted,
+    /// That its sink asks again over a better way.
+    Draining { until: Instant },
+}
+
+/// A sink's place in the tree.
+#[derive(Clone, Debug)]
+pub(crate) struct Branch {
+    /// The link towards the sink.
+    pub(crate) link: LinkId,
+    /// The node at its other end.
+    neighbour: NodeId,
+    /// The link towards the owner.
+    pub(crate) up: LinkId,
+    pub(crate) peer: NodeId,
+    /// The certificates of its request.
+    pub(crate) certs: Arc<[CertId]>,
+    role: Role,
+    stage: Stage,
+}
+
+impl Branch {
+    fn deadline(&self) -> Option<Instant> {
+        match self.stage {
+            Stage::ExpectAnswer { until } | Stage::Draining { until } => Some(until),
+            Stage::Granted => None,
+        }
+    }
+
+    fn carries(&self) -> bool {
+        !matches!(self.stage, Stage::ExpectAnswer { .. })
+    }
+}
+
+/// The branches of one name.
+#[derive(Debug, Default)]
+pub(crate) struct Tree {
+    pub(crate) branches: BTreeMap<SinkId, Branch>,
+    /// From which link each link with sinks behind it is fed: that of the branch over it that was granted last. Never
+    /// from an older one again, or the trees of several sinks could make a circle (`docs/spec/tree-model.md`).
+    feeds: BTreeMap<(LinkId, Role), LinkId>,
+}
+
+impl Tree {
+    fn compile(&self) -> Option<FibEntry> {
+        let mut entry = FibEntry::default();
+        let mut trees = BTreeMap::<LinkId, fib::Tree>::new();
+        let tree = |up| fib::Tree { up, down: SmallVec::new(), publishers: SmallVec::new() };
+        for (sink, branch) in self.branches.iter().filter(|(_, b)| b.carries()) {
+            // What still comes over an old link is of no use, but not wrong.
+            trees.entry(branch.up).or_insert_with(|| tree(branch.up));
+            if branch.role == Role::Subscribe {
+                entry.sinks.push((*sink, branch.link));
+            }
+        }
+        for ((link, role), up) in &self.feeds {
+            let tree = trees.entry(*up).or_insert_with(|| tree(*up));
+            match role {
+                Role::Subscribe => tree.down.push(*link),
+                Role::Publish => tree.publishers.push(*link),
+            }
+        }
+        entry.trees = trees.into_values().collect();
+        (!entry.trees.is_empty()).then_some(entry)
+    }
+}
 
 impl Router {
     pub(crate) fn handle_join(&mut self, now: Now, link: LinkId, signed: Signed) {
-        // Verifying is what costs: a link that asks too often is refused before it.
-        if !self.links.get_mut(&link).is_some_and(|l| l.may_ask(now.instant)) {
+        // Verifying is what costs: who asks too often is refused before it.
+        let Some(state) = self.links.get(&link) else { return };
+        let (node, is_router) = (state.node, state.is_transit());
+        if link != LinkId::LOCAL && !self.allowance(&node).may_join(now.instant, is_router) {
             self.reject_unverified(link, &signed, RejectReason::Limit);
             return self.drop_frame(link, DropReason::Limit { what: "requests per second" });
         }
@@ -25,119 +109,205 @@ impl Router {
         };
         let (name, sink) = (join.body.name, join.body.sink);
         let reject = |this: &mut Self, reason| this.send(link, Control::Reject { name, sink, reason });
-        let up = self.names.get(&name).and_then(NameState::route).map(|r| r.link);
-        let Some(up) = up.filter(|up| *up != link) else {
-            return reject(self, RejectReason::NoRoute);
-        };
-        let carries = up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit;
-        let Some(state) = self.names.get(&name).filter(|_| carries) else {
-            return reject(self, RejectReason::NoRoute);
-        };
-        // A sink has one place in the tree and asks once: the same request over another link is a replay.
-        if state.branches.get(&sink).is_some_and(|b| b.peer != join.peer.node_id || b.link != link) {
-            return reject(self, RejectReason::NotVerified);
+        if let Some(known) = self.trees.get_mut(&name).and_then(|t| t.branches.get_mut(&sink)) {
+            // A sink has one place in the tree and asks once: the same request over another link is a replay, or has
+            // gone in a circle. Over the same one it asks again under a new certificate, and what it has goes on.
+            if known.peer != join.peer.node_id || known.link != link {
+                return reject(self, RejectReason::NoRoute);
+            }
+            known.certs = join.peer.path;
+            let up = known.up;
+            return self.send(up, Control::Join { signed });
         }
-        let over_link = self.links.get(&link).map_or(0, |l| l.branches);
+        let Some((up, _)) = self.way(&name).filter(|(up, _)| *up != link) else {
+            return reject(self, RejectReason::NoRoute);
+        };
+        if !(up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit) {
+            return reject(self, RejectReason::NoRoute);
+        }
+        let of_name = self.trees.get(&name).map_or(0, |t| t.branches.len());
+        let of_peer = self.allowance(&node).branches;
         let limits = &self.config.limits;
-        let full =
-            state.branches.len() >= limits.branches_per_name_max || over_link >= limits.branches_per_link_max;
-        if full && !state.branches.contains_key(&sink) {
+        if of_name >= limits.branches_per_name_max || of_peer >= limits.branches_per_peer_max {
             self.drop_frame(link, DropReason::Limit { what: "branches" });
             return reject(self, RejectReason::Limit);
         }
-        // The same sink asks again under a new certificate: what it is granted goes on meanwhile.
-        let granted = state.branches.get(&sink).is_some_and(|b| b.pending.is_none());
-        let pending = (!granted).then(|| now.instant + limits.answer_wait);
-        let role = join.body.request.role();
-        let branch = Branch { link, peer: join.peer.node_id, certs: join.peer.path, role, pending };
-        match self.names.get_mut(&name).and_then(|s| s.branches.get_mut(&sink)) {
-            Some(known) if granted && known.role == role => *known = branch,
-            _ => {
-                self.remove_branch(name, sink);
-                self.put_branch(name, sink, branch);
-            }
-        }
+        let until = now.instant + self.config.limits.answer_wait;
+        let branch = Branch {
+            link,
+            neighbour: node,
+            up,
+            peer: join.peer.node_id,
+            certs: join.peer.path,
+            role: join.body.request.role(),
+            stage: Stage::ExpectAnswer { until },
+        };
+        self.put_branch(name, sink, branch);
+        self.introduce(up, &name);
         self.send(up, Control::Join { signed });
     }
 
     pub(crate) fn handle_leave(&mut self, link: LinkId, name: Name, sink: SinkId) {
-        let ours = self.names.get(&name).and_then(|s| s.branches.get(&sink)).is_some_and(|b| b.link == link);
-        if !ours {
+        if self.branch(&name, &sink).is_none_or(|b| b.link != link) {
             return self.drop_frame(link, DropReason::Unknown { what: "leave" });
         }
-        self.remove_branch(name, sink);
-        self.send_up(name, Control::Leave { name, sink });
-        self.tidy(name);
+        if let Some(branch) = self.remove_branch(name, sink) {
+            self.send(branch.up, Control::Leave { name, sink });
+        }
     }
 
     pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: Signed) {
         // The name is needed to find the key that the signature must verify with; it is believed only after.
-        let claimed = match AnswerBody::from_slice(&signed.body) {
-            Ok(body) => body.name,
-            Err(why) => {
-                return self.not_verified(now, link, "answer", SignedError::Decode(why));
-            }
-        };
-        let Some(route) = self.names.get(&claimed).and_then(NameState::route) else {
-            return self.drop_frame(link, DropReason::Unknown { what: "answer" });
-        };
-        if route.link != link {
-            return self.drop_frame(link, DropReason::WrongWay { what: "answer" });
-        }
-        let body = match verify_answer(&route.advert.owner, &signed) {
+        let body = match AnswerBody::from_slice(&signed.body) {
             Ok(body) => body,
-            Err(why) => return self.not_verified(now, link, "answer", why),
+            Err(why) => return self.not_verified(now, link, "answer", SignedError::Decode(why)),
         };
         let (name, sink) = (body.name, body.sink);
-        let Some(branch) = self.names.get_mut(&name).and_then(|s| s.branches.get_mut(&sink)) else {
+        let Some(branch) = self.branch(&name, &sink) else {
             // The owner granted a sink that has left meanwhile: it must not keep it.
-            self.send(link, Control::Leave { name, sink });
+            if matches!(body.answer, Answer::Grant { .. }) {
+                self.send(link, Control::Leave { name, sink });
+            }
             return self.drop_frame(link, DropReason::Unknown { what: "answer" });
         };
+        if branch.up != link {
+            return self.drop_frame(link, DropReason::WrongWay { what: "answer" });
+        }
         let down = branch.link;
+        // Once the name is withdrawn, who owns it is not known here any more; the sink still knows.
+        if let Some(record) = self.names.record(&name)
+            && let Err(why) = verify_answer(&record.owner, &signed)
+        {
+            return self.not_verified(now, link, "answer", why);
+        }
         match body.answer {
-            Answer::Grant { .. } => {
-                if let Some(deadline) = branch.pending.take() {
-                    self.pending.remove(&(deadline, name, sink));
-                    self.refresh_fib(name);
-                }
-            }
+            Answer::Grant { .. } => self.grant_branch(name, sink),
             Answer::Refuse { .. } => {
                 self.remove_branch(name, sink);
             }
         }
         self.send(down, Control::Answer { signed });
-        self.tidy(name);
     }
 
     pub(crate) fn handle_reject(&mut self, link: LinkId, name: Name, sink: SinkId, reason: RejectReason) {
-        let state = self.names.get(&name);
-        if state.and_then(NameState::route).is_none_or(|r| r.link != link) {
-            return self.drop_frame(link, DropReason::WrongWay { what: "reject" });
+        match self.branch(&name, &sink).map(|b| b.up == link) {
+            None => self.drop_frame(link, DropReason::Unknown { what: "reject" }),
+            Some(false) => self.drop_frame(link, DropReason::WrongWay { what: "reject" }),
+            Some(true) => self.cut_down(name, sink, reason),
         }
-        let Some(branch) = self.remove_branch(name, sink) else {
-            return self.drop_frame(link, DropReason::Unknown { what: "reject" });
-        };
-        self.send(branch.link, Control::Reject { name, sink, reason });
-        self.tidy(name);
+    }
+
+    /// The way changed closer to the owner; passed on to the sink.
+    pub(crate) fn handle_reroute(&mut self, link: LinkId, name: Name, sink: SinkId) {
+        match self.branch(&name, &sink).map(|b| (b.up == link, b.link)) {
+            None => self.drop_frame(link, DropReason::Unknown { what: "reroute" }),
+            Some((false, _)) => self.drop_frame(link, DropReason::WrongWay { what: "reroute" }),
+            Some((true, down)) => self.send(down, Control::Reroute { name, sink }),
+        }
     }
 
     /// A sink asks for what it missed; passed on towards the owner if the sink has a place in the tree.
     pub(crate) fn handle_recover(&mut self, link: LinkId, recover: Recover) {
-        let branch = self.names.get(&recover.name).and_then(|s| s.branches.get(&recover.sink));
-        if branch.is_none_or(|b| b.link != link || b.pending.is_some()) {
-            return self.drop_frame(link, DropReason::Unknown { what: "recover" });
-        }
-        self.send_up(recover.name, Control::Recover(recover));
+        self.send_from_sink(link, recover.name, recover.sink, "recover", Control::Recover(recover));
     }
 
     /// A sink has the key of an epoch; passed on towards the owner if it has a place in the tree.
     pub(crate) fn handle_ack(&mut self, link: LinkId, name: Name, sink: SinkId, serial: u64) {
-        let branch = self.names.get(&name).and_then(|s| s.branches.get(&sink));
-        if branch.is_none_or(|b| b.link != link || b.pending.is_some()) {
-            return self.drop_frame(link, DropReason::Unknown { what: "acknowledgement" });
+        self.send_from_sink(link, name, sink, "acknowledgement", Control::Ack { name, sink, serial });
+    }
+
+    fn send_from_sink(&mut self, link: LinkId, name: Name, sink: SinkId, what: &'static str, frame: Control) {
+        match self.branch(&name, &sink).filter(|b| b.link == link && b.carries()).map(|b| b.up) {
+            Some(up) => self.send(up, frame),
+            None => self.drop_frame(link, DropReason::Unknown { what }),
         }
-        self.send_up(name, Control::Ack { name, sink, serial });
+    }
+
+    /// The way to a name may be another by now. Sinks whose branches take an old one are told to ask again; what was
+    /// not answered yet is given up, since the answer would come over the old one.
+    pub(crate) fn follow_way(&mut self, name: &Name) {
+        let Some(tree) = self.trees.get(name) else { return };
+        let known = self.names.record(name).is_some();
+        let way = self.way(name).map(|(link, _)| link);
+        let mut moved = Vec::new();
+        for (sink, branch) in &tree.branches {
+            match (way, branch.stage) {
+                // Withdrawn: the owner tells its sinks by itself, but one that died does not.
+                (None, _) if !known => moved.push((*sink, true)),
+                // As far as is known here the owner is out of reach; whoever is next to it will say so.
+                (None, _) => {}
+                (Some(way), _) if way == branch.up => {}
+                (Some(_), Stage::ExpectAnswer { .. }) => moved.push((*sink, true)),
+                (Some(_), Stage::Granted) => moved.push((*sink, false)),
+                (Some(_), Stage::Draining { .. }) => {}
+            }
+        }
+        let until = self.now.instant + self.config.limits.answer_wait;
+        for (sink, cut) in moved {
+            if cut {
+                self.cut(*name, sink, RejectReason::RouteLost);
+                continue;
+            }
+            let tree = self.trees.get_mut(name).and_then(|t| t.branches.get_mut(&sink));
+            let Some(branch) = tree else { continue };
+            branch.stage = Stage::Draining { until };
+            let down = branch.link;
+            self.deadlines.insert((until, *name, sink));
+            self.send(down, Control::Reroute { name: *name, sink });
+        }
+    }
+
+    pub(crate) fn branches_timeout(&mut self, now: Now) {
+        while let Some((at, name, sink)) =
+            self.deadlines.first().copied().filter(|(at, ..)| *at <= now.instant)
+        {
+            self.deadlines.remove(&(at, name, sink));
+            let draining = self.branch(&name, &sink).is_some_and(Branch::carries);
+            let reason = if draining { RejectReason::RouteLost } else { RejectReason::TimedOut };
+            self.cut(name, sink, reason);
+        }
+    }
+
+    /// Cuts a branch in both directions.
+    pub(crate) fn cut(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
+        if let Some(branch) = self.remove_branch(name, sink) {
+            self.send(branch.link, Control::Reject { name, sink, reason });
+            self.send(branch.up, Control::Leave { name, sink });
+        }
+    }
+
+    /// Cuts what is left of a branch whose upper part is gone.
+    fn cut_down(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
+        if let Some(branch) = self.remove_branch(name, sink) {
+            self.send(branch.link, Control::Reject { name, sink, reason });
+        }
+    }
+
+    /// A link is gone, and with it all branches over it.
+    pub(crate) fn cut_link(&mut self, link: LinkId, branches: impl IntoIterator<Item = (Name, SinkId)>) {
+        for (name, sink) in branches {
+            match self.branch(&name, &sink).map(|b| b.up == link) {
+                Some(true) => self.cut_down(name, sink, RejectReason::RouteLost),
+                Some(false) => {
+                    if let Some(branch) = self.remove_branch(name, sink) {
+                        self.send(branch.up, Control::Leave { name, sink });
+                    }
+                }
+                None => {}
+            }
+        }
+    }
+
+    /// Cuts the branches of sinks whose certificates are no longer believed.
+    pub(crate) fn distrust_branches(&mut self) {
+        let mut gone = Vec::new();
+        for (name, tree) in &self.trees {
+            let untrusted = tree.branches.iter().filter(|(_, b)| self.is_untrusted(&b.certs));
+            gone.extend(untrusted.map(|(sink, _)| (*name, *sink)));
+        }
+        for (name, sink) in gone {
+            self.cut(name, sink, RejectReason::Revoked);
+        }
     }
 
     /// Refuses a request that was not verified, as well as can be: its body may at least say whom to answer.
@@ -147,47 +317,60 @@ impl Router {
         }
     }
 
-    pub(crate) fn put_branch(&mut self, name: Name, sink: SinkId, branch: Branch) {
-        if let Some(deadline) = branch.pending {
-            self.pending.insert((deadline, name, sink));
-        }
-        if let Some(link) = self.links.get_mut(&branch.link) {
-            link.branches += 1;
-            link.names.insert(name);
-        }
-        if let Some(state) = self.names.get_mut(&name) {
-            state.branches.insert(sink, branch);
-        }
+    pub(crate) fn branch(&self, name: &Name, sink: &SinkId) -> Option<&Branch> {
+        self.trees.get(name)?.branches.get(sink)
     }
 
-    pub(crate) fn remove_branch(&mut self, name: Name, sink: SinkId) -> Option<Branch> {
-        let branch = self.names.get_mut(&name)?.branches.remove(&sink)?;
-        if branch.pending.is_none() {
+    fn put_branch(&mut self, name: Name, sink: SinkId, branch: Branch) {
+        if let Some(deadline) = branch.deadline() {
+            self.deadlines.insert((deadline, name, sink));
+        }
+        for link in [branch.link, branch.up] {
+            if let Some(link) = self.links.get_mut(&link) {
+                link.branches.insert((name, sink));
+            }
+        }
+        self.allowance(&branch.neighbour).branches += 1;
+        self.trees.entry(name).or_default().branches.insert(sink, branch);
+    }
+
+    fn grant_branch(&mut self, name: Name, sink: SinkId) {
+        let Some(tree) = self.trees.get_mut(&name) else { return };
+        let Some(branch) = tree.branches.get_mut(&sink) else { return };
+        let Stage::ExpectAnswer { until } = branch.stage else { return };
+        branch.stage = Stage::Granted;
+        tree.feeds.insert((branch.link, branch.role), branch.up);
+        self.deadlines.remove(&(until, name, sink));
+        self.refresh_fib(name);
+    }
+
+    fn remove_branch(&mut self, name: Name, sink: SinkId) -> Option<Branch> {
+        let tree = self.trees.get_mut(&name)?;
+        let branch = tree.branches.remove(&sink)?;
+        let same = |b: &Branch| (b.link, b.role) == (branch.link, branch.role) && b.carries();
+        if !tree.branches.values().any(same) {
+            tree.feeds.remove(&(branch.link, branch.role));
+        }
+        if branch.carries() {
             self.refresh_fib(name);
         }
-        self.detach(name, sink, &branch);
+        if self.trees.get(&name).is_some_and(|t| t.branches.is_empty()) {
+            self.trees.remove(&name);
+        }
+        if let Some(deadline) = branch.deadline() {
+            self.deadlines.remove(&(deadline, name, sink));
+        }
+        for link in [branch.link, branch.up] {
+            if let Some(link) = self.links.get_mut(&link) {
+                link.branches.remove(&(name, sink));
+            }
+        }
+        self.allowance(&branch.neighbour).branches -= 1;
         Some(branch)
     }
 
-    /// Takes a branch that is out of its name's tree out of the timers and the link's counts.
-    pub(crate) fn detach(&mut self, name: Name, sink: SinkId, branch: &Branch) {
-        if let Some(deadline) = branch.pending {
-            self.pending.remove(&(deadline, name, sink));
-        }
-        if let Some(link) = self.links.get_mut(&branch.link) {
-            link.branches -= 1;
-        }
-        self.release(name, branch.link);
-    }
-
-    pub(crate) fn refresh_fib(&mut self, name: Name) {
-        let entry = self.names.get(&name).and_then(NameState::compile);
+    fn refresh_fib(&mut self, name: Name) {
+        let entry = self.trees.get(&name).and_then(Tree::compile);
         self.outputs.push_back(Output::Forward { name, entry });
-    }
-
-    pub(crate) fn send_up(&mut self, name: Name, frame: Control) {
-        if let Some(up) = self.names.get(&name).and_then(NameState::route).map(|r| r.link) {
-            self.send(up, frame);
-        }
     }
 }

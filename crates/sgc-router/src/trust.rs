@@ -1,10 +1,11 @@
 //! Whom to believe: revocation lists, certificates that end, and links that bring what does not verify.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{CertError, CertId, CrlError, SignedError, TrustAnchors};
-use sgc_wire::{Control, Now, RejectReason};
+use sgc_trust::{CertError, CertId, CrlError, SignedError, TrustAnchors, VerifiedPeer};
+use sgc_wire::{Control, Now};
 
 use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
 
@@ -16,7 +17,8 @@ impl Router {
 
     /// Believes these CAs, with their revocation lists, from here on. Everything that rests on a certificate which
     /// is no longer good ends: links, routes, branches.
-    pub fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+    pub fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
+        self.now = now;
         self.config.anchors = anchors;
         let links: Vec<_> = self
             .links
@@ -28,25 +30,9 @@ impl Router {
             self.outputs.push_back(Output::Close { link, reason: LinkClose::Revoked });
             self.forget_link(link);
         }
-        let mut branches = Vec::new();
-        let mut routes = Vec::new();
-        for (name, state) in &self.names {
-            let cut = state.branches.iter().filter(|(_, b)| self.is_untrusted(&b.certs));
-            branches.extend(cut.map(|(sink, _)| (*name, *sink)));
-            let ended = state.routes().filter(|r| self.is_untrusted(&r.advert.owner.path));
-            routes.extend(ended.map(|r| (*name, r.link)));
-        }
-        for (name, sink) in branches {
-            if let Some(branch) = self.remove_branch(name, sink) {
-                let reason = RejectReason::Revoked;
-                self.send(branch.link, Control::Reject { name, sink, reason });
-                self.send_up(name, Control::Leave { name, sink });
-                self.tidy(name);
-            }
-        }
-        for (name, link) in routes {
-            self.lose_route(name, link);
-        }
+        self.distrust_branches();
+        self.distrust_nodes(now.instant);
+        self.distrust_names();
     }
 
     pub(crate) fn handle_crl(&mut self, now: Now, link: LinkId, der: &Bytes) {
@@ -63,7 +49,7 @@ impl Router {
         let Some(anchors) = self.config.anchors.with_crl(der, now.unix)? else { return Ok(false) };
         let anchors = Arc::new(anchors);
         self.outputs.push_back(Output::Trust(anchors.clone()));
-        self.set_anchors(anchors);
+        self.set_anchors(now, anchors);
         let others: Vec<_> =
             self.links.keys().filter(|l| **l != from && **l != LinkId::LOCAL).copied().collect();
         for link in others {
@@ -79,9 +65,24 @@ impl Router {
         other_ca || certs.iter().any(|c| anchors.is_revoked(c))
     }
 
+    /// Until when something signed holds: for its lease, and not beyond its signer's certificate.
+    pub(crate) fn lease_end(
+        &self,
+        now: Now,
+        lease_ms: u32,
+        signer: &VerifiedPeer,
+    ) -> Result<Instant, SignedError> {
+        let not_after = signer.not_after;
+        // Certificates are judged by the second, so one may verify when nothing of it is left.
+        let left = not_after.0.checked_sub(now.unix.0).filter(|left| *left > 0);
+        let left = left.ok_or(CertError::Expired { not_after, now: now.unix })?;
+        let lease = Duration::from_millis(lease_ms.into()).min(self.config.limits.lease_max);
+        Ok(now.instant + lease.min(Duration::from_millis(left)))
+    }
+
     /// Closes the links of nodes whose certificates have ended.
     pub(crate) fn close_expired(&mut self, now: Now) {
-        let over = |at: std::time::Instant| at <= now.instant;
+        let over = |at: Instant| at <= now.instant;
         let links: Vec<_> =
             self.links.iter().filter(|(_, s)| s.expires.is_some_and(over)).map(|(l, _)| *l).collect();
         for link in links {
@@ -113,8 +114,10 @@ impl Router {
     }
 
     fn count_forgery(&mut self, now: Now, link: LinkId) {
-        let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return };
-        if !state.may_err(now.instant) {
+        let Some(node) = self.links.get(&link).filter(|_| link != LinkId::LOCAL).map(|l| l.node) else {
+            return;
+        };
+        if !self.allowance(&node).may_err(now.instant) {
             self.outputs.push_back(Output::Close { link, reason: LinkClose::Forgeries });
             self.forget_link(link);
         }

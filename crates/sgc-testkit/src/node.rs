@@ -14,7 +14,7 @@ use sgc_endpoint::{
     Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkDrop, SinkLimits,
     Source, SourceConfig, Wish,
 };
-use sgc_router::{FibEntry, LinkClose, LinkId, Neighbour, Router, RouterConfig};
+use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
@@ -106,6 +106,7 @@ pub(crate) struct Node {
     pub(crate) name: String,
     pub(crate) identity: Arc<Identity>,
     pub(crate) transit: bool,
+    pub(crate) mapping: MappingKind,
     pub(crate) router_limits: sgc_router::Limits,
     pub(crate) endpoint_limits: sgc_endpoint::Limits,
     pub(crate) shares: BTreeMap<String, Sharing>,
@@ -128,6 +129,8 @@ pub(crate) enum Arrival {
     Frame(LinkId, Control),
     Packet(LinkId, Packet),
     LinkDown(LinkId),
+    /// What its driver measures.
+    Quality(LinkId, Duration, bool),
 }
 
 /// What the world has to do for a node.
@@ -205,13 +208,17 @@ impl Node {
         self.frozen = None;
         let own = || Arc::new(self.identity.anchors().clone());
         let anchors = self.anchors.clone().unwrap_or_else(own);
-        let router = Router::new(RouterConfig {
+        let config = RouterConfig {
             node: self.identity.node_id(),
+            identity: self.identity.clone(),
             transit: self.transit,
             incarnation: seed,
+            started: now.unix,
+            mapping: self.mapping,
             anchors: anchors.clone(),
             limits: self.router_limits.clone(),
-        });
+        };
+        let router = Router::new(config, now);
         let config = EndpointConfig {
             identity: self.identity.clone(),
             authority: false,
@@ -265,12 +272,13 @@ impl Running {
 
     pub(crate) fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
         self.anchors = anchors.clone();
-        self.router.set_anchors(anchors.clone());
+        self.router.set_anchors(now, anchors.clone());
         self.endpoint.set_anchors(now, anchors);
     }
 
     pub(crate) fn renew(&mut self, now: Now, identity: Arc<Identity>) {
         self.identity = identity.clone();
+        self.router.set_identity(now, identity.clone());
         self.endpoint.set_identity(now, identity);
     }
 
@@ -278,13 +286,16 @@ impl Running {
         match arrival {
             Arrival::Frame(link, frame) => self.router.handle_frame(now, link, frame),
             Arrival::Packet(link, packet) => self.forward(now, link, packet),
-            Arrival::LinkDown(link) => self.link_down(link),
+            Arrival::LinkDown(link) => self.link_down(now, link),
+            Arrival::Quality(link, round_trip, suspect) => {
+                self.router.handle_link_quality(now, link, round_trip, suspect);
+            }
         }
     }
 
-    pub(crate) fn link_down(&mut self, link: LinkId) {
+    pub(crate) fn link_down(&mut self, now: Now, link: LinkId) {
         if self.links.remove(&link).is_some() {
-            self.router.handle_link_down(link);
+            self.router.handle_link_down(now, link);
         }
     }
 

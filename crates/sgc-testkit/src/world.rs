@@ -6,11 +6,11 @@ use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::{Event, JoinStatus, Wish};
-use sgc_router::{LinkId, Neighbour, RouterStats};
+use sgc_router::{LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, Metadata, Name, Packet,
-    SinkId, SourceOffer,
+    AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, LinkStateBody, Metadata,
+    Name, Packet, SinkId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -26,8 +26,10 @@ use crate::{DataDrop, NodeKey};
 const STEPS_MAX: usize = 300_000;
 /// How often [`World::run_until`] looks.
 const LOOK: Duration = Duration::from_millis(20);
+/// After how long of silence a link seems dead.
+const SUSPECT_AFTER: Duration = Duration::from_millis(2500);
 /// Bound of the `until_…` methods: longer than a lease and the longest wait between attempts.
-const PATIENCE: Duration = Duration::from_secs(150);
+const PATIENCE: Duration = Duration::from_secs(350);
 
 /// What a world is made of.
 #[derive(Clone, Debug)]
@@ -41,6 +43,8 @@ pub struct WorldConfig {
     pub jitter: RangeInclusive<Duration>,
     /// How many of a hundred best-effort packets each link loses.
     pub loss_percent: usize,
+    /// How routers come to know where names are, drawn for each.
+    pub mappings: Vec<MappingKind>,
     /// Bounds of the routers.
     pub router_limits: sgc_router::Limits,
     /// Bounds and timers of the endpoints.
@@ -55,6 +59,7 @@ impl WorldConfig {
             latency: Duration::from_millis(1)..=Duration::from_millis(40),
             jitter: Duration::ZERO..=Duration::from_millis(3),
             loss_percent: 0,
+            mappings: vec![MappingKind::Flood],
             router_limits: sgc_router::Limits::default(),
             endpoint_limits: sgc_endpoint::Limits::default(),
         }
@@ -65,6 +70,7 @@ enum Pending {
     Frame { wire: usize, to: usize, bytes: Vec<u8> },
     Packet { wire: usize, to: usize, packet: Packet },
     LinkDown { wire: usize, to: usize },
+    Quality { wire: usize, to: usize, suspect: bool },
 }
 
 /// How much a trace holds; the environment variable `SGC_TRACE` may ask for more.
@@ -159,6 +165,10 @@ impl World {
             name: member.name.clone(),
             identity,
             transit,
+            mapping: match self.config.mappings.as_slice() {
+                [one] => *one,
+                several => several[self.dice.below(several.len())],
+            },
             router_limits: self.config.router_limits.clone(),
             endpoint_limits: self.config.endpoint_limits.clone(),
             shares: BTreeMap::new(),
@@ -231,6 +241,7 @@ impl World {
     pub fn freeze(&mut self, node: NodeKey) {
         self.note(format!("freeze {node:?}"));
         self.nodes[node.0].frozen.get_or_insert_default();
+        self.tell_neighbours(node, SUSPECT_AFTER, true);
     }
 
     /// Lets a frozen node go on, with all that arrived meanwhile.
@@ -238,6 +249,16 @@ impl World {
         self.note(format!("thaw {node:?}"));
         for arrival in self.nodes[node.0].frozen.take().into_iter().flatten() {
             self.arrive(node, arrival);
+        }
+        self.tell_neighbours(node, Duration::ZERO, false);
+    }
+
+    /// What the neighbours measure of their links to a node, and when.
+    fn tell_neighbours(&mut self, node: NodeKey, after: Duration, suspect: bool) {
+        let links: Vec<_> =
+            self.nodes[node.0].running.iter().flat_map(|r| r.links.values().copied()).collect();
+        for (wire, side) in links {
+            self.queue(self.clock.instant() + after, Pending::Quality { wire, to: 1 - side, suspect });
         }
     }
 
@@ -266,6 +287,7 @@ impl World {
         self.wires[wire].carries = false;
         for to in 0..2 {
             let idle = if self.wires[wire].ends[to].node == a { a_idle } else { b_idle };
+            self.queue(self.clock.instant() + SUSPECT_AFTER, Pending::Quality { wire, to, suspect: true });
             self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to });
         }
     }
@@ -566,7 +588,17 @@ impl World {
 
     /// How far the owner of a name is from a node, in links; `None` without a route.
     pub fn distance(&self, node: NodeKey, name: &Name) -> Option<u8> {
-        self.nodes[node.0].running.as_ref()?.router.route(name).map(|(_, hops)| hops)
+        let (mut here, mut links) = (node, 0);
+        loop {
+            let next = self.next_hop(here, name)?;
+            if next == here {
+                return Some(links);
+            }
+            (here, links) = (next, links + 1);
+            if usize::from(links) > self.nodes.len() {
+                return None;
+            }
+        }
     }
 
     /// The neighbour on a node's route to a name: the node itself for its own; `None` without a route, or if
@@ -583,23 +615,46 @@ impl World {
         (self.wires[wire].carries && far.up && there.run == far.run).then_some(far.node)
     }
 
-    /// Follows the routes of a name from every node; the nodes of the first circle found.
+    /// Follows the data of a name from every node and link; the nodes of the first circle found. Routes may go in a
+    /// circle for a moment, while routers hear of a change one after the other; data may not.
     pub fn circle(&self, name: &Name) -> Option<Vec<NodeKey>> {
-        self.nodes().find_map(|start| {
-            let mut way = vec![start];
-            loop {
-                let here = way[way.len() - 1];
-                let next = self.next_hop(here, name)?;
-                if next == here {
-                    return None;
+        let mut done = BTreeSet::new();
+        for start in self.nodes() {
+            let entry = self.nodes[start.0].running.as_ref().and_then(|r| r.fib.get(name));
+            for tree in entry.iter().flat_map(|e| &e.trees) {
+                let mut way = Vec::new();
+                if let Some(circle) = self.circle_from(name, (start, tree.up), &mut way, &mut done) {
+                    return Some(circle);
                 }
-                if way.contains(&next) {
-                    way.push(next);
-                    return Some(way);
-                }
-                way.push(next);
             }
-        })
+        }
+        None
+    }
+
+    /// Depth first: packets that came to a node over a link.
+    fn circle_from(
+        &self,
+        name: &Name,
+        at: (NodeKey, LinkId),
+        way: &mut Vec<(NodeKey, LinkId)>,
+        done: &mut BTreeSet<(NodeKey, LinkId)>,
+    ) -> Option<Vec<NodeKey>> {
+        if way.contains(&at) {
+            return Some(way.iter().chain([&at]).map(|(node, _)| *node).collect());
+        }
+        if !done.insert(at) {
+            return None;
+        }
+        let running = self.nodes[at.0.0].running.as_ref()?;
+        let links: Vec<_> = running.fib.get(name)?.egress(at.1).filter(|l| *l != LinkId::LOCAL).collect();
+        way.push(at);
+        let circle = links.into_iter().find_map(|link| {
+            let (wire, side) = *running.links.get(&link)?;
+            let far = &self.wires[wire].ends[1 - side];
+            self.circle_from(name, (far.node, far.link), way, done)
+        });
+        way.pop();
+        circle
     }
 
     /// Numbers of the messages of a topic that a node received, over all its runs, in order of arrival.
@@ -706,8 +761,9 @@ impl World {
         });
         let nodes = [ends[0].node, ends[1].node];
         self.wires.push(Wire { cable, carries: true, ends });
-        for node in nodes {
+        for (to, node) in nodes.into_iter().enumerate() {
             self.settle(node);
+            self.queue(instant, Pending::Quality { wire, to, suspect: false });
         }
     }
 
@@ -722,7 +778,9 @@ impl World {
                 self.hang_up(wire, side);
             } else if self.wires[wire].carries {
                 self.wires[wire].carries = false;
-                self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to: 1 - side });
+                let (at, to) = (self.clock.instant(), 1 - side);
+                self.queue(at + SUSPECT_AFTER, Pending::Quality { wire, to, suspect: true });
+                self.queue(at + idle, Pending::LinkDown { wire, to });
                 self.unplug(wire);
             }
         }
@@ -840,13 +898,15 @@ impl World {
         let (wire, to) = match &pending {
             Pending::Frame { wire, to, .. }
             | Pending::Packet { wire, to, .. }
+            | Pending::Quality { wire, to, .. }
             | Pending::LinkDown { wire, to } => (*wire, *to),
         };
         let Wire { carries, ends, .. } = &mut self.wires[wire];
         let end = &mut ends[to];
         let (node, link, run) = (end.node, end.link, end.run);
         let is_down = matches!(pending, Pending::LinkDown { .. });
-        if !end.up || !(*carries || is_down) {
+        let is_seen = is_down || matches!(pending, Pending::Quality { .. });
+        if !end.up || !(*carries || is_seen) {
             return;
         }
         end.up &= !is_down;
@@ -864,6 +924,10 @@ impl World {
                 packet.payload.copy_into(&mut bytes);
                 let packet = Packet::from_datagram(bytes.into()).expect("a packet reads as it was written");
                 Arrival::Packet(link, packet)
+            }
+            Pending::Quality { suspect, .. } => {
+                let cable = self.wires[wire].cable;
+                Arrival::Quality(link, 2 * self.cables[cable].latency, suspect)
             }
             Pending::LinkDown { .. } => {
                 self.unplug(wire);
@@ -915,9 +979,10 @@ impl World {
             }
             Effect::Close(link, reason) => {
                 self.write_log(node, What::Closed { reason });
+                let now = self.now_at(node);
                 let Some(running) = &mut self.nodes[node.0].running else { return };
                 if let Some((wire, side)) = running.links.get(&link).copied() {
-                    running.link_down(link);
+                    running.link_down(now, link);
                     self.hang_up(wire, side);
                 }
             }
@@ -940,11 +1005,11 @@ impl World {
 
 fn frame_text(frame: &Control) -> String {
     match frame {
-        Control::Advert { hops, signed } => match AdvertBody::from_slice(&signed.body) {
+        Control::Advert { cost, signed } => match AdvertBody::from_slice(&signed.body) {
             Ok(AdvertBody { seq, withdraw, blinds, .. }) => {
                 let kind = if withdraw { "Withdrawal" } else { "Advert" };
                 let blinds: Vec<_> = blinds.iter().map(|b| b.short()).collect();
-                format!("{kind} at {hops} of {}: {}", seq - GENESIS.0, blinds.join(" "))
+                format!("{kind} at {cost} of {}: {}", seq - GENESIS.0, blinds.join(" "))
             }
             Err(_) => "malformed Advert".to_owned(),
         },
@@ -958,6 +1023,15 @@ fn frame_text(frame: &Control) -> String {
                 format!("{text} {name:?} {sink:?} {serial}")
             }
             Err(_) => "malformed Answer".to_owned(),
+        },
+        Control::LinkState { signed } => match LinkStateBody::from_slice(&signed.body) {
+            Ok(LinkStateBody { seq, routers, attached, .. }) => {
+                let routers: Vec<_> =
+                    routers.iter().map(|a| format!("{}:{}", a.node.short(), a.cost)).collect();
+                let attached: Vec<_> = attached.iter().map(|t| t.short()).collect();
+                format!("LinkState {}: {} + {}", seq - GENESIS.0, routers.join(" "), attached.join(" "))
+            }
+            Err(_) => "malformed LinkState".to_owned(),
         },
         other => format!("{other:?}"),
     }

@@ -201,9 +201,9 @@ fn clean_shutdown_withdraws_names_at_once() {
 fn an_owner_that_falls_silent_is_forgotten_when_its_lease_ends() {
     let Line { mut world, arm, cloud, desk } = flowing(6);
     world.freeze(arm);
-    world.run(ms(35_000));
+    world.run(ms(150_000));
     assert_eq!(world.status(desk, arm, "/chatter"), Some(JoinStatus::Granted), "its lease still holds");
-    world.run(ms(27_000));
+    world.run(ms(152_000));
     assert_eq!(world.status(desk, arm, "/chatter"), Some(JoinStatus::Waiting));
     let stats = world.stats(cloud);
     assert_eq!((stats.routed_names, stats.branches), (1, 0));
@@ -469,7 +469,7 @@ fn a_flow_moves_to_a_shorter_way_and_back_without_a_circle() {
 
 /// Owner and user at opposite corners of four routers, with two equal ways and a cable for a shorter one.
 fn diamond(seed: u64) -> (World, [NodeKey; 6]) {
-    let mut world = World::new(seed);
+    let mut world = World::with(WorldConfig { latency: ms(10)..=ms(10), ..WorldConfig::new(seed) });
     let [north, east, south, west] = ["north", "east", "south", "west"].map(|n| world.router(n));
     let (arm, desk) = (world.proxy("arm-1"), world.proxy("desk"));
     for (a, b) in [(north, east), (east, south), (south, west), (west, north), (north, south)] {
@@ -500,18 +500,24 @@ fn an_equally_short_way_is_taken_at_once() {
 }
 
 #[test]
-fn a_flow_that_moves_to_a_shorter_way_leaves_the_longer_one() {
-    for seed in 60..65 {
+fn a_flow_moves_to_a_shorter_way_without_a_gap() {
+    for seed in 60..70 {
         let (mut world, [north, _, south, _, arm, desk]) = diamond(seed);
-        let before = world.next_hop(south, &world.name(arm, "/chatter"));
+        let name = world.name(arm, "/chatter");
+        let mut published = Vec::new();
+        let mut steadily = |world: &mut World, time: u64| {
+            for _ in 0..time / 10 {
+                published.push(world.publish(arm, "/chatter"));
+                world.run(ms(10));
+            }
+        };
+        steadily(&mut world, 500);
         world.rejoin(north, south);
-        world.run(ms(25_000));
-        assert_eq!(world.next_hop(south, &world.name(arm, "/chatter")), before, "what flows is left alone");
-        // A new name takes the shorter way, and those advertised with it come along.
-        world.share(arm, "/new", Sharing::to_fleet());
-        world.run(ms(25_000));
-        assert_eq!(world.next_hop(south, &world.name(arm, "/chatter")), Some(north));
-        assert_flows(&mut world, arm, desk);
+        steadily(&mut world, 3000);
+        assert_eq!(world.next_hop(south, &name), Some(north), "{}", world.trace());
+        world.run(ms(500));
+        let received = world.received(desk, arm, "/chatter");
+        assert_eq!(received[received.len() - published.len()..], published, "{}", world.trace());
         assert_eq!(Model::of(&world).check(&world), Ok(()), "{}", world.trace());
     }
 }
@@ -546,7 +552,7 @@ fn whoever_is_granted_is_near_enough_for_data_and_the_rest_has_no_route() {
         chain.push(router);
     }
     world.share(arm, "/chatter", Sharing::to_fleet());
-    let users: Vec<_> = (28..35)
+    let users: Vec<_> = (60..67)
         .map(|far: usize| {
             let user = world.proxy(&format!("user-{far}"));
             world.link(chain[far - 1], user);
@@ -565,14 +571,13 @@ fn whoever_is_granted_is_near_enough_for_data_and_the_rest_has_no_route() {
     }
     let drops: Vec<_> = world.nodes().flat_map(|n| world.data_drops(n)).collect();
     assert!(!drops.contains(&DataDrop::HopLimit));
-    assert!(world.nodes().any(|n| world.router_drops(n).contains(&"hop_limit")));
 }
 
 #[test]
 fn branches_beyond_a_links_limit_are_refused_and_others_unharmed() {
     let mut config = WorldConfig::new(41);
     // The catalogue and one topic.
-    config.router_limits = Limits { branches_per_link_max: 2, ..Limits::default() };
+    config.router_limits = Limits { branches_per_peer_max: 2, ..Limits::default() };
     let Line { mut world, arm, cloud, desk } = line_with(config);
     let other = world.proxy("other");
     world.link(cloud, other);
@@ -625,7 +630,7 @@ fn branches_beyond_a_names_limit_are_refused_and_a_place_that_gets_free_is_taken
 #[test]
 fn routes_beyond_a_proxys_limit_are_refused_and_others_unharmed() {
     let mut config = WorldConfig::new(42);
-    config.router_limits = Limits { routes_per_proxy_max: 3, ..Limits::default() };
+    config.router_limits = Limits { names_per_owner_max: 3, ..Limits::default() };
     let Line { mut world, arm, cloud, desk } = line_with(config);
     let greedy = world.proxy("greedy");
     world.link(cloud, greedy);

@@ -289,7 +289,7 @@ impl Run {
             let topics = TOPICS.iter().map(|t| self.world.name(*owner, t));
             for name in topics.chain([catalogue]) {
                 if let Some(circle) = self.world.circle(&name) {
-                    panic!("routes to a name of {owner:?} go in a circle: {circle:?}");
+                    panic!("data under a name of {owner:?} goes in a circle: {circle:?}");
                 }
             }
         }
@@ -415,7 +415,7 @@ impl Run {
             }
             self.pass(ms(self.dice.clone().below(200) as u64));
         }
-        self.pass(Duration::from_secs(130));
+        self.pass(Duration::from_secs(420));
         for node in self.world.nodes().collect::<Vec<_>>() {
             let stats = self.world.stats(node);
             let left = (stats.names, stats.branches, self.world.forwarding(node).len());

@@ -47,7 +47,7 @@ impl Default for LinkOptions {
         Self {
             handshake_timeout: Duration::from_secs(5),
             resolve_timeout: Duration::from_secs(5),
-            keep_alive: Duration::from_secs(3),
+            keep_alive: Duration::from_secs(1),
             idle_timeout: Duration::from_secs(10),
             receive_window_bytes: 64 << 20,
             flow_window_bytes: 32 << 20,

@@ -9,8 +9,8 @@ use std::time::Duration;
 use bytes::Bytes;
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{
-    AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, Name, RefuseReason, RejectReason, Signed,
-    UnixMillis,
+    AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, LinkStateBody, Name, RefuseReason,
+    RejectReason, Signed, UnixMillis,
 };
 
 use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
@@ -21,6 +21,7 @@ pub const CLOCK_SKEW_MAX: Duration = Duration::from_secs(10 * 60);
 const ADVERT: &str = "sgc advert v1";
 const JOIN: &str = "sgc join v1";
 const ANSWER: &str = "sgc answer v1";
+const LINK_STATE: &str = "sgc link state v1";
 
 /// Why a signed body is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -87,6 +88,15 @@ pub struct VerifiedJoin {
     pub body: JoinBody,
 }
 
+/// A link state whose node is proven.
+#[derive(Clone, Debug)]
+pub struct VerifiedLinkState {
+    /// Whose links they are.
+    pub node: VerifiedPeer,
+    /// What it says.
+    pub body: LinkStateBody,
+}
+
 impl Identity {
     /// The certificate chain as signed bodies carry it.
     pub fn chain_bytes(&self) -> Vec<Bytes> {
@@ -101,6 +111,11 @@ impl Identity {
     /// Signs a join of this node.
     pub fn sign_join(&self, body: &JoinBody) -> Signed {
         self.signed(JOIN, body)
+    }
+
+    /// Signs a link state of this node.
+    pub fn sign_link_state(&self, body: &LinkStateBody) -> Signed {
+        self.signed(LINK_STATE, body)
     }
 
     /// Signs an answer of this node, the owner of the name.
@@ -138,6 +153,24 @@ pub fn verify_join(
     let peer = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     peer.verify_signature(JOIN, &signed.body, &signed.signature)?;
     Ok(VerifiedJoin { peer, body })
+}
+
+/// Verifies a link state: chain, time, signature. Whether the node may carry others' names is for the caller to see.
+pub fn verify_link_state(
+    anchors: &TrustAnchors,
+    signed: &Signed,
+    now: UnixMillis,
+) -> Result<VerifiedLinkState, SignedError> {
+    let body = LinkStateBody::from_slice(&signed.body)?;
+    let node = verify_chain(anchors, &body.chain, body.issued_at, now)?;
+    node.verify_signature(LINK_STATE, &signed.body, &signed.signature)?;
+    Ok(VerifiedLinkState { node, body })
+}
+
+/// A fingerprint of something signed, body and signature: what was verified once needs not be verified again.
+pub fn signed_digest(signed: &Signed) -> [u8; 32] {
+    let length = (signed.body.len() as u64).to_be_bytes();
+    crate::verify::sha256(&[&length, &signed.body, &signed.signature])
 }
 
 /// Verifies an answer by the owner of the name.

@@ -340,7 +340,7 @@ pub(crate) fn signature_input(context: &str, message: &[u8]) -> Vec<u8> {
     input
 }
 
-fn sha256(parts: &[&[u8]]) -> [u8; 32] {
+pub(crate) fn sha256(parts: &[&[u8]]) -> [u8; 32] {
     let mut context = digest::Context::new(&digest::SHA256);
     parts.iter().for_each(|part| context.update(part));
     let mut out = [0; 32];

@@ -7,13 +7,17 @@
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::{Blind, Name, SinkId, SourceId, UnixMillis};
+use crate::ids::{Blind, Name, NodeId, NodeTag, SinkId, SourceId, UnixMillis};
 
 /// Longest control frame, bytes.
 pub const CONTROL_FRAME_BYTES_MAX: usize = 1024 * 1024;
 /// Most names in one advertisement.
 pub const ADVERT_NAMES_MAX: usize = 256;
-/// Most names in one interest, or in one notice that names are out of reach.
+/// Most routers that one node is linked to.
+pub const ADJACENCIES_MAX: usize = 1024;
+/// Most other nodes that are linked to one router.
+pub const ATTACHED_MAX: usize = 16_384;
+/// Most names in one interest or query, or in one notice that names are out of reach.
 pub const NAMES_PER_FRAME_MAX: usize = 4096;
 /// Most certificates in a chain, leaf first.
 pub const CHAIN_CERTS_MAX: usize = 4;
@@ -37,10 +41,11 @@ pub const SEALED_BYTES_MAX: usize = 768 * 1024;
 pub enum Control {
     /// First on every link, both ways.
     Hello(Hello),
-    /// A signed advertisement, and how many links it crossed.
+    /// A signed advertisement, and how far its owner is from the sender.
     Advert {
-        /// Links crossed so far; the owner's own node sends 0.
-        hops: u8,
+        /// Cost of the way from the sender to the owner, microseconds of round trip; the owner's own node sends 0.
+        /// Between routers it means nothing: they know the topology.
+        cost: u32,
         /// An [`AdvertBody`].
         signed: Signed,
     },
@@ -103,6 +108,27 @@ pub enum Control {
         sink: SinkId,
         /// Serial of the answer.
         serial: u64,
+    },
+    /// To whom a node is linked, and at what cost; travels from router to router.
+    LinkState {
+        /// A [`LinkStateBody`].
+        signed: Signed,
+    },
+    /// Does anybody know where these names are? From router to router; answered with advertisements, now or when
+    /// they become known.
+    Query {
+        /// Links crossed so far.
+        hops: u8,
+        /// Which.
+        names: Vec<Name>,
+    },
+    /// There is a better way to the owner than the one that this branch takes: the sink is to ask again, and has a
+    /// while until the branch is cut. Travels along the branch to the sink.
+    Reroute {
+        /// Name.
+        name: Name,
+        /// Sink.
+        sink: SinkId,
     },
 }
 
@@ -177,6 +203,36 @@ pub struct AdvertBody {
     pub withdraw: bool,
     /// One per name: `name = SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
     pub blinds: Vec<Blind>,
+}
+
+/// To whom a node is linked. Routers put their networks together from these; an edge counts if both its ends say it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LinkStateBody {
+    /// Certificates of the node, leaf first, DER.
+    pub chain: Vec<Bytes>,
+    /// Grows with every one of the node.
+    pub seq: u64,
+    /// When it was signed.
+    pub issued_at: UnixMillis,
+    /// For how long it holds, milliseconds from its arrival.
+    pub lease_ms: u32,
+    /// Advertisements of this node with lower sequence numbers are of an earlier run, and void.
+    pub floor: u64,
+    /// True if the node carries others' names.
+    pub transit: bool,
+    /// The routers that it is linked to, ascending by node.
+    pub routers: Vec<Adjacency>,
+    /// The other nodes that it is linked to, ascending; only a router says them.
+    pub attached: Vec<NodeTag>,
+}
+
+/// A link to a router.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Adjacency {
+    /// The router.
+    pub node: NodeId,
+    /// Cost of the link, microseconds of round trip.
+    pub cost: u32,
 }
 
 /// What a joiner wants to be.
@@ -465,6 +521,47 @@ impl Decode for AdvertBody {
     }
 }
 
+impl Encode for LinkStateBody {
+    fn encode(&self, w: &mut Writer) {
+        encode_chain(w, &self.chain);
+        w.u64(self.seq);
+        self.issued_at.encode(w);
+        w.u32(self.lease_ms);
+        w.u64(self.floor);
+        w.bool(self.transit);
+        w.list(&self.routers, |w, a| {
+            a.node.encode(w);
+            w.u32(a.cost);
+        });
+        w.list(&self.attached, |w, tag| tag.encode(w));
+    }
+}
+
+impl Decode for LinkStateBody {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let body = Self {
+            chain: decode_chain(r)?,
+            seq: r.u64()?,
+            issued_at: UnixMillis::decode(r)?,
+            lease_ms: r.u32()?,
+            floor: r.u64()?,
+            transit: r.bool("transit")?,
+            routers: r.list("adjacencies", ADJACENCIES_MAX, |r| {
+                Ok(Adjacency { node: NodeId::decode(r)?, cost: r.u32()? })
+            })?,
+            attached: r.list("attached nodes", ATTACHED_MAX, NodeTag::decode)?,
+        };
+        // One encoding for each set, and they can be searched as they are.
+        if !body.routers.is_sorted_by(|a, b| a.node < b.node) {
+            return Err(DecodeError::value("order of adjacencies", 0));
+        }
+        if !body.attached.is_sorted_by(|a, b| a < b) {
+            return Err(DecodeError::value("order of attached nodes", 0));
+        }
+        Ok(body)
+    }
+}
+
 impl Encode for JoinBody {
     fn encode(&self, w: &mut Writer) {
         self.name.encode(w);
@@ -535,9 +632,9 @@ impl Encode for Control {
                 w.u64(hello.incarnation);
                 w.bool(hello.transit);
             }
-            Self::Advert { hops, signed } => {
+            Self::Advert { cost, signed } => {
                 w.u8(2);
-                w.u8(*hops);
+                w.u32(*cost);
                 signed.encode(w);
             }
             Self::Unreach { names } => {
@@ -590,6 +687,20 @@ impl Encode for Control {
                 sink.encode(w);
                 w.u64(*serial);
             }
+            Self::LinkState { signed } => {
+                w.u8(14);
+                signed.encode(w);
+            }
+            Self::Query { hops, names } => {
+                w.u8(15);
+                w.u8(*hops);
+                encode_names(w, names);
+            }
+            Self::Reroute { name, sink } => {
+                w.u8(16);
+                name.encode(w);
+                sink.encode(w);
+            }
         }
     }
 }
@@ -598,7 +709,7 @@ impl Decode for Control {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Ok(match r.u8()? {
             1 => Self::Hello(Hello { minor: r.u16()?, incarnation: r.u64()?, transit: r.bool("transit")? }),
-            2 => Self::Advert { hops: r.u8()?, signed: Signed::decode(r)? },
+            2 => Self::Advert { cost: r.u32()?, signed: Signed::decode(r)? },
             3 => Self::Unreach { names: decode_names(r)? },
             4 => Self::Interest { names: decode_names(r)? },
             5 => Self::Uninterest { names: decode_names(r)? },
@@ -620,6 +731,9 @@ impl Decode for Control {
             11 => Self::Goodbye,
             12 => Self::Crl { der: blob(r, "revocation list", CRL_BYTES_MAX)? },
             13 => Self::Ack { name: Name::decode(r)?, sink: SinkId::decode(r)?, serial: r.u64()? },
+            14 => Self::LinkState { signed: Signed::decode(r)? },
+            15 => Self::Query { hops: r.u8()?, names: decode_names(r)? },
+            16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -634,18 +748,21 @@ mod tests {
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
         vec![
             Control::Hello(Hello { minor: 3, incarnation: 9, transit: true }),
-            Control::Advert { hops: 2, signed: signed.clone() },
+            Control::Advert { cost: 2, signed: signed.clone() },
             Control::Unreach { names: vec![name; 3] },
             Control::Interest { names: vec![name] },
             Control::Uninterest { names: vec![] },
             Control::Join { signed: signed.clone() },
             Control::Leave { name, sink },
-            Control::Answer { signed },
+            Control::Answer { signed: signed.clone() },
             Control::Reject { name, sink, reason: RejectReason::RouteLost },
             Control::Recover(Recover { name, sink, source: SourceId([3; 16]), from: 1, to: 9 }),
             Control::Goodbye,
             Control::Crl { der: Bytes::from_static(b"list") },
             Control::Ack { name, sink, serial: 7 },
+            Control::LinkState { signed },
+            Control::Query { hops: 1, names: vec![name; 2] },
+            Control::Reroute { name, sink },
         ]
     }
 
@@ -675,6 +792,23 @@ mod tests {
             blinds: vec![Blind([4; 32]); 2],
         };
         assert_eq!(AdvertBody::from_slice(&advert.to_vec()), Ok(advert));
+        let link_state = LinkStateBody {
+            chain: chain.clone(),
+            seq: 6,
+            issued_at: UnixMillis(78),
+            lease_ms: 300_000,
+            floor: 5,
+            transit: true,
+            routers: [1, 2].map(|n| Adjacency { node: NodeId([n; 32]), cost: 7 }).into(),
+            attached: [3, 4].map(|n| NodeTag([n; 8])).into(),
+        };
+        assert_eq!(LinkStateBody::from_slice(&link_state.to_vec()), Ok(link_state.clone()));
+        let mut unordered = link_state.clone();
+        unordered.routers.reverse();
+        assert!(LinkStateBody::from_slice(&unordered.to_vec()).is_err());
+        let mut twice = link_state;
+        twice.attached[1] = twice.attached[0];
+        assert!(LinkStateBody::from_slice(&twice.to_vec()).is_err());
         let offer = SourceOffer { source: SourceId([6; 16]), key: Bytes::from_static(b"public") };
         for request in [
             Request::Subscribe { describe: true },

@@ -67,6 +67,10 @@ id!(
     NodeId, 32, "node id"
 );
 id!(
+    /// The first bytes of a [`NodeId`]: enough to tell apart the nodes that say themselves that they are meant.
+    NodeTag, 8, "node tag"
+);
+id!(
     /// The half of a name that proves knowledge of its topic secret without telling it.
     Blind, 32, "blind"
 );
@@ -86,6 +90,15 @@ id!(
     /// One incarnation of one joiner of one name, random.
     SinkId, 16, "sink id"
 );
+
+impl NodeId {
+    /// Its tag.
+    pub fn tag(&self) -> NodeTag {
+        let mut tag = [0; 8];
+        tag.copy_from_slice(&self.0[..8]);
+        NodeTag(tag)
+    }
+}
 
 /// 256 secret bits: a key, or what keys are derived from. Wiped when dropped, compared in constant time, never
 /// printed.

@@ -20,13 +20,14 @@ pub use catalogue::{
 };
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
-    ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX,
-    CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX, Control, Hello, JoinBody, NAMES_PER_FRAME_MAX,
-    REPLY_KEY_BYTES_MAX, Recover, RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX,
-    SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed, SourceOffer,
+    ADJACENCIES_MAX, ADVERT_NAMES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer, AnswerBody,
+    CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX, Control, Hello,
+    JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover, RefuseReason, RejectReason,
+    Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed, SourceOffer,
 };
 pub use ids::{
-    Blind, GroupTag, Name, NodeId, Now, ParseIdError, Pseudonym, SecretBytes, SinkId, SourceId, UnixMillis,
+    Blind, GroupTag, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym, SecretBytes, SinkId, SourceId,
+    UnixMillis,
 };
 pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};

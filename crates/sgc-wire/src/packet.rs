@@ -22,7 +22,7 @@ pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 1024;
 /// Longest message, bytes of plaintext.
 pub const MESSAGE_BYTES_MAX: u32 = 64 * 1024 * 1024;
 /// Hops that a packet may take.
-pub const HOP_LIMIT: u8 = 32;
+pub const HOP_LIMIT: u8 = 64;
 
 /// Which traffic overtakes which (`docs/spec/wire.md`, classes).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]

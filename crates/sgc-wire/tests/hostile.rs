@@ -51,7 +51,7 @@ fn control_frames_survive_mutation() {
     let (name, sink, source) = (Name([1; 32]), SinkId([2; 16]), SourceId([3; 16]));
     let frames = [
         Control::Hello(Hello { minor: 0, incarnation: 5, transit: true }),
-        Control::Advert { hops: 1, signed: signed() },
+        Control::Advert { cost: 1, signed: signed() },
         Control::Unreach { names: vec![name; 3] },
         Control::Interest { names: vec![name; 2] },
         Control::Uninterest { names: vec![name] },

@@ -90,6 +90,7 @@ struct NameTraffic {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct RouterSize {
+    nodes: usize,
     names: u64,
     routed_names: u64,
     branches: u64,
@@ -226,9 +227,11 @@ impl Status {
         };
         section("Drops", &["reason", "count"], counts(&self.drops));
         section("Refused peers", &["reason", "count"], counts(&self.refused));
-        let RouterSize { names, routed_names, branches } = self.router;
+        let RouterSize { nodes, names, routed_names, branches } = self.router;
         lines.push(String::new());
-        lines.push(format!("Router: {names} names known, {routed_names} with a route, {branches} branches"));
+        lines.push(format!(
+            "Router: {nodes} nodes and {names} names known, {routed_names} with a route, {branches} branches"
+        ));
         lines
     }
 }
@@ -285,7 +288,7 @@ mod tests {
                       "rtt_us":420,"sent_bytes":1500,"received_bytes":7}],
             "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
                        "state":"waiting for a publisher"}],
-            "names":[],"drops":{"no_tree":3},"refused":{},"router":{"names":1,"routed_names":0,"branches":2}}"#;
+            "names":[],"drops":{"no_tree":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
         let lines = parse(Path::new("x"), text).unwrap().lines();
         let expected = [
             "arm-1: sgc 0.1.0, up for 1 min 15 s",
@@ -306,7 +309,7 @@ mod tests {
             "",
             "Refused peers: none",
             "",
-            "Router: 1 names known, 0 with a route, 2 branches",
+            "Router: 3 nodes and 1 names known, 0 with a route, 2 branches",
         ];
         assert_eq!(lines, expected);
     }

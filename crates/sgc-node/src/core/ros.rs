@@ -1,6 +1,5 @@
 //! What the routes want done: shares, joins, readers, writers, and the forwarding of their names.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -217,10 +216,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         };
         let stats = self.entries.get(&name).map(|(_, stats)| stats.clone()).unwrap_or_default();
-        let mut wanted: BTreeSet<LinkId> = entry.down.iter().copied().collect();
-        if !entry.publishers.is_empty() {
-            wanted.insert(entry.up);
-        }
+        let wanted = entry.links();
         let mut outs = Vec::new();
         for id in &wanted {
             if *id == LinkId::LOCAL {

@@ -118,6 +118,7 @@ impl<N: RosNetwork> Core<N> {
             routes.set_secret(newest.secret.clone());
         }
         self.credentials.set_identity(identity.clone());
+        self.router.set_identity(now, identity.clone());
         self.endpoint.set_identity(now, identity);
         if shows_another {
             self.redial.send_replace(());
@@ -127,7 +128,7 @@ impl<N: RosNetwork> Core<N> {
     /// Trusts these CAs from here on and no others; what they have revoked stays so.
     pub(super) fn trust(&mut self, anchors: TrustAnchors) {
         let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
-        self.router.set_anchors(anchors.clone());
+        self.router.set_anchors(now(), anchors.clone());
         self.set_anchors(anchors);
     }
 

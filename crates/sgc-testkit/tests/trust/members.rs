@@ -137,12 +137,12 @@ fn nobody_claims_the_names_of_another_owner() {
         withdraw: false,
         blinds: vec![world.blind(*arm, "/chatter")],
     };
-    let advert = Control::Advert { hops: 0, signed: thief.sign_advert(&body) };
+    let advert = Control::Advert { cost: 0, signed: thief.sign_advert(&body) };
     let withdrawal = AdvertBody { withdraw: true, seq: body.seq + 1, ..body.clone() };
-    let withdrawal = Control::Advert { hops: 0, signed: thief.sign_advert(&withdrawal) };
+    let withdrawal = Control::Advert { cost: 0, signed: thief.sign_advert(&withdrawal) };
     // With the owner's certificate, which everyone has seen, and another key.
     let borrowed = AdvertBody { chain: world.identity(*arm).chain_bytes(), ..body };
-    let borrowed = Control::Advert { hops: 0, signed: thief.sign_advert(&borrowed) };
+    let borrowed = Control::Advert { cost: 0, signed: thief.sign_advert(&borrowed) };
     for frame in [advert, withdrawal, borrowed] {
         world.inject(*desk, *west, &frame);
         world.inject(*west, *east, &frame);
@@ -258,8 +258,8 @@ fn who_says_that_it_is_a_router_and_is_not_certified_as_one_is_taken_for_a_proxy
     // Nor is it believed that it leads to others.
     let advert = frames(world, *arm, *east).into_iter().rfind(|f| matches!(f, Control::Advert { .. }));
     let Some(Control::Advert { signed, .. }) = advert else { panic!("it advertised") };
-    world.inject(liar, *east, &Control::Advert { hops: 0, signed: signed.clone() });
-    world.inject(honest, *east, &Control::Advert { hops: 7, signed });
+    world.inject(liar, *east, &Control::Advert { cost: 0, signed: signed.clone() });
+    world.inject(honest, *east, &Control::Advert { cost: 7, signed });
     world.run(ms(500));
     assert_eq!(drops(world, *east, "not_owner"), 1);
     assert_eq!(world.next_hop(*east, &world.name(*arm, "/chatter")), Some(*arm));

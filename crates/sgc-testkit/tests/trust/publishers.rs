@@ -250,8 +250,9 @@ fn a_publisher_whose_way_moves_goes_on_under_the_same_source() {
         let first = world.publish_as(*desk, *arm, "/chatter").expect("granted");
         world.run(ms(500));
         let name = world.name(*arm, "/chatter");
-        assert_eq!(world.next_hop(*desk, &name), Some(*west));
-        world.cut_unseen(*west, *desk, ms(60_000), ms(0));
+        let used = world.next_hop(*desk, &name).expect("it flows");
+        assert!([*east, *west].contains(&used));
+        world.cut_unseen(used, *desk, ms(60_000), ms(0));
         let begin = world.elapsed();
         world.run(ms(100));
         world.until_granted(*desk, *arm, "/chatter");

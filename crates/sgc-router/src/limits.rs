@@ -1,0 +1,156 @@
+//! Bounds on what neighbours may make a router remember and do.
+
+use std::time::{Duration, Instant};
+
+/// Longest way, in links, that data can take.
+pub(crate) const HOPS_MAX: u8 = sgc_wire::HOP_LIMIT - 3;
+/// How many times as many requests a router may bring as a proxy.
+const ROUTER_FACTOR: u32 = 16;
+
+/// Bounds on what neighbours may make this node remember.
+#[derive(Clone, Debug)]
+pub struct Limits {
+    /// Names known in all.
+    pub names_max: usize,
+    /// Names of one owner.
+    pub names_per_owner_max: usize,
+    /// Names that are known over one link to a router.
+    pub names_per_router_max: usize,
+    /// Nodes whose links are known.
+    pub nodes_max: usize,
+    /// Branches that one node may have here.
+    pub branches_per_peer_max: usize,
+    /// Branches of one name.
+    pub branches_per_name_max: usize,
+    /// Names that one link may ask for.
+    pub interests_per_link_max: usize,
+    /// Withdrawn names remembered against replay, and as many that were asked for lately.
+    pub tombstones_max: usize,
+    /// How long an owner may take to answer a join, and a sink to find the better way that it was told of.
+    pub answer_wait: Duration,
+    /// Longest lease of an advertisement or link state that is honoured.
+    pub lease_max: Duration,
+    /// Links of one node at one time.
+    pub links_per_node_max: usize,
+    /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which
+    /// speaks for many, may bring sixteen times as many.
+    pub joins_burst: u32,
+    /// Names that a router may ask for at once; refilled by an eighth of it a second.
+    pub queries_burst: u32,
+    /// Things that do not verify which a node may bring before its link is closed; one is forgiven a second.
+    pub forgeries_max: u32,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            names_max: 16_000_000,
+            names_per_owner_max: 16_384,
+            names_per_router_max: 4_000_000,
+            nodes_max: 1_000_000,
+            branches_per_peer_max: 65_536,
+            branches_per_name_max: 4096,
+            interests_per_link_max: 65_536,
+            tombstones_max: 100_000,
+            answer_wait: Duration::from_secs(10),
+            lease_max: Duration::from_secs(600),
+            links_per_node_max: 8,
+            joins_burst: 1024,
+            queries_burst: 65_536,
+            forgeries_max: 64,
+        }
+    }
+}
+
+/// What one node may still do here, over all its links.
+#[derive(Debug)]
+pub(crate) struct Allowance {
+    joins: Budget,
+    queries: Budget,
+    forgeries: Budget,
+    /// Branches that it has here.
+    pub(crate) branches: usize,
+}
+
+impl Allowance {
+    pub(crate) fn new(limits: &Limits) -> Self {
+        Self {
+            joins: Budget::new(limits.joins_burst, limits.joins_burst / 8),
+            queries: Budget::new(limits.queries_burst, limits.queries_burst / 8),
+            forgeries: Budget::new(limits.forgeries_max, 1),
+            branches: 0,
+        }
+    }
+
+    /// Takes a request to join; false if there is none left.
+    pub(crate) fn may_join(&mut self, now: Instant, is_router: bool) -> bool {
+        self.joins.take(now, 1, if is_router { ROUTER_FACTOR } else { 1 })
+    }
+
+    /// Takes a question for so many names; false if that is too many.
+    pub(crate) fn may_query(&mut self, now: Instant, names: usize) -> bool {
+        self.queries.take(now, names.max(1).try_into().unwrap_or(u32::MAX), 1)
+    }
+
+    /// Takes one from what it may get wrong; false if there is none left.
+    pub(crate) fn may_err(&mut self, now: Instant) -> bool {
+        self.forgeries.take(now, 1, 1)
+    }
+
+    /// True if nothing is used, so that forgetting it gives nothing back.
+    pub(crate) fn is_whole(&self, now: Instant) -> bool {
+        let budgets = [&self.joins, &self.queries, &self.forgeries];
+        self.branches == 0 && budgets.iter().all(|b| b.used_at(now, 1) <= 0.0)
+    }
+}
+
+/// A bucket of tokens that refills with time.
+#[derive(Debug)]
+struct Budget {
+    burst: u32,
+    /// Tokens a second.
+    rate: u32,
+    used: f64,
+    at: Option<Instant>,
+}
+
+impl Budget {
+    fn new(burst: u32, rate: u32) -> Self {
+        Self { burst, rate: rate.max(1), used: 0.0, at: None }
+    }
+
+    fn used_at(&self, now: Instant, factor: u32) -> f64 {
+        let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+        (self.used - elapsed.as_secs_f64() * f64::from(self.rate) * f64::from(factor)).max(0.0)
+    }
+
+    fn take(&mut self, now: Instant, tokens: u32, factor: u32) -> bool {
+        self.used = self.used_at(now, factor);
+        self.at = Some(now);
+        let room = self.used + f64::from(tokens) <= f64::from(self.burst) * f64::from(factor);
+        if room {
+            self.used += f64::from(tokens);
+        }
+        room
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_is_spent_and_comes_back_with_time() {
+        #[allow(clippy::disallowed_methods)]
+        let start = Instant::now();
+        let mut budget = Budget::new(4, 2);
+        let taken = |budget: &mut Budget, at| (0..10).filter(|_| budget.take(at, 1, 1)).count();
+        assert_eq!(taken(&mut budget, start), 4);
+        assert_eq!(taken(&mut budget, start + Duration::from_secs(1)), 2);
+        assert_eq!(taken(&mut budget, start + Duration::from_secs(60)), 4);
+        assert!(!budget.take(start + Duration::from_secs(70), 5, 1));
+        assert!(budget.take(start + Duration::from_secs(70), 4, 1));
+        let mut shared = Budget::new(4, 2);
+        assert_eq!((0..100).filter(|_| shared.take(start, 1, 16)).count(), 64);
+    }
+}

@@ -1,0 +1,879 @@
+//! Names: who owns them, which way that is, and who is told of it.
+//!
+//! What is known of a name does not depend on links: an advertisement says whose it is, and where that is the topology
+//! says. So a robot that moves changes one entry, and a link that breaks none. A node that carries nobody else's names
+//! sees no topology; it goes by what its routers tell it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
+use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed};
+use smallvec::SmallVec;
+
+use crate::links::{COST_SUSPECT, LinkState};
+use crate::mapping::{Ask, Known};
+use crate::router::{DropReason, LinkId, Router};
+use crate::topology::cost_differs;
+
+/// How often a name that somebody waits for is asked for again.
+const QUERY_EVERY: Duration = Duration::from_secs(20);
+/// For how long one who asked is told of what becomes known.
+const QUERY_LEASE: Duration = Duration::from_secs(60);
+/// The same question goes on at most that often.
+const QUERY_AGAIN: Duration = Duration::from_secs(5);
+
+/// Number of a [`Record`]; never used again while the process lives.
+pub(crate) type RecordId = u64;
+
+/// A verified advertisement.
+#[derive(Debug)]
+pub(crate) struct Record {
+    pub(crate) owner: VerifiedPeer,
+    pub(crate) seq: u64,
+    names: Box<[Name]>,
+    signed: Signed,
+    digest: [u8; 32],
+    expires: Instant,
+    /// Names that no newer one speaks for.
+    live: usize,
+    /// The link that it came over first.
+    from: LinkId,
+    /// When it was asked for; `None` if it was told unasked.
+    asked: Option<Instant>,
+}
+
+#[derive(Debug)]
+struct Tombstone {
+    seq: u64,
+    until: Instant,
+    withdrawal: Signed,
+}
+
+/// The way to a name, at a node that goes by what it is told.
+#[derive(Debug, Default)]
+struct Heard {
+    /// Cost from the neighbour to the owner.
+    over: SmallVec<[(LinkId, u32); 2]>,
+    selected: Option<LinkId>,
+}
+
+/// Everything that is known of names.
+#[derive(Debug, Default)]
+pub(crate) struct Names {
+    names: BTreeMap<Name, RecordId>,
+    records: BTreeMap<RecordId, Record>,
+    expiries: BTreeSet<(Instant, RecordId)>,
+    seen: BTreeMap<[u8; 32], RecordId>,
+    /// Records of each owner.
+    owners: BTreeMap<NodeId, BTreeSet<RecordId>>,
+    next_id: RecordId,
+    tombstones: BTreeMap<Name, Tombstone>,
+    forgets: BTreeSet<(Instant, Name)>,
+    heard: BTreeMap<Name, Heard>,
+    /// Who wants to hear of a name: proxies, and this node's own endpoint.
+    watchers: BTreeMap<Name, BTreeSet<LinkId>>,
+    /// Names that are asked for, and when the next time is.
+    asking: BTreeMap<Name, Instant>,
+    ask_at: BTreeSet<(Instant, Name)>,
+    /// When a question of others was passed on last.
+    passed_on: BTreeMap<Name, Instant>,
+    pub(crate) prune_at: Option<Instant>,
+}
+
+impl Names {
+    pub(crate) fn record(&self, name: &Name) -> Option<&Record> {
+        self.records.get(self.names.get(name)?)
+    }
+
+    /// Names in any state.
+    pub(crate) fn known(&self) -> usize {
+        let others = self.watchers.keys().chain(self.heard.keys());
+        let unknown: BTreeSet<_> = others.filter(|n| !self.names.contains_key(*n)).collect();
+        self.names.len() + unknown.len()
+    }
+
+    pub(crate) fn tombstones(&self) -> usize {
+        self.tombstones.len()
+    }
+
+    pub(crate) fn deadlines(&self) -> impl Iterator<Item = Instant> {
+        let expiry = self.expiries.first().map(|(at, _)| *at);
+        let forget = self.forgets.first().map(|(at, _)| *at);
+        let ask = self.ask_at.first().map(|(at, _)| *at);
+        [expiry, forget, ask, self.prune_at].into_iter().flatten()
+    }
+
+    /// The newest sequence number known of a name, withdrawn or not.
+    fn known_seq(&self, name: &Name) -> Option<u64> {
+        let live = self.record(name).map(|r| r.seq);
+        live.max(self.tombstones.get(name).map(|t| t.seq))
+    }
+
+    fn remove_tombstone(&mut self, name: &Name) {
+        if let Some(tombstone) = self.tombstones.remove(name) {
+            self.forgets.remove(&(tombstone.until, *name));
+        }
+    }
+
+    fn stop_asking(&mut self, name: &Name) {
+        if let Some(at) = self.asking.remove(name) {
+            self.ask_at.remove(&(at, *name));
+        }
+    }
+
+    fn ask_again(&mut self, name: Name, at: Instant) {
+        self.stop_asking(&name);
+        self.asking.insert(name, at);
+        self.ask_at.insert((at, name));
+    }
+}
+
+impl Router {
+    /// The link towards the owner of `name`, and the cost of the way.
+    pub(crate) fn way(&self, name: &Name) -> Option<(LinkId, u32)> {
+        let record = self.names.record(name)?;
+        let owner = &record.owner.node_id;
+        if *owner == self.config.node {
+            return Some((LinkId::LOCAL, 0));
+        }
+        if self.config.transit {
+            return self.way_to(owner);
+        }
+        let heard = self.names.heard.get(name)?;
+        let over = |(link, cost): &(LinkId, u32)| {
+            let own = self.links.get(link)?.cost.now();
+            Some((cost.saturating_add(own), *link))
+        };
+        let best = heard.over.iter().filter_map(over).min()?;
+        // Another link is taken only if that is clearly better.
+        let kept = heard.over.iter().filter(|(l, _)| Some(*l) == heard.selected).find_map(over);
+        let (cost, link) = kept.filter(|(cost, _)| !cost_differs(best.0, *cost)).unwrap_or(best);
+        Some((link, cost))
+    }
+
+    /// The link towards a node, and the cost of the way, as the topology says it or a link of this node itself.
+    fn way_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
+        let direct = self.link_to(node);
+        let way = self.topology.way(&self.config.node, node);
+        match (way, direct) {
+            (Some((cost, first)), _) if first == *node => Some((direct?.0, cost)),
+            (Some((cost, first)), direct) => match (self.link_to(&first), direct) {
+                (Some((link, _)), Some((straight, own))) => {
+                    Some(if own <= cost { (straight, own) } else { (link, cost) })
+                }
+                (Some((link, _)), None) => Some((link, cost)),
+                (None, direct) => direct,
+            },
+            (None, direct) => direct,
+        }
+    }
+
+    /// True if `name` may be told over `link`: not back where it is, and others' names only by routers.
+    fn may_tell(&self, way: LinkId, link: LinkId) -> bool {
+        way != link && (way == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
+    }
+
+    pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: Signed) {
+        let Some(state) = self.links.get(&link) else { return };
+        let (neighbour, from_router) = (state.node, state.is_transit());
+        let digest = signed_digest(&signed);
+        if let Some((id, known)) =
+            self.names.seen.get(&digest).and_then(|id| Some((*id, self.names.records.get(id)?)))
+        {
+            let owner = known.owner.node_id;
+            if !from_router && owner != neighbour {
+                return self.drop_frame(link, DropReason::NotOwner { owner });
+            }
+            return self.hear(link, cost, id);
+        }
+        let advert = match verify_advert(&self.config.anchors, &signed, now.unix) {
+            Ok(advert) => advert,
+            Err(why) => return self.not_verified(now, link, "advertisement", why),
+        };
+        let owner = advert.owner.node_id;
+        if !from_router && owner != neighbour {
+            return self.drop_frame(link, DropReason::NotOwner { owner });
+        }
+        let (seq, withdraw) = (advert.body.seq, advert.body.withdraw);
+        if let Some(floor) = self.topology.node(&owner).map(|n| n.floor).filter(|floor| seq < *floor) {
+            return self.drop_frame(link, DropReason::Stale { seq, known: floor });
+        }
+        let known = advert.names.iter().filter_map(|n| self.names.known_seq(n)).max();
+        let news: Vec<_> = advert
+            .names
+            .iter()
+            .copied()
+            .filter(|n| self.names.known_seq(n).is_none_or(|known| seq > known))
+            // What nobody here wants, a node that carries nothing need not know.
+            .filter(|n| self.config.transit || link == LinkId::LOCAL || self.names.watchers.contains_key(n))
+            .collect();
+        if let Some(known) = known.filter(|known| *known >= seq && news.is_empty()) {
+            return self.drop_frame(link, DropReason::Stale { seq, known });
+        }
+        if withdraw {
+            return self.withdraw(now, link, seq, &owner, &news, signed);
+        }
+        if let Some(what) = self.names_over_limit(link, &owner, &news) {
+            return self.drop_frame(link, DropReason::Limit { what });
+        }
+        let expires = match self.lease_end(now, advert.body.lease_ms, &advert.owner) {
+            Ok(expires) => expires,
+            Err(why) => return self.not_verified(now, link, "advertisement", why),
+        };
+        let asked =
+            news.iter().any(|n| self.names.asking.contains_key(n) || self.names.passed_on.contains_key(n));
+        let record = Record {
+            owner: advert.owner,
+            seq,
+            names: advert.names.into(),
+            signed: signed.clone(),
+            digest,
+            expires,
+            live: 0,
+            from: link,
+            // Owners tell of changes without being asked.
+            asked: (asked && from_router).then_some(now.instant),
+        };
+        let id = self.insert(record, &news);
+        // A node that only listens may hear of names that it knew already from another neighbour.
+        self.hear(link, cost, id);
+        let frames = [Control::Advert { cost: 0, signed }];
+        self.tell_routers(link, &owner, &news, &frames);
+        self.routes_changed(&news);
+    }
+
+    /// The bound that these names would exceed.
+    fn names_over_limit(&self, link: LinkId, owner: &NodeId, news: &[Name]) -> Option<&'static str> {
+        let (names, limits) = (&self.names, &self.config.limits);
+        let more = news.iter().filter(|n| !names.names.contains_key(*n)).count();
+        let of_owner: usize = names
+            .owners
+            .get(owner)
+            .into_iter()
+            .flatten()
+            .filter_map(|id| names.records.get(id))
+            .map(|r| r.live)
+            .sum();
+        let over_link = self.links.get(&link).map_or(0, |l| l.names);
+        if link == LinkId::LOCAL || more == 0 {
+            None
+        } else if of_owner + more > limits.names_per_owner_max {
+            Some("names of an owner")
+        } else if over_link + more > limits.names_per_router_max {
+            Some("names over a link")
+        } else if names.names.len() + more > limits.names_max {
+            Some("names")
+        } else {
+            None
+        }
+    }
+
+    fn insert(&mut self, record: Record, names: &[Name]) -> RecordId {
+        let id = self.names.next_id;
+        self.names.next_id += 1;
+        self.names.seen.insert(record.digest, id);
+        self.names.expiries.insert((record.expires, id));
+        self.names.owners.entry(record.owner.node_id).or_default().insert(id);
+        self.names.records.insert(id, record);
+        for name in names {
+            self.names.remove_tombstone(name);
+            self.names.passed_on.remove(name);
+            if let Some(old) = self.names.names.insert(*name, id) {
+                self.release(old, 1);
+            }
+        }
+        self.hold(id, names.len());
+        id
+    }
+
+    fn hold(&mut self, id: RecordId, names: usize) {
+        let Some(record) = self.names.records.get_mut(&id) else { return };
+        record.live += names;
+        if let Some(link) = self.links.get_mut(&record.from) {
+            link.names += names;
+        }
+        self.release(id, 0);
+    }
+
+    /// Names are not of this record any more; without any it is gone.
+    fn release(&mut self, id: RecordId, names: usize) {
+        let Some(record) = self.names.records.get_mut(&id) else { return };
+        record.live -= names;
+        if let Some(link) = self.links.get_mut(&record.from) {
+            link.names = link.names.saturating_sub(names);
+        }
+        if record.live > 0 {
+            return;
+        }
+        if let Some(record) = self.names.records.remove(&id) {
+            self.names.seen.remove(&record.digest);
+            self.names.expiries.remove(&(record.expires, id));
+            if let Some(of_owner) = self.names.owners.get_mut(&record.owner.node_id) {
+                of_owner.remove(&id);
+                if of_owner.is_empty() {
+                    self.names.owners.remove(&record.owner.node_id);
+                }
+            }
+        }
+    }
+
+    /// Forgets all names that a record still speaks for.
+    fn forget_record(&mut self, id: RecordId) -> Vec<Name> {
+        let Some(record) = self.names.records.get(&id) else { return Vec::new() };
+        let names: Vec<_> =
+            record.names.iter().copied().filter(|n| self.names.names.get(n) == Some(&id)).collect();
+        for name in &names {
+            self.names.names.remove(name);
+            self.names.heard.remove(name);
+        }
+        self.release(id, names.len());
+        names
+    }
+
+    /// Forgets what an owner advertised in a run before this one.
+    pub(crate) fn void_names(&mut self, owner: &NodeId, floor: u64) {
+        let records = self.names.owners.get(owner).into_iter().flatten();
+        let old = |id: &&RecordId| self.names.records.get(id).is_some_and(|r| r.seq < floor);
+        for id in records.filter(old).copied().collect::<Vec<_>>() {
+            let names = self.forget_record(id);
+            self.routes_changed(&names);
+        }
+    }
+
+    fn withdraw(&mut self, now: Now, link: LinkId, seq: u64, owner: &NodeId, names: &[Name], signed: Signed) {
+        let known: Vec<_> = names.iter().copied().filter(|n| self.names.names.contains_key(n)).collect();
+        for name in names {
+            self.names.remove_tombstone(name);
+            if self.names.tombstones.len() >= self.config.limits.tombstones_max
+                && let Some((_, oldest)) = self.names.forgets.pop_first()
+            {
+                self.names.tombstones.remove(&oldest);
+            }
+            let until = now.instant + 2 * CLOCK_SKEW_MAX;
+            self.names.tombstones.insert(*name, Tombstone { seq, until, withdrawal: signed.clone() });
+            self.names.forgets.insert((until, *name));
+            if let Some(id) = self.names.names.remove(name) {
+                self.names.heard.remove(name);
+                self.release(id, 1);
+            }
+        }
+        // Those who never heard of the names need not hear that they are gone.
+        if !known.is_empty() {
+            let frame = Control::Advert { cost: 0, signed };
+            self.tell_routers(link, owner, &known, std::slice::from_ref(&frame));
+            self.tell_watchers(link, &known, &frame);
+            self.routes_changed(&known);
+        }
+    }
+
+    /// A node that goes by what it is told: the owner of a record's names is in reach over this link.
+    fn hear(&mut self, link: LinkId, cost: u32, id: RecordId) {
+        if self.config.transit || link == LinkId::LOCAL {
+            return;
+        }
+        let Some(record) = self.names.records.get(&id) else { return };
+        let seq = record.seq;
+        let names: Vec<_> =
+            record.names.iter().copied().filter(|n| self.names.watchers.contains_key(n)).collect();
+        for name in &names {
+            // It may have been without interest when the record came.
+            if self.names.known_seq(name).is_none_or(|known| known < seq) {
+                if let Some(old) = self.names.names.insert(*name, id) {
+                    self.release(old, 1);
+                }
+                self.hold(id, 1);
+            }
+            let heard = self.names.heard.entry(*name).or_default();
+            match heard.over.iter_mut().find(|(l, _)| *l == link) {
+                Some(known) => known.1 = cost,
+                None => heard.over.push((link, cost)),
+            }
+        }
+        self.routes_changed(&names);
+    }
+
+    /// A neighbour can no longer reach these names.
+    pub(crate) fn handle_unreach(&mut self, link: LinkId, names: &[Name]) {
+        if self.config.transit {
+            return self.drop_frame(link, DropReason::Unknown { what: "unreach" });
+        }
+        let mut lost = Vec::new();
+        for name in names {
+            if let Some(heard) = self.names.heard.get_mut(name) {
+                heard.over.retain(|(l, _)| *l != link);
+                lost.push(*name);
+            }
+        }
+        self.routes_changed(&lost);
+    }
+
+    /// Nothing that was heard over a link counts any more.
+    pub(crate) fn unhear(&mut self, link: LinkId) {
+        let mut lost = Vec::new();
+        for (name, heard) in &mut self.names.heard {
+            if heard.over.iter().any(|(l, _)| *l == link) {
+                heard.over.retain(|(l, _)| *l != link);
+                lost.push(*name);
+            }
+        }
+        self.routes_changed(&lost);
+    }
+
+    pub(crate) fn handle_interest(&mut self, now: Now, link: LinkId, names: &[Name]) {
+        let mut news = Vec::new();
+        for name in names {
+            let Some(state) = self.links.get_mut(&link) else { return };
+            if state.interests.len() >= self.config.limits.interests_per_link_max {
+                self.drop_frame(link, DropReason::Limit { what: "interests per link" });
+                break;
+            }
+            if state.interests.contains_key(name) {
+                continue;
+            }
+            state.interests.insert(*name, None);
+            self.names.watchers.entry(*name).or_default().insert(link);
+            news.push(*name);
+        }
+        if link == LinkId::LOCAL && !self.config.transit && !news.is_empty() {
+            self.ask_routers(&Control::Interest { names: news.clone() });
+        }
+        self.tell_interested(link, &news);
+        if self.config.transit {
+            for name in news {
+                let record = self.names.record(&name);
+                let needs = self.way(&name).is_none() || record.is_some_and(|r| r.asked.is_some());
+                if needs && !self.names.asking.contains_key(&name) {
+                    self.names.ask_again(name, now.instant);
+                }
+            }
+        }
+    }
+
+    pub(crate) fn handle_uninterest(&mut self, link: LinkId, names: &[Name]) {
+        for name in names {
+            let Some(state) = self.links.get_mut(&link) else { return };
+            if state.interests.remove(name).is_none() {
+                continue;
+            }
+            self.unwatch(link, name);
+        }
+        if link == LinkId::LOCAL && !self.config.transit {
+            self.ask_routers(&Control::Uninterest { names: names.to_vec() });
+        }
+    }
+
+    pub(crate) fn unwatch(&mut self, link: LinkId, name: &Name) {
+        let Some(watchers) = self.names.watchers.get_mut(name) else { return };
+        watchers.remove(&link);
+        if !watchers.is_empty() {
+            return;
+        }
+        self.names.watchers.remove(name);
+        self.names.stop_asking(name);
+        if !self.config.transit && self.way(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
+            self.names.heard.remove(name);
+            if let Some(id) = self.names.names.remove(name) {
+                self.release(id, 1);
+            }
+        }
+    }
+
+    /// Sends an interest of this node to its neighbours.
+    fn ask_routers(&mut self, frame: &Control) {
+        let greeted = |(l, s): &(&LinkId, &LinkState)| **l != LinkId::LOCAL && s.hello.is_some();
+        let targets: Vec<_> = self.links.iter().filter(greeted).map(|(l, _)| *l).collect();
+        for link in targets {
+            self.send(link, frame.clone());
+        }
+    }
+
+    /// Asks a neighbour that just greeted for the names that are wanted here.
+    pub(crate) fn send_interests(&mut self, link: LinkId) {
+        if self.config.transit {
+            return;
+        }
+        let wanted: Vec<_> = self.links[&LinkId::LOCAL].interests.keys().copied().collect();
+        for names in wanted.chunks(NAMES_PER_FRAME_MAX) {
+            self.send(link, Control::Interest { names: names.to_vec() });
+        }
+    }
+
+    /// Tells a router that just greeted of names: of those of this node, and if the mapping says so of all.
+    pub(crate) fn send_names(&mut self, link: LinkId) {
+        let all = self.config.transit && self.mapping.tells_unasked();
+        let own = self.config.node;
+        let told: Vec<_> = self
+            .names
+            .records
+            .iter()
+            .filter(|(_, r)| all || r.owner.node_id == own)
+            .map(|(id, _)| *id)
+            .collect();
+        for id in told {
+            for frame in self.record_frames(id, 0) {
+                self.send(link, frame);
+            }
+        }
+        // It may have been out of reach when these were withdrawn.
+        let recent = self.now.instant.checked_sub(self.config.limits.lease_max);
+        let recent = |t: &&Tombstone| recent.is_none_or(|recent| t.until > recent + 2 * CLOCK_SKEW_MAX);
+        let withdrawals = self.names.tombstones.values().filter(|_| all).filter(recent);
+        let distinct: BTreeMap<_, _> =
+            withdrawals.map(|t| (t.withdrawal.signature.clone(), &t.withdrawal)).collect();
+        let frames: Vec<_> = distinct
+            .into_values()
+            .map(|signed| Control::Advert { cost: 0, signed: signed.clone() })
+            .collect();
+        for frame in frames {
+            self.send(link, frame);
+        }
+    }
+
+    /// An advertisement, and the withdrawals of those of its names that do not hold any more.
+    fn record_frames(&self, id: RecordId, cost: u32) -> Vec<Control> {
+        let Some(record) = self.names.records.get(&id) else { return Vec::new() };
+        let mut frames = vec![Control::Advert { cost, signed: record.signed.clone() }];
+        if record.live < record.names.len() {
+            let mut withdrawals = BTreeMap::new();
+            for name in &record.names {
+                if let Some(tombstone) = self.names.tombstones.get(name).filter(|t| t.seq > record.seq) {
+                    withdrawals.insert(tombstone.seq, tombstone.withdrawal.clone());
+                }
+            }
+            frames.extend(withdrawals.into_values().map(|signed| Control::Advert { cost: 0, signed }));
+        }
+        frames
+    }
+
+    /// Passes on what came over `ingress` of names of `owner`: to all routers, or to those who asked.
+    fn tell_routers(&mut self, ingress: LinkId, owner: &NodeId, names: &[Name], frames: &[Control]) {
+        let own = *owner == self.config.node;
+        if names.is_empty() || !(self.config.transit || own) {
+            return;
+        }
+        let everyone = if self.config.transit { self.mapping.tells_unasked() } else { own };
+        let targets: Vec<_> = self
+            .links
+            .iter()
+            .filter(|(l, s)| {
+                let asked = || s.follows.contains_key(owner) || names.iter().any(|n| s.asks.contains_key(n));
+                **l != ingress && s.is_transit() && (everyone || asked())
+            })
+            .map(|(l, _)| *l)
+            .collect();
+        for link in targets {
+            if !everyone {
+                self.answer(link, owner, names);
+            }
+            for frame in frames {
+                self.send(link, frame.clone());
+            }
+        }
+    }
+
+    /// Hands a withdrawal to those who were told of one of the names.
+    fn tell_watchers(&mut self, ingress: LinkId, names: &[Name], frame: &Control) {
+        let told = |link: &LinkState| names.iter().any(|n| matches!(link.interests.get(n), Some(Some(_))));
+        let targets: Vec<_> =
+            self.links.iter().filter(|(l, s)| **l != ingress && told(s)).map(|(l, _)| *l).collect();
+        for link in targets {
+            self.send(link, frame.clone());
+            if let Some(state) = self.links.get_mut(&link) {
+                for name in names {
+                    if let Some(told) = state.interests.get_mut(name) {
+                        *told = None;
+                    }
+                }
+            }
+        }
+    }
+
+    /// The ways to these names may be others by now: their trees follow, and who wants to know is told.
+    pub(crate) fn routes_changed(&mut self, names: &[Name]) {
+        let mut links = BTreeSet::new();
+        for name in names {
+            self.select(name);
+            self.follow_way(name);
+            links.extend(self.names.watchers.get(name).into_iter().flatten().copied());
+        }
+        for link in links {
+            self.tell_interested(link, names);
+        }
+        if self.config.transit {
+            let waited = names.iter().filter(|n| self.names.watchers.contains_key(*n));
+            let lost: Vec<_> = waited
+                .filter(|n| !self.names.asking.contains_key(*n) && self.way(n).is_none())
+                .copied()
+                .collect();
+            for name in lost {
+                self.names.ask_again(name, self.now.instant);
+            }
+        }
+    }
+
+    /// The ways to nodes are others by now.
+    pub(crate) fn ways_changed(&mut self) {
+        let names: BTreeSet<_> = self.names.watchers.keys().chain(self.trees.keys()).copied().collect();
+        self.routes_changed(&names.into_iter().collect::<Vec<_>>());
+    }
+
+    fn select(&mut self, name: &Name) {
+        if !self.config.transit {
+            let way = self.way(name).map(|(link, _)| link);
+            if let Some(heard) = self.names.heard.get_mut(name) {
+                heard.selected = way;
+            }
+        }
+    }
+
+    /// Tells one who is interested what is news of these names: each advertisement once.
+    fn tell_interested(&mut self, link: LinkId, names: &[Name]) {
+        let mut adverts = BTreeMap::new();
+        let mut gone = Vec::new();
+        for name in names {
+            let Some(told) = self.links.get(&link).and_then(|l| l.interests.get(name)).copied() else {
+                continue;
+            };
+            let way = self.way(name).filter(|(way, _)| self.may_tell(*way, link));
+            let id = self.names.names.get(name).copied();
+            let news = match (told, way.zip(id)) {
+                (None, None) => continue,
+                (Some(_), None) => {
+                    gone.push(*name);
+                    None
+                }
+                (Some((known, old)), Some(((_, new), id))) if known == id && !cost_differs(old, new) => {
+                    continue;
+                }
+                (_, Some(((_, cost), id))) => {
+                    adverts.insert(id, cost);
+                    Some((id, cost))
+                }
+            };
+            if let Some(told) = self.links.get_mut(&link).and_then(|l| l.interests.get_mut(name)) {
+                *told = news;
+            }
+        }
+        for (id, cost) in adverts {
+            for frame in self.record_frames(id, cost.min(COST_SUSPECT)) {
+                self.send(link, frame);
+            }
+        }
+        for names in gone.chunks(NAMES_PER_FRAME_MAX) {
+            self.send(link, Control::Unreach { names: names.to_vec() });
+        }
+    }
+
+    // ---- Questions among routers.
+
+    pub(crate) fn handle_query(&mut self, now: Now, link: LinkId, hops: u8, names: &[Name]) {
+        let Some(state) = self.links.get(&link) else { return };
+        if !self.config.transit || !state.is_transit() {
+            return self.drop_frame(link, DropReason::NotRouter);
+        }
+        let node = state.node;
+        if !self.allowance(&node).may_query(now.instant, names.len()) {
+            return self.drop_frame(link, DropReason::Limit { what: "names asked for per second" });
+        }
+        let until = now.instant + QUERY_LEASE;
+        self.names.prune_at.get_or_insert(until);
+        let (mut unknown, mut refresh) = (Vec::new(), BTreeMap::<LinkId, Vec<Name>>::new());
+        for name in names {
+            let way = self.way(name).filter(|(way, _)| *way != link);
+            if way.is_some()
+                && let Some(record) = self.names.record(name)
+            {
+                let (owner, from) = (record.owner.node_id, record.from);
+                let again = record.asked.filter(|at| *at + QUERY_AGAIN <= now.instant).is_some();
+                self.answer(link, &owner, &[*name]);
+                self.tell_record(link, name);
+                if again && from != link {
+                    refresh.entry(from).or_default().push(*name);
+                    self.mark_asked(now.instant, name);
+                }
+                continue;
+            }
+            let Some(state) = self.links.get_mut(&link) else { return };
+            if state.asks.len() >= self.config.limits.interests_per_link_max {
+                self.drop_frame(link, DropReason::Limit { what: "names asked for" });
+                break;
+            }
+            state.asks.insert(*name, until);
+            let passed_on = self.names.passed_on.get(name);
+            if passed_on.is_none_or(|at| *at + QUERY_AGAIN <= now.instant) {
+                unknown.push(*name);
+            }
+        }
+        if hops >= HOP_LIMIT - 1 {
+            return self.drop_frame(link, DropReason::HopLimit);
+        }
+        self.pass_on(now.instant, Some(link), hops + 1, &unknown);
+        for (from, names) in refresh {
+            self.send(from, Control::Query { hops: hops + 1, names });
+        }
+    }
+
+    /// Asks all routers but the one who asked.
+    fn pass_on(&mut self, now: Instant, asker: Option<LinkId>, hops: u8, names: &[Name]) {
+        if names.is_empty() {
+            return;
+        }
+        let room = self.config.limits.tombstones_max.saturating_sub(self.names.passed_on.len());
+        let names = &names[..names.len().min(room)];
+        self.names.passed_on.extend(names.iter().map(|n| (*n, now)));
+        self.names.prune_at.get_or_insert(now + QUERY_LEASE);
+        let targets: Vec<_> = self
+            .links
+            .iter()
+            .filter(|(l, s)| Some(**l) != asker && s.is_transit())
+            .map(|(l, _)| *l)
+            .collect();
+        for link in targets {
+            for names in names.chunks(NAMES_PER_FRAME_MAX) {
+                self.send(link, Control::Query { hops, names: names.to_vec() });
+            }
+        }
+    }
+
+    fn mark_asked(&mut self, now: Instant, name: &Name) {
+        let record = self.names.names.get(name).and_then(|id| self.names.records.get_mut(id));
+        if let Some(record) = record {
+            record.asked = Some(now);
+        }
+    }
+
+    /// A router that asked is told where the owner is, and of changes from here on.
+    fn answer(&mut self, link: LinkId, owner: &NodeId, names: &[Name]) {
+        let until = self.now.instant + QUERY_LEASE;
+        let Some(state) = self.links.get_mut(&link) else { return };
+        for name in names {
+            state.asks.remove(name);
+        }
+        let new = state.follows.insert(*owner, until).is_none();
+        self.names.prune_at.get_or_insert(until);
+        // Routers are known to all; and who follows is told of changes.
+        if let Some(record) = self.topology.node(owner).filter(|r| new && !r.transit) {
+            let signed = record.signed.clone();
+            self.send(link, Control::LinkState { signed });
+        }
+    }
+
+    fn tell_record(&mut self, link: LinkId, name: &Name) {
+        if let Some(id) = self.names.names.get(name).copied() {
+            for frame in self.record_frames(id, 0) {
+                self.send(link, frame);
+            }
+        }
+    }
+
+    /// Answers what could not be answered before.
+    pub(crate) fn answer_asks(&mut self) {
+        let open: Vec<_> = self
+            .links
+            .iter()
+            .flat_map(|(link, s)| s.asks.keys().map(move |n| (*link, *n)))
+            .filter(|(link, n)| self.way(n).is_some_and(|(way, _)| way != *link))
+            .collect();
+        for (link, name) in open {
+            let Some(owner) = self.names.record(&name).map(|r| r.owner.node_id) else { continue };
+            self.answer(link, &owner, &[name]);
+            self.tell_record(link, &name);
+        }
+    }
+
+    /// What a router on the way must know before it can take a request for a name.
+    pub(crate) fn introduce(&mut self, link: LinkId, name: &Name) {
+        let transit = self.links.get(&link).is_some_and(|l| l.is_transit());
+        if self.mapping.tells_unasked() || !self.config.transit || !transit {
+            return;
+        }
+        let Some(record) = self.names.record(name) else { return };
+        let owner = record.owner.node_id;
+        self.answer(link, &owner, &[]);
+        self.tell_record(link, name);
+    }
+
+    /// Asks other routers for names that somebody here waits for, if that is due.
+    pub(crate) fn ask_due(&mut self, now: Now) {
+        let mut everyone = Vec::new();
+        let mut one = BTreeMap::<LinkId, Vec<Name>>::new();
+        while let Some((at, name)) = self.names.ask_at.first().copied().filter(|(at, _)| *at <= now.instant) {
+            self.names.ask_at.remove(&(at, name));
+            let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
+                None => Known::No,
+                Some(record) => match record.asked {
+                    Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
+                    Some(_) => Known::No,
+                    None => Known::Told,
+                },
+            };
+            match self.mapping.ask(known) {
+                Ask::Nobody => {
+                    self.names.asking.remove(&name);
+                    continue;
+                }
+                Ask::Everyone => everyone.push(name),
+                Ask::One(link) => one.entry(link).or_default().push(name),
+            }
+            self.names.ask_again(name, now.instant + QUERY_EVERY);
+        }
+        self.pass_on(now.instant, None, 0, &everyone);
+        for (link, names) in one {
+            for chunk in names.chunks(NAMES_PER_FRAME_MAX) {
+                chunk.iter().for_each(|name| self.mark_asked(now.instant, name));
+                self.send(link, Control::Query { hops: 0, names: chunk.to_vec() });
+            }
+        }
+    }
+
+    // ---- Time and trust.
+
+    pub(crate) fn names_timeout(&mut self, now: Now) {
+        while let Some((at, id)) = self.names.expiries.first().copied().filter(|(at, _)| *at <= now.instant) {
+            self.names.expiries.remove(&(at, id));
+            let names = self.forget_record(id);
+            self.routes_changed(&names);
+        }
+        while let Some((at, name)) = self.names.forgets.first().copied().filter(|(at, _)| *at <= now.instant)
+        {
+            self.names.forgets.remove(&(at, name));
+            self.names.tombstones.remove(&name);
+        }
+        if self.names.prune_at.is_some_and(|at| at <= now.instant) {
+            for state in self.links.values_mut() {
+                state.asks.retain(|_, until| *until > now.instant);
+                state.follows.retain(|_, until| *until > now.instant);
+            }
+            self.names.passed_on.retain(|_, at| *at + QUERY_LEASE > now.instant);
+            let idle = |s: &LinkState| s.asks.is_empty() && s.follows.is_empty();
+            let all_idle = self.names.passed_on.is_empty() && self.links.values().all(idle);
+            self.names.prune_at = (!all_idle).then(|| now.instant + QUERY_LEASE);
+        }
+    }
+
+    /// Forgets what was advertised under certificates that are no longer believed.
+    pub(crate) fn distrust_names(&mut self) {
+        let untrusted = |(_, r): &(&RecordId, &Record)| self.is_untrusted(&r.owner.path);
+        let gone: Vec<_> = self.names.records.iter().filter(untrusted).map(|(id, _)| *id).collect();
+        for id in gone {
+            let names = self.forget_record(id);
+            self.routes_changed(&names);
+        }
+    }
+
+    /// Names whose owners are in reach.
+    pub(crate) fn routed_names(&self) -> usize {
+        let reached = |r: &&Record| {
+            let owner = &r.owner.node_id;
+            *owner == self.config.node || !self.config.transit || self.way_to(owner).is_some()
+        };
+        let heard = |r: &Record| {
+            if self.config.transit || r.owner.node_id == self.config.node {
+                return r.live;
+            }
+            r.names.iter().filter(|n| self.way(n).is_some()).count()
+        };
+        self.names.records.values().filter(reached).map(heard).sum()
+    }
+}

@@ -1,0 +1,352 @@
+//! The network as its nodes describe it: link states in, ways out.
+//!
+//! Each node signs to whom it is linked. Routers pass link states on to each other, every one once, and each finds the
+//! shortest ways by itself. An edge counts only if both its ends say it, so nobody can claim to be where it is not.
+//! Ways to names are `names.rs`'s.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use sgc_trust::{CertId, signed_digest, verify_link_state};
+use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed};
+
+use crate::links::LinkState;
+use crate::router::{DropReason, LinkId, Router};
+use crate::spf::{Path, shortest_paths};
+
+/// How long a link state holds; it is signed anew after a third of it.
+const LEASE: Duration = Duration::from_secs(300);
+/// Least time between two link states of this node.
+const ORIGINATE_EVERY: Duration = Duration::from_millis(100);
+/// Least time between two searches for ways.
+const SEARCH_EVERY: Duration = Duration::from_millis(50);
+/// A cost that differs by less than a quarter is not told anew.
+const COST_PART: u32 = 4;
+
+/// A node as it described itself.
+#[derive(Debug)]
+pub(crate) struct NodeRecord {
+    pub(crate) seq: u64,
+    /// Advertisements of it with lower numbers are void.
+    pub(crate) floor: u64,
+    pub(crate) transit: bool,
+    routers: Vec<Adjacency>,
+    attached: Vec<NodeTag>,
+    pub(crate) certs: Arc<[CertId]>,
+    pub(crate) signed: Signed,
+    digest: [u8; 32],
+    expires: Instant,
+}
+
+impl NodeRecord {
+    fn cost_to(&self, router: &NodeId) -> Option<u32> {
+        let at = self.routers.binary_search_by(|a| a.node.cmp(router)).ok()?;
+        Some(self.routers[at].cost)
+    }
+
+    fn says(&self, node: &NodeId, transit: bool) -> bool {
+        if transit { self.cost_to(node).is_some() } else { self.attached.binary_search(&node.tag()).is_ok() }
+    }
+}
+
+/// All nodes that described themselves, and the ways to the routers among them.
+#[derive(Debug, Default)]
+pub(crate) struct Topology {
+    nodes: BTreeMap<NodeId, NodeRecord>,
+    expiries: BTreeSet<(Instant, NodeId)>,
+    seen: BTreeMap<[u8; 32], NodeId>,
+    paths: BTreeMap<NodeId, Path>,
+    /// When to search for ways, if something changed.
+    pub(crate) search_at: Option<Instant>,
+    searched: Option<Instant>,
+    /// When to describe this node anew.
+    pub(crate) originate_at: Option<Instant>,
+    originated: Option<Instant>,
+    own_seq: u64,
+}
+
+impl Topology {
+    pub(crate) fn node(&self, node: &NodeId) -> Option<&NodeRecord> {
+        self.nodes.get(node)
+    }
+
+    /// How many nodes are known.
+    pub(crate) fn len(&self) -> usize {
+        self.nodes.len()
+    }
+
+    pub(crate) fn next_expiry(&self) -> Option<Instant> {
+        self.expiries.first().map(|(at, _)| *at)
+    }
+
+    /// Something changed that ways depend on.
+    pub(crate) fn touch(&mut self, now: Instant) {
+        let at = self.searched.map_or(now, |at| now.max(at + SEARCH_EVERY));
+        self.search_at.get_or_insert(at);
+    }
+
+    /// This node's own links changed.
+    pub(crate) fn touch_own(&mut self, now: Instant) {
+        let at = self.originated.map_or(now, |at| now.max(at + ORIGINATE_EVERY));
+        self.originate_at = Some(self.originate_at.map_or(at, |due| due.min(at)));
+    }
+
+    /// The way from this router to a node: its cost and the first node on it.
+    pub(crate) fn way(&self, own: &NodeId, node: &NodeId) -> Option<(u32, NodeId)> {
+        if let Some(path) = self.paths.get(node) {
+            return Some((path.cost, path.first));
+        }
+        let record = self.nodes.get(node).filter(|r| !r.transit)?;
+        let over = |at: &Adjacency| {
+            let path = self.paths.get(&at.node)?;
+            let attached = self.nodes.get(&at.node).is_some_and(|r| r.says(node, false));
+            let first = if at.node == *own { *node } else { path.first };
+            attached.then(|| (path.cost.saturating_add(at.cost), path.hops, first))
+        };
+        record.routers.iter().filter_map(over).min().map(|(cost, _, first)| (cost, first))
+    }
+
+    fn search(&mut self, now: Instant, root: NodeId) {
+        self.search_at = None;
+        self.searched = Some(now);
+        let nodes = &self.nodes;
+        let edges = |from: &NodeId| {
+            let from = *from;
+            let record = nodes.get(&from).filter(|r| r.transit);
+            record.into_iter().flat_map(|r| &r.routers).filter_map(move |a| {
+                let back = nodes.get(&a.node).filter(|r| r.transit)?.says(&from, true);
+                back.then_some((a.node, a.cost))
+            })
+        };
+        self.paths = shortest_paths(root, &self.paths, edges);
+    }
+
+    fn insert(&mut self, node: NodeId, record: NodeRecord) {
+        self.remove(&node);
+        self.seen.insert(record.digest, node);
+        self.expiries.insert((record.expires, node));
+        self.nodes.insert(node, record);
+    }
+
+    fn remove(&mut self, node: &NodeId) -> bool {
+        let Some(old) = self.nodes.remove(node) else { return false };
+        self.seen.remove(&old.digest);
+        self.expiries.remove(&(old.expires, *node));
+        true
+    }
+}
+
+impl Router {
+    /// This node's links or their costs changed.
+    pub(crate) fn links_changed(&mut self, now: Instant) {
+        self.topology.touch_own(now);
+        self.topology.touch(now);
+    }
+
+    pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: Signed) {
+        let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return };
+        let (neighbour, from_router) = (state.node, state.is_transit());
+        if !self.config.transit {
+            return self.drop_frame(link, DropReason::Unknown { what: "link state" });
+        }
+        let digest = signed_digest(&signed);
+        if self.topology.seen.contains_key(&digest) {
+            return;
+        }
+        let verified = match verify_link_state(&self.config.anchors, &signed, now.unix) {
+            Ok(verified) => verified,
+            Err(why) => return self.not_verified(now, link, "link state", why),
+        };
+        let (node, body) = (verified.node.node_id, verified.body);
+        if !from_router && node != neighbour {
+            return self.drop_frame(link, DropReason::NotOwner { owner: node });
+        }
+        if body.transit && !verified.node.may_route {
+            return self.drop_frame(link, DropReason::NotRouter);
+        }
+        if node == self.config.node {
+            // Of an earlier run whose clock was ahead: this one goes on from there.
+            if body.seq >= self.topology.own_seq {
+                self.topology.own_seq = body.seq;
+                self.topology.touch_own(now.instant);
+            }
+            return;
+        }
+        match self.topology.node(&node) {
+            Some(known) if known.seq >= body.seq => {
+                let (seq, known) = (body.seq, known.seq);
+                if node == neighbour && seq < known {
+                    // It should hear that it said something newer before.
+                    let signed = self.topology.nodes[&node].signed.clone();
+                    self.send(link, Control::LinkState { signed });
+                }
+                return self.drop_frame(link, DropReason::Stale { seq, known });
+            }
+            Some(_) => {}
+            None if self.topology.len() >= self.config.limits.nodes_max => {
+                return self.drop_frame(link, DropReason::Limit { what: "nodes" });
+            }
+            None => {}
+        }
+        let expires = match self.lease_end(now, body.lease_ms, &verified.node) {
+            Ok(expires) => expires,
+            Err(why) => return self.not_verified(now, link, "link state", why),
+        };
+        let record = NodeRecord {
+            seq: body.seq,
+            floor: body.floor,
+            transit: body.transit,
+            routers: body.routers,
+            attached: body.attached,
+            certs: verified.node.path,
+            signed,
+            digest,
+            expires,
+        };
+        let floor = record.floor;
+        self.topology.insert(node, record);
+        self.topology.touch(now.instant);
+        self.void_names(&node, floor);
+        self.tell_link_state(link, &node);
+    }
+
+    /// Describes this node, if that is due: to all routers that it is linked to.
+    pub(crate) fn originate_due(&mut self, now: Now) {
+        if self.topology.originate_at.is_none_or(|at| at > now.instant) {
+            return;
+        }
+        self.topology.originated = Some(now.instant);
+        self.topology.originate_at = Some(now.instant + LEASE / 3);
+        let mut routers = BTreeMap::<NodeId, u32>::new();
+        let mut attached = BTreeSet::new();
+        let greeted = |(l, s): &(&LinkId, &LinkState)| **l != LinkId::LOCAL && s.hello.is_some();
+        for (_, state) in self.links.iter().filter(greeted) {
+            if state.is_transit() {
+                let cost = routers.entry(state.node).or_insert(u32::MAX);
+                *cost = state.cost.now().min(*cost);
+            } else if self.config.transit {
+                attached.insert(state.node.tag());
+            }
+        }
+        let own_seq = now.unix.0.max(self.topology.own_seq + 1);
+        self.topology.own_seq = own_seq;
+        let identity = &self.config.identity;
+        let body = LinkStateBody {
+            chain: identity.chain_bytes(),
+            seq: own_seq,
+            issued_at: now.unix,
+            lease_ms: LEASE.as_millis() as u32,
+            floor: self.config.started.0,
+            transit: self.config.transit,
+            routers: routers.into_iter().map(|(node, cost)| Adjacency { node, cost }).collect(),
+            attached: attached.into_iter().collect(),
+        };
+        let signed = identity.sign_link_state(&body);
+        let node = self.config.node;
+        let record = NodeRecord {
+            seq: body.seq,
+            floor: body.floor,
+            transit: body.transit,
+            routers: body.routers,
+            attached: body.attached,
+            certs: Arc::new([]),
+            digest: signed_digest(&signed),
+            signed,
+            // Always renewed before.
+            expires: now.instant + LEASE,
+        };
+        self.topology.insert(node, record);
+        self.topology.touch(now.instant);
+        self.tell_link_state(LinkId::LOCAL, &node);
+    }
+
+    /// Passes on what a node said of itself: a router to all routers, others as the mapping says.
+    fn tell_link_state(&mut self, ingress: LinkId, node: &NodeId) {
+        let Some(record) = self.topology.node(node) else { return };
+        let (everyone, signed) = (record.transit || *node == self.config.node, record.signed.clone());
+        let everyone = everyone || self.mapping.tells_unasked();
+        let targets: Vec<_> = self
+            .links
+            .iter()
+            .filter(|(l, s)| **l != ingress && s.is_transit() && (everyone || s.follows.contains_key(node)))
+            .map(|(l, _)| *l)
+            .collect();
+        for link in targets {
+            self.send(link, Control::LinkState { signed: signed.clone() });
+        }
+    }
+
+    /// Tells a router that just greeted what is known of the network.
+    pub(crate) fn send_topology(&mut self, link: LinkId) {
+        let unasked = self.mapping.tells_unasked();
+        let own = self.config.node;
+        let told = |(node, record): &(&NodeId, &NodeRecord)| {
+            **node == own || self.config.transit && (record.transit || unasked)
+        };
+        let frames: Vec<_> = self.topology.nodes.iter().filter(told).map(|(_, r)| r.signed.clone()).collect();
+        for signed in frames {
+            self.send(link, Control::LinkState { signed });
+        }
+    }
+
+    /// Searches for ways if that is due; then everything that goes another way by now is told so.
+    pub(crate) fn search_due(&mut self, now: Now) {
+        if self.topology.search_at.is_none_or(|at| at > now.instant) {
+            return;
+        }
+        if self.config.transit {
+            self.topology.search(now.instant, self.config.node);
+        } else {
+            self.topology.search_at = None;
+        }
+        self.ways_changed();
+        self.answer_asks();
+    }
+
+    pub(crate) fn expire_nodes(&mut self, now: Now) {
+        while let Some((at, node)) =
+            self.topology.expiries.first().copied().filter(|(at, _)| *at <= now.instant)
+        {
+            self.topology.expiries.remove(&(at, node));
+            if node != self.config.node {
+                self.topology.remove(&node);
+                self.topology.touch(now.instant);
+            }
+        }
+    }
+
+    /// Forgets what nodes said whose certificates are no longer believed.
+    pub(crate) fn distrust_nodes(&mut self, now: Instant) {
+        let gone: Vec<_> = self
+            .topology
+            .nodes
+            .iter()
+            .filter(|(_, r)| self.is_untrusted(&r.certs))
+            .map(|(n, _)| *n)
+            .collect();
+        for node in gone {
+            self.topology.remove(&node);
+            self.topology.touch(now);
+        }
+    }
+
+    /// The best link to a neighbour: the cheapest, of about equal ones the newest.
+    pub(crate) fn link_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
+        let of_node =
+            |(l, s): &(&LinkId, &LinkState)| **l != LinkId::LOCAL && s.node == *node && s.hello.is_some();
+        let mut best: Option<(LinkId, u32)> = None;
+        for (link, state) in self.links.iter().rev().filter(of_node) {
+            let cost = state.cost.now();
+            if best.is_none_or(|(_, known)| cost.saturating_mul(2).saturating_add(5000) < known) {
+                best = Some((*link, cost));
+            }
+        }
+        best
+    }
+}
+
+/// True if a neighbour that was told `old` should hear of `new`.
+pub(crate) fn cost_differs(old: u32, new: u32) -> bool {
+    old.abs_diff(new) > old.min(new) / COST_PART
+}

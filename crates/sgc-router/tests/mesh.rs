@@ -1,0 +1,644 @@
+//! One router among scripted neighbours: which way it takes, and what it tells of it.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_router::{FibEntry, Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterConfig};
+use sgc_testkit::{Clock, Member, identity};
+use sgc_trust::{Identity, name_of};
+use sgc_wire::{
+    Adjacency, AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Hello, JoinBody, LinkStateBody, Name,
+    NodeId, RejectReason, Request, SinkId,
+};
+
+const A: Blind = Blind([0xa; 32]);
+const B: Blind = Blind([0xb; 32]);
+const LEASE: Duration = Duration::from_secs(60);
+
+fn ms(n: u64) -> Duration {
+    Duration::from_millis(n)
+}
+
+/// The router `cloud`, linked to the scripted routers 1, 2 and 3 by links of those numbers. Their links among each
+/// other and to the owner are what they say.
+struct Bench {
+    router: Router,
+    clock: Clock,
+    own: Arc<Identity>,
+    routers: Vec<Arc<Identity>>,
+    owner: Arc<Identity>,
+    user: Arc<Identity>,
+    timeout: Option<std::time::Instant>,
+    sent: Vec<(u32, Control)>,
+    dropped: Vec<&'static str>,
+    entry: Option<FibEntry>,
+    seq: u64,
+}
+
+impl Bench {
+    fn with(mapping: MappingKind, limits: Limits) -> Self {
+        let router_identity = |name: &str| identity(&Member { router: true, ..Member::new(name) });
+        let own = router_identity("cloud");
+        let clock = Clock::default();
+        let config = RouterConfig {
+            node: own.node_id(),
+            identity: own.clone(),
+            transit: true,
+            incarnation: 1,
+            started: clock.now().unix,
+            mapping,
+            anchors: Arc::new(own.anchors().clone()),
+            limits,
+        };
+        let mut bench = Self {
+            router: Router::new(config, clock.now()),
+            clock,
+            own,
+            routers: (1..=5).map(|n| router_identity(&format!("router-{n}"))).collect(),
+            owner: identity(&Member::new("arm-1")),
+            user: identity(&Member::new("desk")),
+            timeout: None,
+            sent: Vec::new(),
+            dropped: Vec::new(),
+            entry: None,
+            seq: 0,
+        };
+        for n in 1..=3 {
+            bench.up(n, &bench.routers[n as usize - 1].clone(), true, 1000);
+        }
+        bench
+    }
+
+    fn new() -> Self {
+        Self::with(MappingKind::Flood, Limits::default())
+    }
+
+    fn up(&mut self, link: u32, node: &Identity, transit: bool, cost: u32) {
+        let neighbour = Neighbour { cost: Some(cost), ..Neighbour::from(node.as_peer()) };
+        self.router.handle_link_up(self.clock.now(), LinkId(link), neighbour);
+        self.frame(link, Control::Hello(Hello { minor: 0, incarnation: link.into(), transit }));
+    }
+
+    fn drain(&mut self) {
+        loop {
+            match self.router.poll_output() {
+                Output::Send { link, frame } => self.sent.push((link.0, frame)),
+                Output::Dropped(dropped) => self.dropped.push(dropped.reason.key()),
+                Output::Forward { entry, .. } => self.entry = entry,
+                Output::Timeout(at) => {
+                    self.timeout = at;
+                    return;
+                }
+                Output::Close { .. } | Output::Trust(_) => {}
+            }
+        }
+    }
+
+    fn frame(&mut self, link: u32, frame: Control) {
+        self.sent.clear();
+        self.router.handle_frame(self.clock.now(), LinkId(link), frame);
+        self.drain();
+    }
+
+    /// The router with a number; 0 is the one under test.
+    fn node(&self, router: usize) -> NodeId {
+        if router == 0 { self.own.node_id() } else { self.routers[router - 1].node_id() }
+    }
+
+    /// A link state of a router, over a link: to which routers it is linked, and whether to the owner.
+    fn says(&mut self, link: u32, router: usize, links: &[(usize, u32)], owner: bool) {
+        self.seq += 1;
+        let mut routers: Vec<_> =
+            links.iter().map(|(n, cost)| Adjacency { node: self.node(*n), cost: *cost }).collect();
+        routers.sort_by_key(|a| a.node);
+        let body = LinkStateBody {
+            chain: self.routers[router - 1].chain_bytes(),
+            seq: self.seq,
+            issued_at: self.clock.now().unix,
+            lease_ms: LEASE.as_millis() as u32,
+            floor: 0,
+            transit: true,
+            routers,
+            attached: owner.then(|| self.owner.node_id().tag()).into_iter().collect(),
+        };
+        let signed = self.routers[router - 1].sign_link_state(&body);
+        self.frame(link, Control::LinkState { signed });
+        self.pass(ms(100));
+    }
+
+    /// Where the owner says that it is.
+    fn owner_says(&mut self, link: u32, floor: u64, routers: &[(usize, u32)]) {
+        self.seq += 1;
+        let mut at: Vec<_> =
+            routers.iter().map(|(n, cost)| Adjacency { node: self.node(*n), cost: *cost }).collect();
+        at.sort_by_key(|a| a.node);
+        let body = LinkStateBody {
+            chain: self.owner.chain_bytes(),
+            seq: self.seq,
+            issued_at: self.clock.now().unix,
+            lease_ms: LEASE.as_millis() as u32,
+            floor,
+            transit: false,
+            routers: at,
+            attached: vec![],
+        };
+        let signed = self.owner.sign_link_state(&body);
+        self.frame(link, Control::LinkState { signed });
+        self.pass(ms(100));
+    }
+
+    fn advert_frame(&self, seq: u64, withdraw: bool, blinds: &[Blind]) -> Control {
+        let body = AdvertBody {
+            chain: self.owner.chain_bytes(),
+            seq,
+            issued_at: self.clock.now().unix,
+            lease_ms: LEASE.as_millis() as u32,
+            withdraw,
+            blinds: blinds.to_vec(),
+        };
+        Control::Advert { cost: 0, signed: self.owner.sign_advert(&body) }
+    }
+
+    fn advert(&mut self, link: u32, seq: u64, blinds: &[Blind]) {
+        self.frame(link, self.advert_frame(seq, false, blinds));
+    }
+
+    /// All three neighbours are linked to this router; the owner is at router 4, which 1 and 2 reach at these costs.
+    fn with_owner_behind(&mut self, over_1: u32, over_2: u32) {
+        self.says(1, 1, &[(0, 1000), (4, over_1)], false);
+        self.says(2, 2, &[(0, 1000), (4, over_2)], false);
+        self.says(1, 4, &[(1, over_1), (2, over_2)], true);
+        self.owner_says(1, 0, &[(4, 500)]);
+        self.advert(1, 10, &[A]);
+    }
+
+    fn link_down(&mut self, link: u32) {
+        self.sent.clear();
+        self.router.handle_link_down(self.clock.now(), LinkId(link));
+        self.drain();
+    }
+
+    fn pass(&mut self, time: Duration) {
+        let end = self.clock.instant() + time;
+        while let Some(at) = self.timeout.filter(|at| *at <= end) {
+            self.clock.advance_to(at);
+            self.router.handle_timeout(self.clock.now());
+            self.drain();
+        }
+        self.clock.advance_to(end);
+    }
+
+    fn name(&self, blind: &Blind) -> Name {
+        name_of(&self.owner.node_id(), blind)
+    }
+
+    /// Link in use and cost.
+    fn route(&self, blind: &Blind) -> Option<(u32, u32)> {
+        self.router.route(&self.name(blind)).map(|(link, cost)| (link.0, cost))
+    }
+
+    /// A proxy asks to subscribe.
+    fn join(&mut self, link: u32, sink: u8, blind: &Blind) {
+        let body = JoinBody {
+            name: self.name(blind),
+            sink: SinkId([sink; 16]),
+            request: Request::Subscribe { describe: false },
+            issued_at: self.clock.now().unix,
+            chain: self.user.chain_bytes(),
+            reply_key: Bytes::from_static(&[1; 32]),
+        };
+        let signed = self.user.sign_join(&body);
+        self.frame(link, Control::Join { signed });
+    }
+
+    fn grant(&mut self, link: u32, sink: u8, blind: &Blind) {
+        let answer = Answer::Grant { enc: Bytes::new(), sealed: Bytes::new() };
+        let (name, sink) = (self.name(blind), SinkId([sink; 16]));
+        let signed = self.owner.sign_answer(&AnswerBody { name, sink, serial: 1, answer });
+        self.frame(link, Control::Answer { signed });
+    }
+
+    /// The kinds of the frames sent since the last, with their links.
+    fn told(&self) -> Vec<(u32, &'static str)> {
+        let kind = |frame: &Control| match frame {
+            Control::Advert { signed, .. } => {
+                let body = AdvertBody::from_slice(&signed.body).expect("as it was signed");
+                if body.withdraw { "withdrawal" } else { "advert" }
+            }
+            Control::LinkState { .. } => "link state",
+            Control::Query { .. } => "query",
+            Control::Unreach { .. } => "unreach",
+            Control::Join { .. } => "join",
+            Control::Answer { .. } => "answer",
+            Control::Leave { .. } => "leave",
+            Control::Reject { reason: RejectReason::RouteLost, .. } => "route lost",
+            Control::Reject { reason: RejectReason::NoRoute, .. } => "no route",
+            Control::Reject { .. } => "reject",
+            Control::Reroute { .. } => "reroute",
+            _ => "other",
+        };
+        let mut told: Vec<_> = self.sent.iter().map(|(link, frame)| (*link, kind(frame))).collect();
+        told.sort_unstable();
+        told
+    }
+
+    /// What leaves for all, having come in over a link.
+    fn egress(&self, ingress: u32) -> Vec<u32> {
+        self.entry.iter().flat_map(|e| e.egress(LinkId(ingress))).map(|l| l.0).collect()
+    }
+
+    /// A proxy on link 4 and one on link 5.
+    fn with_proxies(&mut self) {
+        for (link, name) in [(4, "desk"), (5, "wall")] {
+            self.up(link, &identity(&Member::new(name)).clone(), false, 1000);
+        }
+    }
+}
+
+#[test]
+fn the_cheapest_way_is_taken_and_a_change_of_cost_moves_it() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    assert_eq!(bench.route(&A), Some((1, 1000 + 5000 + 500)));
+    bench.says(2, 2, &[(0, 1000), (4, 2000)], false);
+    assert_eq!(bench.route(&A), Some((2, 1000 + 2000 + 500)));
+}
+
+#[test]
+fn an_edge_counts_only_if_both_its_ends_say_it() {
+    let mut bench = Bench::new();
+    bench.says(1, 1, &[(0, 1000), (4, 10)], true);
+    // Router 1 says that it is linked to 4, and that the owner is attached to it; neither says so.
+    bench.says(1, 4, &[(2, 10)], true);
+    bench.owner_says(1, 0, &[(4, 500)]);
+    bench.advert(1, 10, &[A]);
+    assert_eq!(bench.route(&A), None);
+    bench.says(1, 4, &[(1, 10), (2, 10)], true);
+    assert_eq!(bench.route(&A), Some((1, 1510)));
+    bench.says(1, 4, &[(1, 10), (2, 10)], false);
+    assert_eq!(bench.route(&A), None, "the router does not see the owner any more");
+}
+
+#[test]
+fn a_link_state_goes_to_all_others_once_and_an_old_one_nowhere() {
+    let mut bench = Bench::new();
+    bench.pass(ms(200));
+    bench.seq = 10;
+    bench.says(1, 4, &[(1, 10)], false);
+    assert_eq!(bench.told(), [(2, "link state"), (3, "link state")]);
+    bench.seq = 4;
+    bench.says(2, 4, &[(1, 10)], false);
+    assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![], ["stale"].as_slice()));
+    bench.says(1, 1, &[(0, 1000)], false);
+    assert_eq!(bench.told(), [(2, "link state"), (3, "link state")]);
+    bench.seq = 0;
+    bench.says(1, 1, &[], false);
+    assert_eq!(bench.told(), [(1, "link state")], "who is behind its own word hears it");
+}
+
+#[test]
+fn a_node_that_may_not_route_cannot_say_that_it_does() {
+    let mut bench = Bench::new();
+    let body = LinkStateBody {
+        chain: bench.owner.chain_bytes(),
+        seq: 1,
+        issued_at: bench.clock.now().unix,
+        lease_ms: 1000,
+        floor: 0,
+        transit: true,
+        routers: vec![],
+        attached: vec![],
+    };
+    let signed = bench.owner.sign_link_state(&body);
+    bench.frame(1, Control::LinkState { signed });
+    assert_eq!((bench.dropped.as_slice(), bench.router.stats().nodes), (["not_router"].as_slice(), 1));
+}
+
+#[test]
+fn a_proxy_says_only_where_it_is_itself() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.says(4, 4, &[(1, 10)], true);
+    bench.owner_says(4, 0, &[(1, 10)]);
+    assert_eq!(bench.dropped, ["not_owner", "not_owner"]);
+}
+
+#[test]
+fn this_nodes_word_of_a_run_with_a_wrong_clock_is_overtaken() {
+    let mut bench = Bench::new();
+    let ahead = bench.clock.now().unix.0 + 1_000_000;
+    let body = LinkStateBody {
+        chain: bench.own.chain_bytes(),
+        seq: ahead,
+        issued_at: bench.clock.now().unix,
+        lease_ms: 1000,
+        floor: 0,
+        transit: true,
+        routers: vec![],
+        attached: vec![],
+    };
+    let signed = bench.own.sign_link_state(&body);
+    bench.frame(1, Control::LinkState { signed });
+    bench.pass(ms(200));
+    let newest = bench.sent.iter().filter_map(|(_, frame)| match frame {
+        Control::LinkState { signed } => Some(LinkStateBody::from_slice(&signed.body).expect("ours").seq),
+        _ => None,
+    });
+    assert_eq!(newest.max(), Some(ahead + 1));
+}
+
+#[test]
+fn a_link_that_fell_silent_is_left_where_there_is_another_way() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    bench.router.handle_link_quality(bench.clock.now(), LinkId(1), ms(1), true);
+    bench.drain();
+    bench.pass(ms(200));
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(2));
+    bench.link_down(2);
+    bench.pass(ms(200));
+    assert_eq!(bench.route(&A).map(|(link, _)| link), Some(1), "it is better than none");
+}
+
+#[test]
+fn names_are_told_to_all_routers_or_to_those_who_ask() {
+    for (mapping, told) in
+        [(MappingKind::Flood, vec![(2, "advert"), (3, "advert")]), (MappingKind::Query, vec![])]
+    {
+        let mut bench = Bench::with(mapping, Limits::default());
+        bench.up(4, &bench.owner.clone(), false, 1000);
+        bench.owner_says(4, 0, &[(0, 1000)]);
+        bench.advert(4, 10, &[A, B]);
+        let from_proxy: Vec<_> = bench.told().into_iter().filter(|(link, _)| *link != 1).collect();
+        assert_eq!(from_proxy, told, "{mapping:?}");
+        let names = vec![bench.name(&A)];
+        bench.frame(1, Control::Query { hops: 0, names });
+        assert_eq!(bench.told(), [(1, "advert"), (1, "link state")], "{mapping:?}: an answer");
+        // Who asked hears of changes.
+        bench.frame(4, bench.advert_frame(11, true, &[A]));
+        assert!(bench.told().contains(&(1, "withdrawal")), "{mapping:?}");
+    }
+}
+
+#[test]
+fn an_unknown_name_is_asked_for_once_and_all_who_asked_are_answered() {
+    let mut bench = Bench::with(MappingKind::Query, Limits::default());
+    let names = vec![bench.name(&A)];
+    bench.frame(1, Control::Query { hops: 0, names: names.clone() });
+    assert_eq!(bench.told(), [(2, "query"), (3, "query")]);
+    bench.frame(2, Control::Query { hops: 1, names: names.clone() });
+    assert_eq!(bench.told(), [], "the same question is under way");
+    bench.frame(3, Control::Query { hops: 63, names });
+    assert_eq!(bench.dropped, ["hop_limit"]);
+    bench.up(4, &bench.owner.clone(), false, 1000);
+    bench.owner_says(4, 0, &[(0, 1000)]);
+    bench.advert(4, 10, &[A]);
+    let adverts: Vec<_> = bench.told().into_iter().filter(|(_, what)| *what == "advert").collect();
+    assert_eq!(adverts, [(1, "advert"), (2, "advert"), (3, "advert")]);
+}
+
+#[test]
+fn who_waits_for_a_name_makes_the_router_ask_again_and_again() {
+    for mapping in [MappingKind::Flood, MappingKind::Query] {
+        let mut bench = Bench::with(mapping, Limits::default());
+        bench.with_proxies();
+        let names = vec![bench.name(&A)];
+        bench.pass(ms(200));
+        bench.frame(4, Control::Interest { names: names.clone() });
+        let asked = [(1, "query"), (2, "query"), (3, "query")];
+        assert_eq!(bench.told(), asked);
+        bench.sent.clear();
+        bench.pass(Duration::from_secs(21));
+        assert_eq!(bench.told(), asked);
+        bench.frame(4, Control::Uninterest { names });
+        bench.sent.clear();
+        bench.pass(Duration::from_secs(50));
+        assert_eq!(bench.told(), []);
+        bench.pass(Duration::from_secs(200));
+        assert_eq!(bench.router.stats().names, 0, "nothing is left");
+    }
+}
+
+#[test]
+fn questions_are_bounded() {
+    let limits = Limits { queries_burst: 16, interests_per_link_max: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Query, limits);
+    let names: Vec<_> = (0..12).map(|n| bench.name(&numbered(n))).collect();
+    bench.frame(1, Control::Query { hops: 0, names });
+    let asked = |bench: &Bench| match &bench.sent[..] {
+        [(2, Control::Query { names, .. }), (3, _)] => names.len(),
+        other => panic!("{other:?}"),
+    };
+    assert_eq!((asked(&bench), bench.dropped.as_slice()), (8, ["limit"].as_slice()));
+    let names: Vec<_> = (20..28).map(|n| bench.name(&numbered(n))).collect();
+    bench.frame(1, Control::Query { hops: 0, names });
+    assert_eq!((bench.sent.len(), bench.dropped.len()), (0, 2), "too fast");
+}
+
+#[test]
+fn what_an_owner_advertised_before_it_started_anew_is_void() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    bench.owner_says(1, 11, &[(4, 500)]);
+    assert_eq!((bench.route(&A), bench.router.stats().routed_names), (None, 0));
+    bench.advert(2, 10, &[B]);
+    assert_eq!((bench.route(&B), bench.dropped.as_slice()), (None, ["stale"].as_slice()));
+    bench.advert(2, 11, &[A]);
+    assert!(bench.route(&A).is_some());
+}
+
+#[test]
+fn a_router_that_comes_later_hears_what_was_withdrawn() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    bench.advert(1, 11, &[A, B]);
+    bench.frame(1, bench.advert_frame(12, true, &[B]));
+    bench.sent.clear();
+    let late = bench.routers[4].clone();
+    bench.up(6, &late, true, 1000);
+    let to_late: Vec<_> =
+        bench.told().into_iter().filter(|(l, what)| *l == 6 && *what != "link state").collect();
+    assert!(to_late.contains(&(6, "advert")) && to_late.contains(&(6, "withdrawal")), "{to_late:?}");
+    bench.advert(3, 11, &[A, B]);
+    assert_eq!(bench.route(&B), None, "a replay does not bring it back");
+}
+
+#[test]
+fn a_name_ends_with_its_lease_and_no_lease_is_longer_than_the_limit() {
+    let limits = Limits { lease_max: Duration::from_secs(30), ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    bench.with_proxies();
+    bench.up(6, &bench.owner.clone(), false, 1000);
+    bench.advert(6, 10, &[A]);
+    let names = vec![bench.name(&A)];
+    bench.frame(4, Control::Interest { names });
+    assert_eq!(bench.told(), [(4, "advert")]);
+    bench.pass(Duration::from_secs(29));
+    assert!(bench.route(&A).is_some());
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(2));
+    assert_eq!(bench.route(&A), None);
+    assert!(bench.told().contains(&(4, "unreach")));
+}
+
+#[test]
+fn a_branch_stays_on_its_way_until_its_sink_has_found_the_better_one() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(4, 1, &A);
+    assert_eq!(bench.told(), [(1, "join")]);
+    bench.grant(1, 1, &A);
+    assert_eq!(bench.egress(1), [4]);
+    bench.sent.clear();
+    bench.says(2, 2, &[(0, 1000), (4, 100)], false);
+    assert!(bench.told().contains(&(4, "reroute")));
+    assert_eq!(bench.egress(1), [4], "what flows goes on");
+    bench.join(4, 2, &A);
+    assert_eq!(bench.told(), [(2, "join")]);
+    bench.grant(2, 2, &A);
+    assert_eq!((bench.egress(2), bench.egress(1)), (vec![4], vec![]), "one copy");
+    assert!(
+        bench.entry.as_ref().is_some_and(|e| e.accepts_from(LinkId(1))),
+        "what is under way is no attack"
+    );
+    let (name, sink) = (bench.name(&A), SinkId([1; 16]));
+    bench.frame(4, Control::Leave { name, sink });
+    assert_eq!((bench.told(), bench.egress(2)), (vec![(1, "leave")], vec![4]));
+    assert!(bench.entry.as_ref().is_some_and(|e| !e.accepts_from(LinkId(1))));
+}
+
+#[test]
+fn a_link_is_never_fed_from_an_older_way_again() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(4, 1, &A);
+    bench.grant(1, 1, &A);
+    bench.says(2, 2, &[(0, 1000), (4, 100)], false);
+    bench.join(4, 2, &A);
+    bench.grant(2, 2, &A);
+    let (name, sink) = (bench.name(&A), SinkId([2; 16]));
+    bench.frame(4, Control::Leave { name, sink });
+    assert_eq!((bench.egress(1), bench.egress(2)), (vec![], vec![4]));
+}
+
+#[test]
+fn a_sink_that_does_not_find_the_better_way_is_cut_in_the_end() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(4, 1, &A);
+    bench.grant(1, 1, &A);
+    bench.says(2, 2, &[(0, 1000), (4, 100)], false);
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(11));
+    let told = bench.told();
+    assert!(told.contains(&(4, "route lost")) && told.contains(&(1, "leave")), "{told:?}");
+    assert_eq!(bench.entry, None);
+}
+
+#[test]
+fn a_branch_is_cut_with_its_link_and_one_that_waits_when_the_way_changes() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(4, 1, &A);
+    bench.grant(1, 1, &A);
+    bench.link_down(1);
+    assert!(bench.told().contains(&(4, "route lost")));
+    assert_eq!(bench.entry, None);
+    bench.pass(ms(200));
+    bench.join(5, 2, &A);
+    assert_eq!(bench.told(), [(2, "join")]);
+    bench.sent.clear();
+    bench.says(3, 3, &[(0, 1000), (4, 10)], false);
+    bench.says(3, 4, &[(2, 9000), (3, 10)], true);
+    let told = bench.told();
+    assert!(told.contains(&(5, "route lost")) && told.contains(&(2, "leave")), "{told:?}");
+    assert_eq!(bench.router.stats().branches, 0);
+}
+
+#[test]
+fn a_request_that_comes_back_is_refused() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(3, 1, &A);
+    bench.join(2, 1, &A);
+    assert_eq!(bench.told(), [(2, "no route")]);
+    bench.join(1, 2, &A);
+    assert_eq!(bench.told(), [(1, "no route")], "not back where it came from");
+}
+
+#[test]
+fn a_grant_for_a_sink_that_left_is_given_back() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    bench.grant(1, 1, &A);
+    assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![(1, "leave")], ["unknown"].as_slice()));
+}
+
+#[test]
+fn a_newer_run_supersedes_and_an_older_one_that_greets_late_does_not() {
+    let mut bench = Bench::new();
+    let node = identity(&Member::new("wall"));
+    let neighbour = Neighbour::from(node.as_peer());
+    for link in [10, 11] {
+        bench.router.handle_link_up(bench.clock.now(), LinkId(link), neighbour.clone());
+    }
+    let hello = |incarnation| Control::Hello(Hello { minor: 0, incarnation, transit: false });
+    bench.frame(11, hello(2));
+    bench.frame(10, hello(1));
+    let interest = Control::Interest { names: vec![bench.name(&A)] };
+    bench.frame(10, interest.clone());
+    assert_eq!(bench.dropped, ["no_link"]);
+    bench.frame(11, interest);
+    assert_eq!(bench.dropped, ["no_link"], "the newer link lives");
+}
+
+#[test]
+fn names_are_bounded_for_each_owner_and_each_link() {
+    for (limits, from) in [
+        (Limits { names_per_owner_max: 3, ..Limits::default() }, 1),
+        (Limits { names_per_router_max: 3, ..Limits::default() }, 2),
+        (Limits { names_max: 3, ..Limits::default() }, 3),
+    ] {
+        let mut bench = Bench::with(MappingKind::Flood, limits);
+        bench.advert(1, 10, &(0..3).map(numbered).collect::<Vec<_>>());
+        bench.advert(1, 11, &(0..3).map(numbered).collect::<Vec<_>>());
+        assert_eq!(bench.dropped, [""; 0], "known names are renewed ({from})");
+        bench.advert(1, 12, &[numbered(3)]);
+        assert_eq!((bench.dropped.as_slice(), bench.router.stats().names), (["limit"].as_slice(), 3));
+    }
+}
+
+fn numbered(n: usize) -> Blind {
+    let mut blind = [0; 32];
+    blind[..8].copy_from_slice(&(n as u64).to_be_bytes());
+    Blind(blind)
+}
+
+#[test]
+fn the_loss_of_a_link_with_many_names_is_told_in_few_frames() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    let blinds: Vec<_> = (0..5000).map(numbered).collect();
+    for some in blinds.chunks(256) {
+        bench.advert(1, 10, some);
+    }
+    let names: Vec<_> = blinds.iter().map(|b| bench.name(b)).collect();
+    for some in names.chunks(4096) {
+        bench.frame(4, Control::Interest { names: some.to_vec() });
+        assert!(bench.sent.iter().all(|(_, f)| matches!(f, Control::Advert { .. })));
+        assert_eq!(bench.sent.len(), some.len().div_ceil(256), "one advertisement answers for all its names");
+    }
+    bench.sent.clear();
+    bench.says(1, 4, &[], true);
+    let told = bench.sent.iter().filter_map(|(link, frame)| match frame {
+        Control::Unreach { names } => Some((*link, names.len())),
+        _ => None,
+    });
+    assert_eq!(told.collect::<Vec<_>>(), [(4, 4096), (4, 904)]);
+}
