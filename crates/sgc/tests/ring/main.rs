@@ -43,9 +43,9 @@ const HEAL_MAX: Duration = Duration::from_secs(30);
 const LAST_MAX: Duration = Duration::from_secs(60);
 /// Longest wait for a best-effort message that may be lost, and for something doubled that should not come.
 const LINGER: Duration = Duration::from_secs(2);
-/// Best effort: how much must come at least, and how many may be lost with no fault near.
+/// Best effort: how much must come at least, and how much may be lost with no fault near (to a busy processor).
 const SHARE_MIN: f64 = 0.5;
-const UNEXPLAINED_MAX: usize = 5;
+const UNEXPLAINED_MAX: f64 = 0.02;
 /// How long after the mending of a fault it explains a loss.
 const EXPLAINS: Duration = Duration::from_secs(15);
 /// Events that are no further apart than this count as one moment: what is under way still arrives.
@@ -367,7 +367,7 @@ impl Run {
                 .filter(|(at, _)| !self.events.iter().any(|event| explains(event, *at)))
                 .map(|(_, seq)| *seq)
                 .collect();
-            if unexplained.len() > UNEXPLAINED_MAX {
+            if unexplained.len() as f64 > sent as f64 * UNEXPLAINED_MAX {
                 problems.push(format!(
                     "{name}: {} lost with no fault near: {:?}",
                     unexplained.len(),
