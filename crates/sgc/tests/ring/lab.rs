@@ -22,11 +22,11 @@ const PREFIX: &str = "sgcring";
 const STATUS_MAX: Duration = Duration::from_secs(2);
 /// Lines of each log that are shown when a test fails.
 const LOG_LINES: usize = 40;
-/// How long a peer may live at most, in seconds, should nobody end it.
-const PEER_LIFE: &str = "3600";
 
 pub(crate) struct Lab {
     dir: PathBuf,
+    /// How many seconds a peer lives at most, should nobody end it.
+    peer_life: String,
     _temporary: Option<TempDir>,
     /// False where the kernel or the user cannot make namespaces.
     pub(crate) apart: bool,
@@ -34,13 +34,18 @@ pub(crate) struct Lab {
 }
 
 impl Lab {
-    /// A fleet, and all nodes running; the robot shares `topics`. Files go to `dir`, if given, and stay there.
-    pub(crate) fn new(topics: &[&str], dir: Option<PathBuf>) -> Self {
-        let temporary = dir.is_none().then(|| tempfile::tempdir().unwrap());
-        let dir = dir.unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
+    /// A fleet, and all nodes running; the robot shares `topics`. Files go to a directory of their own in `keep`, if
+    /// given, and stay there.
+    pub(crate) fn new(topics: &[&str], keep: Option<PathBuf>, peer_life: Duration) -> Self {
+        let temporary = keep.is_none().then(|| tempfile::tempdir().unwrap());
+        let dir = match keep {
+            Some(keep) => keep.join(std::process::id().to_string()),
+            None => temporary.as_ref().unwrap().path().to_owned(),
+        };
         fs::create_dir_all(&dir).unwrap();
         let mut lab = Self {
             dir: dir.canonicalize().unwrap(),
+            peer_life: peer_life.as_secs().to_string(),
             _temporary: temporary,
             apart: false,
             nodes: [const { None }; NODES.len()],
@@ -181,7 +186,7 @@ impl Lab {
     /// A peer in a proxy's network.
     pub(crate) fn peer(&self, proxy: Node, vendor: &str, role: &str, args: &[&str]) -> Peer {
         let mut command = self.command(Some(proxy), &Peer::program(vendor));
-        command.args([role, "--localhost", "--domain", &self.domain(proxy), "--timeout", PEER_LIFE]);
+        command.args([role, "--localhost", "--domain", &self.domain(proxy), "--timeout", &self.peer_life]);
         command.args(args);
         Peer::start(command)
     }

@@ -46,6 +46,10 @@ const LINGER: Duration = Duration::from_secs(2);
 /// Best effort: how much must come at least, and how much may be lost with no fault near (to a busy processor).
 const SHARE_MIN: f64 = 0.5;
 const UNEXPLAINED_MAX: f64 = 0.02;
+/// How much longer than the faults all the rest may take.
+const OVERTIME_MAX: Duration = Duration::from_secs(300);
+/// How many seconds publishers stay when they have sent all, so that what was lost can be asked for.
+const HOLD: &str = "120";
 /// How long after the mending of a fault it explains a loss.
 const EXPLAINS: Duration = Duration::from_secs(15);
 /// Events that are no further apart than this count as one moment: what is under way still arrives.
@@ -108,9 +112,9 @@ struct Run {
 }
 
 impl Run {
-    fn new() -> Self {
+    fn new(time: Duration) -> Self {
         let names: Vec<_> = TOPICS.iter().map(|topic| topic.name).collect();
-        let lab = Lab::new(&names, std::env::var_os("SGC_RING_DIR").map(PathBuf::from));
+        let lab = Lab::new(&names, std::env::var_os("SGC_RING_DIR").map(PathBuf::from), time + OVERTIME_MAX);
         let mut run = Self {
             talkers: Vec::new(),
             listeners: Vec::new(),
@@ -134,7 +138,7 @@ impl Run {
                 let peer = self.lab.peer(at, vendor, "sub", &[&both[..], topic.listener].concat());
                 self.listeners.push(Listener::new(topic, at, peer));
             }
-            let control = ["--wait-go", "--wait-stop", "--hold", "3600"];
+            let control = ["--wait-go", "--wait-stop", "--hold", HOLD];
             let peer =
                 self.lab.peer(Node::ROBOT, "cyclone", "pub", &[&both[..], topic.talker, &control].concat());
             self.talkers.push(Talker::new(topic, peer));
@@ -494,11 +498,12 @@ fn chosen<T: FromStr>(variable: &str, otherwise: T) -> T {
 fn a_ring_heals_and_nothing_reliable_is_lost_or_doubled() {
     let (seed, seconds) = (chosen("SGC_RING_SEED", SEED), chosen("SGC_RING_SECONDS", SECONDS));
     say(&format!("ring: SGC_RING_SEED={seed} SGC_RING_SECONDS={seconds}"));
-    let mut run = Run::new();
+    let time = Duration::from_secs(seconds);
+    let mut run = Run::new(time);
     let calm_since = Instant::now();
     run.pass(CALM);
     let memory = NODES.map(|node| run.lab.resident(node));
-    run.chaos(seed, Duration::from_secs(seconds));
+    run.chaos(seed, time);
     run.wait_for_links();
     run.pass(CALM);
     run.finish();
