@@ -36,8 +36,12 @@ _print_lock = threading.Lock()
 def emit(event: str, **fields: object) -> None:
     line = json.dumps({"event": event, **fields})
     with _print_lock:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
+        try:
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Nobody listens any more. An exception would end this thread only, and Cyclone's would keep us here.
+            os._exit(EXIT_INCOMPLETE)
 
 
 def arguments() -> argparse.Namespace:
