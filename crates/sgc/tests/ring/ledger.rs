@@ -55,13 +55,15 @@ pub(crate) struct Listener {
     pub(crate) got: Vec<(Instant, u64)>,
     /// Content that nobody sent.
     pub(crate) altered: u32,
+    /// How many writers it was matched with, and since when.
+    pub(crate) matched: Vec<(Instant, u64)>,
     /// True if it ended, which none should while we listen.
     pub(crate) ended: bool,
 }
 
 impl Listener {
     pub(crate) fn new(topic: &'static Topic, at: Node, peer: Peer) -> Self {
-        Self { topic, at, peer, got: Vec::new(), altered: 0, ended: false }
+        Self { topic, at, peer, got: Vec::new(), altered: 0, matched: Vec::new(), ended: false }
     }
 
     /// Takes in what it reported.
@@ -72,6 +74,7 @@ impl Listener {
                     self.got.push((at, event["seq"].as_u64().unwrap()));
                 }
                 Some("received" | "unreadable") => self.altered += 1,
+                Some("matched") => self.matched.push((at, event["count"].as_u64().unwrap())),
                 Some("summary") => self.ended = true,
                 _ => {}
             }

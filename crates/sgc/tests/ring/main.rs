@@ -299,6 +299,9 @@ impl Run {
         let lacking = wait(self, LAST_MAX, true);
         if !lacking.is_empty() {
             self.trouble(format!("the last message did not come within {LAST_MAX:?}: {lacking:?}"));
+            for node in [Node::ROBOT, Node::DESK, Node::LAB] {
+                self.trouble(format!("{node:?} says {}", self.lab.status(node)["routes"]));
+            }
         }
         wait(self, LINGER, false);
         sleep(LINGER);
@@ -437,7 +440,7 @@ impl Run {
         self.problems.extend(suspicious);
     }
 
-    /// Every event and every problem, with its time.
+    /// Every event with its time and what came next after it, and when writers came and went.
     fn trace(&self) -> String {
         let mut text = String::new();
         for event in &self.events {
@@ -451,6 +454,12 @@ impl Run {
                 text += &format!("  {} {seq}", listener.name());
             }
             text.push('\n');
+        }
+        for listener in &self.listeners {
+            for (at, count) in &listener.matched {
+                let at = at.saturating_duration_since(self.begun).as_secs_f64();
+                text += &format!("{at:7.2} {}: {count} writers\n", listener.name());
+            }
         }
         text
     }
