@@ -4,13 +4,14 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
-	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
+	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
+	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -70,6 +71,11 @@ peers-check: peers
 
 peers-check-long: peers
 	.venv/bin/python -B tests/peers/check.py --long
+
+# Five routers that are cut and killed at random; a new seed each time, which it prints. The suite runs a short one.
+ring: peers
+	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
+		$(CARGO) test -p sgc --locked --test ring $(ARGS) -- --nocapture
 
 clean-tools:
 	rm -rf .venv .tools .peers

@@ -10,6 +10,10 @@ mkdir -p .peers
 requirements=tests/peers/py/requirements.txt
 installed=.venv/installed.txt
 if ! cmp -s "$requirements" "$installed"; then
+    # `--clear` would empty what a link leads to, which is another checkout's.
+    if [ -L .venv ]; then
+        rm .venv
+    fi
     say "Python environment in .venv: $(grep -m1 '^cyclonedds' "$requirements")"
     python3 -m venv --clear .venv
     .venv/bin/pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"

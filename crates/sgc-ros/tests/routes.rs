@@ -290,13 +290,28 @@ fn a_used_topic_is_joined_written_held_and_dropped() {
     b.routes.handle_granted(&name, None);
     assert_eq!([b.commands(), b.passes(UNREACHABLE_HOLD)].concat(), []);
     // It breaks for longer: the writer goes, and comes back with the grant.
-    b.routes.handle_owner_lost(b.now, OWNER, LostReason::Unreachable);
+    b.routes.handle_lost(b.now, &name);
     assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source: None }]);
     b.routes.handle_granted(&name, None);
     assert!(has(&b.commands(), |c| matches!(c, Command::OpenWriter { .. })));
     // The owner no longer shares it: gone at once.
     let gone = b.catalogue(vec![]);
     assert_eq!(gone, [Command::CloseWriter { name, source: None }, Command::Leave { name }]);
+}
+
+#[test]
+fn a_lost_catalogue_takes_no_topic_along() {
+    let mut b = bench(&[], &[("/a", None)]);
+    let name = theirs("/a", STRING);
+    let entries = || vec![entry("/a", STRING, Qos::default(), &[])];
+    b.catalogue(entries());
+    b.routes.handle_granted(&name, None);
+    b.commands();
+    // The topic's own way stands, so nothing will grant it again.
+    b.routes.handle_owner_lost(OWNER, LostReason::Unreachable);
+    assert_eq!(b.passes(2 * UNREACHABLE_HOLD), []);
+    assert_eq!(b.catalogue(entries()), []);
+    assert_eq!(b.passes(2 * UNREACHABLE_HOLD), []);
 }
 
 #[test]
@@ -319,7 +334,7 @@ fn an_owner_that_stops_takes_its_topics_along() {
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
     b.routes.handle_granted(&name, None);
     b.commands();
-    b.routes.handle_owner_lost(b.now, OWNER, LostReason::Withdrawn);
+    b.routes.handle_owner_lost(OWNER, LostReason::Withdrawn);
     assert_eq!(b.commands(), [Command::CloseWriter { name, source: None }, Command::Leave { name }]);
     assert!(b.routes.status()[0].state.contains("has gone"), "{:?}", b.routes.status());
 }
@@ -456,7 +471,7 @@ fn a_token_is_joined_without_a_catalogue_and_written_once_it_is_described() {
     let granted = b.granted(name, Some(entry("/a", STRING, Qos::default(), &[])));
     assert!(matches!(&granted[..], [Command::OpenWriter { source: None, .. }]), "{granted:?}");
     assert_eq!(b.catalogue(vec![]), []);
-    b.routes.handle_owner_lost(b.now, OWNER, LostReason::Withdrawn);
+    b.routes.handle_owner_lost(OWNER, LostReason::Withdrawn);
     assert_eq!(b.passes(UNREACHABLE_HOLD), []);
     // Granted again, as after a new epoch: nothing changes.
     assert_eq!(b.granted(name, Some(entry("/a", STRING, Qos::default(), &[]))), []);

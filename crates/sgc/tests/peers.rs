@@ -7,21 +7,21 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod support;
+
 use std::fs;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use support::{Peer, eventually, ip, say};
 use tempfile::TempDir;
 
-/// Longest wait for an event, far beyond what any takes.
-const PATIENCE: Duration = Duration::from_secs(60);
 /// One lab at a time: each fills both processors.
 static TURN: Mutex<()> = Mutex::new(());
 static LABS: AtomicU32 = AtomicU32::new(0);
@@ -160,19 +160,8 @@ impl Lab {
 
     /// A command at a site, or on this host where none is given or there are no namespaces.
     fn command(&self, site: Option<Site>, program: &Path) -> Command {
-        let mut command = match site.filter(|_| self.apart) {
-            Some(site) => {
-                let mut command = Command::new("ip");
-                command.args(["netns", "exec", &self.namespace(site)]).arg(program);
-                command
-            }
-            None => Command::new(program),
-        };
-        let path = std::env::var_os("PATH").unwrap();
-        command.env_clear().env("PATH", path).env("XDG_RUNTIME_DIR", self.dir.path());
-        command.envs(std::env::var_os("SGC_LOG").map(|level| ("SGC_LOG", level)));
-        command.current_dir(self.dir.path()).stdin(Stdio::null());
-        command
+        let namespace = site.filter(|_| self.apart).map(|site| self.namespace(site));
+        support::command(namespace.as_deref(), self.dir.path(), program)
     }
 
     fn sgc(&self, site: Option<Site>, args: &[&str]) -> Command {
@@ -227,26 +216,11 @@ impl Lab {
     }
 
     fn peer(&self, site: Site, vendor: &str, role: &str, args: &[&str]) -> Peer {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap();
-        let program = root.join(".peers").join(vendor);
-        assert!(program.exists(), "{} is missing: run `make peers`", program.display());
-        let mut command = self.command(Some(site), &program);
+        let mut command = self.command(Some(site), &Peer::program(vendor));
         command
             .args([role, "--localhost", "--domain", site.domain(self.apart), "--timeout", "120"])
             .args(args);
-        command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let mut child = command.spawn().unwrap();
-        let (sender, events) = channel();
-        let stdout = BufReader::new(child.stdout.take().unwrap());
-        std::thread::spawn(move || {
-            for line in stdout.lines().map_while(Result::ok) {
-                match serde_json::from_str(&line) {
-                    Ok(event) => drop(sender.send(event)),
-                    Err(error) => panic!("{line}: {error}"),
-                }
-            }
-        });
-        Peer { stdin: child.stdin.take(), child, events }
+        Peer::start(command)
     }
 
     /// [`Self::try_to_carry`]. Seen once: the Fast DDS peer counted as intact a message with a number
@@ -318,76 +292,6 @@ impl Drop for Lab {
         if self.apart {
             self.remove_namespaces();
         }
-    }
-}
-
-/// A program that is not ours.
-struct Peer {
-    child: Child,
-    stdin: Option<ChildStdin>,
-    events: Receiver<Value>,
-}
-
-impl Peer {
-    fn wait(&mut self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
-        let deadline = Instant::now() + PATIENCE;
-        loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            match self.events.recv_timeout(left) {
-                Ok(event) if is_it(&event) => return event,
-                Ok(event) => assert_ne!(event["event"], "summary", "ended before {what}: {event}"),
-                Err(error) => panic!("{what}: {error}"),
-            }
-        }
-    }
-
-    fn go(&mut self) {
-        self.stdin.as_mut().unwrap().write_all(b"go\n").unwrap();
-    }
-
-    fn end(&mut self) {
-        kill_process(Pid::from_child(&self.child), Signal::TERM).unwrap();
-    }
-
-    fn summary(&mut self) -> Value {
-        let deadline = Instant::now() + 2 * PATIENCE;
-        loop {
-            let left = deadline.saturating_duration_since(Instant::now());
-            let event = self.events.recv_timeout(left).expect("a summary");
-            if event["event"] == "summary" {
-                self.child.wait().unwrap();
-                return event;
-            }
-        }
-    }
-}
-
-impl Drop for Peer {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// To the terminal, past the test harness, which shows nothing of a test that passes.
-fn say(text: &str) {
-    let _ = writeln!(std::io::stderr(), "{text}");
-}
-
-fn ip(args: &[&str]) -> Result<(), String> {
-    let output = Command::new("ip").args(args).output().map_err(|e| format!("ip: {e}"))?;
-    if output.status.success() {
-        Ok(())
-    } else {
-        Err(String::from_utf8_lossy(&output.stderr).trim().to_owned())
-    }
-}
-
-fn eventually(what: &str, mut is_so: impl FnMut() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
-    while !is_so() {
-        assert!(Instant::now() < deadline, "never: {what}");
-        std::thread::sleep(Duration::from_millis(20));
     }
 }
 

@@ -36,8 +36,12 @@ _print_lock = threading.Lock()
 def emit(event: str, **fields: object) -> None:
     line = json.dumps({"event": event, **fields})
     with _print_lock:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
+        try:
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Nobody listens any more. An exception would end this thread only, and Cyclone's would keep us here.
+            os._exit(EXIT_INCOMPLETE)
 
 
 def arguments() -> argparse.Namespace:
@@ -64,6 +68,7 @@ def arguments() -> argparse.Namespace:
     pub.add_argument("--start", type=int, default=0, help="first sequence number")
     pub.add_argument("--wait-matched", type=int, default=1, help="subscribers to wait for before sending")
     pub.add_argument("--wait-go", action="store_true", help="once matched, wait for a line on standard input")
+    pub.add_argument("--wait-stop", action="store_true", help="a further line there ends the sending")
     pub.add_argument("--hold", type=float, default=0.0, help="seconds to stay after the last message")
     sub = roles.add_parser("sub", parents=[common])
     sub.add_argument("--linger", type=float, default=0.0, help="seconds to listen on for duplicates after --count")
@@ -154,12 +159,19 @@ def publish(args, stop: Stop, deadline: float) -> int:
     matched = matches.count >= args.wait_matched
     if matched and args.wait_go:
         matched = wait_go(stop, deadline)
+    # Set by whatever ends the sending; only `stop` ends the program.
+    enough = threading.Event()
+    stop.hooks.append(enough.set)
+    if stop.event.is_set():
+        enough.set()
+    if matched and args.wait_stop:
+        threading.Thread(target=lambda: (sys.stdin.readline(), enough.set()), daemon=True).start()
     sent, seq, first_at = 0, args.start, time.monotonic()
-    while matched and not stop.event.is_set() and (args.count == 0 or sent < args.count):
+    while matched and not enough.is_set() and (args.count == 0 or sent < args.count):
         due = first_at + sent / args.rate if args.rate > 0 else 0.0
         if due > deadline or time.monotonic() > deadline:
             break
-        if due > time.monotonic() and stop.event.wait(due - time.monotonic()):
+        if due > time.monotonic() and enough.wait(due - time.monotonic()):
             break
         writer.write(make(seq, time.time_ns(), args.size))
         if args.verbose:

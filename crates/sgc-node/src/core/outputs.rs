@@ -181,7 +181,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::OwnerLost { owner, reason } => {
                 info!(owner = %owner.short(), ?reason, "owner out of reach");
-                routes.handle_owner_lost(now.instant, owner, reason);
+                routes.handle_owner_lost(owner, reason);
             }
             Event::OwnerRefused { owner, by } => {
                 warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");

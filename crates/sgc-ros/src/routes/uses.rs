@@ -44,25 +44,23 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// An owner is out of reach, or has gone in good order.
-    pub fn handle_owner_lost(&mut self, now: Instant, owner: NodeId, reason: LostReason) {
+    /// The way to an owner's catalogue is lost, or the owner has gone in good order. Its topics have ways of their own,
+    /// which may well stand; what becomes of those [`Self::handle_lost`] is told.
+    pub fn handle_owner_lost(&mut self, owner: NodeId, reason: LostReason) {
+        if !matches!(reason, LostReason::Withdrawn | LostReason::Refused(_)) {
+            self.owners.insert(owner, "is out of reach".into());
+            return;
+        }
+        self.catalogues.remove(&owner);
+        self.owners.insert(owner, "has gone".into());
         let names: Vec<_> = self
             .uses
             .iter()
             .filter(|(_, u)| self.use_rules[u.rule].is_of_catalogue(&owner))
             .map(|(n, _)| *n)
             .collect();
-        let gone = matches!(reason, LostReason::Withdrawn | LostReason::Refused(_));
-        if gone {
-            self.catalogues.remove(&owner);
-        }
-        self.owners.insert(owner, if gone { "has gone".into() } else { "is out of reach".into() });
         for name in names {
-            if gone {
-                self.drop_use(name);
-            } else {
-                self.hold_use(now, name);
-            }
+            self.drop_use(name);
         }
     }
 
