@@ -399,7 +399,7 @@ impl Run {
                     }
                     _ => true,
                 },
-                What::Closed { .. } | What::Event(_) => true,
+                What::Closed { .. } | What::Event(_) | What::SinkLost { .. } => true,
             };
             assert!(fine, "{logged:?}");
         }
