@@ -380,12 +380,16 @@ fn lock(source: &Mutex<Source>) -> std::sync::MutexGuard<'_, Source> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use bytes::Bytes;
     use sgc_endpoint::{RecoveryLimits, SourceConfig};
+    use sgc_router::FibEntry;
     use sgc_trust::{MessageKey, Suite};
     use sgc_wire::{Class, SecretBytes};
 
     use super::*;
+    use crate::dataplane::Forward;
 
     const KNOWN: Guid = Guid([1; 16]);
     const STRANGER: Guid = Guid([2; 16]);
@@ -434,7 +438,16 @@ mod tests {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, slot) = share();
+        // Without anybody who listens nothing is sealed.
         share.publish(sample(KNOWN, true));
+        assert_eq!((share.published(), unflushed(&slot)), (1, 0));
+        let nowhere = FibEntry {
+            up: LinkId::LOCAL,
+            down: [].as_slice().into(),
+            publishers: [].as_slice().into(),
+            sinks: vec![],
+        };
+        share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
         share.publish(sample(KNOWN, true));
         share.publish(sample(STRANGER, false));
         assert_eq!((share.published(), unflushed(&slot)), (2, 0));
@@ -463,5 +476,22 @@ mod tests {
             std::thread::yield_now();
         }
         assert_eq!(slot.progress.published_in_epoch(), 0);
+    }
+
+    #[test]
+    fn a_share_is_looked_at_until_its_silence_was_told_three_times() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        let begin = Instant::now();
+        let at = |seconds| begin + Duration::from_secs(seconds);
+        assert!(!share.look_for_silence(at(0)), "nothing was published");
+        for _ in 0..2 {
+            share.publish(sample(KNOWN, false));
+            assert!(share.look_for_silence(at(100)) && share.look_for_silence(at(102)));
+            assert!(share.look_for_silence(at(105)) && share.look_for_silence(at(114)));
+            assert!(!share.look_for_silence(at(116)) && !share.look_for_silence(at(900)));
+        }
+        assert_eq!(slot.progress.published(), 2, "without anybody who listens nothing is said");
     }
 }

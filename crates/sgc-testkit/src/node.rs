@@ -87,6 +87,12 @@ impl Sharing {
         Self { depth, ..self }
     }
 
+    /// As one of which so many messages are kept for who loses some.
+    pub fn recovering(self, messages_max: usize) -> Self {
+        let recovery = RecoveryLimits { messages_max, ..self.recovery };
+        Self { recovery, ..self }
+    }
+
     /// As a best-effort topic.
     pub fn best_effort(self) -> Self {
         Self { best_effort: true, ..self }

@@ -5,6 +5,7 @@ mod epochs;
 mod forgery;
 mod messages;
 mod nonces;
+mod recovery;
 
 use std::sync::OnceLock;
 
