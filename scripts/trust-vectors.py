@@ -198,7 +198,7 @@ def raw_public(private):
 
 def topic_grant():
     """GrantContent::Topic with one source and no entry."""
-    source = SOURCE + struct.pack(">I", 32) + b"\xdd" * 32 + struct.pack(">QQ", 5, 9)
+    source = SOURCE + struct.pack(">I", 32) + b"\xdd" * 32 + struct.pack(">QQQ", 5, 9, 3)
     return b"\x00" + struct.pack(">IB", EPOCH, 3) + TOPIC_KEY + struct.pack(">I", 1) + source + b"\x00"
 
 

@@ -7,7 +7,7 @@ use std::{fs, io};
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
-use sgc_endpoint::{Source, SourceConfig};
+use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
@@ -127,6 +127,7 @@ fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
             reliable: true,
             history_depth: 2,
             history_bytes_max: 1 << 20,
+            recovery: RecoveryLimits::default(),
         };
         let mut source =
             Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use bytes::Bytes;
 use libfuzzer_sys::fuzz_target;
-use sgc_endpoint::{Delivery, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{Delivery, Sink, SinkLimits, RecoveryLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
     Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
@@ -46,6 +46,7 @@ fuzz_target!(|input: &[u8]| {
         reliable: true,
         history_depth: 2,
         history_bytes_max: 1 << 20,
+        recovery: RecoveryLimits::default(),
     };
     let topic_key = SecretBytes::new([3; 32]);
     let mut grant =

@@ -8,7 +8,7 @@
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_endpoint::{Delivery, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkId, SourceId, TopicGrant};
 
@@ -35,6 +35,7 @@ impl Ends {
             reliable: true,
             history_depth: 0,
             history_bytes_max: 0,
+            recovery: RecoveryLimits::default(),
         };
         let key_bytes = SecretBytes::new([3; 32]);
         let mut grant =

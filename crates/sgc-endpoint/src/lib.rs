@@ -10,8 +10,10 @@
 #![forbid(unsafe_code)]
 
 mod endpoint;
+mod history;
 mod joiner;
 mod joins;
+mod marks;
 mod owner;
 mod parking;
 mod partial;
@@ -20,8 +22,10 @@ mod sink;
 mod source;
 
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
+pub use history::{RECOVERY_BYTES_MAX, RECOVERY_MESSAGES_MAX, RecoveryLimits};
 pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
+pub use marks::{MARK_AFTER, Marks};
 pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
-pub use sink::{Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
+pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};

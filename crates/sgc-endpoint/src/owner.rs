@@ -45,6 +45,7 @@ impl Endpoint {
             own: Vec::new(),
             heard: None,
             sinks: BTreeMap::new(),
+            since: BTreeMap::new(),
             left: BTreeMap::new(),
             told_own: false,
         };
@@ -94,6 +95,7 @@ impl Endpoint {
             return;
         }
         share.own = sources;
+        share.forget_floors();
         self.regrant(*name);
     }
 
@@ -211,6 +213,7 @@ impl Endpoint {
             self.event(Event::SinkCut { name, sink, peer: granted.peer.node_id, reason });
             names.insert(name);
         }
+        self.forget_denied();
         for name in names {
             self.begin_epoch(name);
         }
@@ -228,6 +231,18 @@ impl Endpoint {
             if let Some(reason) = reason {
                 self.answer_renewal(self.now, sink, Err(reason));
             }
+        }
+    }
+
+    /// Who lost the right to a share begins anew if it gets it back.
+    fn forget_denied(&mut self) {
+        let (anchors, now) = (self.anchors.clone(), self.now.unix);
+        for share in self.shares.shares.values_mut() {
+            let policy = &share.spec.policy;
+            share.since.retain(|_, since| {
+                let stands = !anchors.is_peer_revoked(&since.peer) && since.peer.not_after >= now;
+                stands && policy.permits(&since.peer, Role::Subscribe).is_ok()
+            });
         }
     }
 
@@ -456,12 +471,16 @@ impl Endpoint {
             self.event(Event::SinkRefused { name, peer, reason });
             return;
         }
+        let max = self.config.limits.sinks_per_name_max;
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         let reply_key = asked.reply_key.clone();
         let role = asked.request.role();
         let publishes = role == Role::Publish;
         // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
+        if role == Role::Subscribe {
+            share.note_since(&asked.peer, max);
+        }
         let known = share.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
         share.left.remove(&peer);
         let content = GrantContent::Topic(share.grant(&share.epoch, share.sinks.get(&sink)));
@@ -606,13 +625,19 @@ impl Endpoint {
         }
     }
 
-    pub(crate) fn handle_recover(&mut self, recover: Recover) {
-        let granted =
-            self.shares.shares.get(&recover.name).is_some_and(|s| s.sinks.contains_key(&recover.sink));
-        if granted {
-            self.event(Event::Recover(recover));
-        } else {
-            self.unexpected("recover");
+    /// A sink asks for messages; of those that were published before it may have any it is told the history at most.
+    pub(crate) fn handle_recover(&mut self, mut recover: Recover) {
+        let share = self.shares.shares.get(&recover.name);
+        let granted = share.and_then(|s| Some((s, s.sinks.get(&recover.sink)?)));
+        match granted {
+            Some((share, sink)) if sink.request.role() == Role::Subscribe => {
+                if recover.from > 0 {
+                    let floor = share.floor(&sink.peer.node_id, &recover.source);
+                    recover.from = recover.from.max(floor.unwrap_or(u64::MAX));
+                }
+                self.event(Event::Recover(recover));
+            }
+            _ => self.unexpected("recover"),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! What this node owns: its shares, who was granted them, and what each asker sees in the catalogue.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -96,6 +96,14 @@ pub(crate) struct Rotation {
     pub(crate) again: bool,
 }
 
+/// Since when a node may receive a share: nothing older is sent to it again, on whatever way it asks.
+#[derive(Debug)]
+pub(crate) struct Since {
+    pub(crate) peer: VerifiedPeer,
+    /// By source; of one that came later, all.
+    floors: BTreeMap<SourceId, u64>,
+}
+
 /// A share.
 #[derive(Debug)]
 pub(crate) struct Share {
@@ -112,6 +120,8 @@ pub(crate) struct Share {
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
     /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
     pub(crate) told_own: bool,
+    /// Who receives it, or did, and what it may have sent to it again.
+    pub(crate) since: BTreeMap<NodeId, Since>,
     /// Who left and still has the newest key. If one of them loses its right, that key has to go.
     pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
 }
@@ -119,7 +129,14 @@ pub(crate) struct Share {
 impl Share {
     /// What is granted of an epoch to one who asked with `request`.
     pub(crate) fn grant(&self, epoch: &Epoch, peer: Option<&GrantedSink>) -> TopicGrant {
-        let own = self.own.iter().map(|s| s.announce());
+        let own = self.own.iter().map(|s| s.announce()).map(|announce| {
+            let floor = match peer {
+                Some(p) => self.floor(&p.peer.node_id, &announce.source).unwrap_or(announce.next),
+                None => 1,
+            };
+            let recover = if announce.recover > 0 { floor } else { 0 };
+            SourceAnnounce { recover, ..announce }
+        });
         // By source: one that moved to another way may have two places for a while.
         let others: BTreeMap<_, _> = self
             .sinks
@@ -132,7 +149,7 @@ impl Share {
         // They keep no history; what this node has heard of them is past to whoever is told of them now.
         let others = others.into_iter().map(|(source, key)| {
             let next = self.heard.as_ref().map_or(0, |heard| heard.newest(&source)).saturating_add(1);
-            SourceAnnounce { source, key, oldest: next, next }
+            SourceAnnounce { source, key, oldest: next, next, recover: 0 }
         });
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {
@@ -142,6 +159,35 @@ impl Share {
             sources: own.chain(others).take(GRANT_SOURCES_MAX).collect(),
             entry: describe.map(|p| Box::new(self.entry(&p.peer))),
         }
+    }
+
+    /// Remembers since when a node receives the share, if it did not before; at most `max` nodes, beside those that
+    /// receive it now.
+    pub(crate) fn note_since(&mut self, peer: &VerifiedPeer, max: usize) {
+        if let Some(known) = self.since.get_mut(&peer.node_id) {
+            // It may have another certificate by now.
+            known.peer = peer.clone();
+            return;
+        }
+        if self.since.len() >= max {
+            let here: BTreeSet<_> = self.sinks.values().map(|s| s.peer.node_id).collect();
+            if let Some(gone) = self.since.keys().find(|node| !here.contains(*node)).copied() {
+                self.since.remove(&gone);
+            }
+        }
+        let floors = self.own.iter().map(|s| s.announce()).map(|a| (a.source, a.oldest)).collect();
+        self.since.insert(peer.node_id, Since { peer: peer.clone(), floors });
+    }
+
+    /// The first message of a source that a node may have sent to it again.
+    pub(crate) fn floor(&self, node: &NodeId, source: &SourceId) -> Option<u64> {
+        self.since.get(node).map(|since| since.floors.get(source).copied().unwrap_or(1))
+    }
+
+    /// Forgets the floors of sources that are no more.
+    pub(crate) fn forget_floors(&mut self) {
+        let own: BTreeSet<_> = self.own.iter().map(|s| s.id()).collect();
+        self.since.values_mut().for_each(|since| since.floors.retain(|source, _| own.contains(source)));
     }
 
     /// The epoch that sinks were told last.

@@ -1,5 +1,8 @@
 //! One subscriber of one name: opens and verifies packets, puts messages together, and delivers each once.
 //!
+//! Of a source that can send again what was lost it delivers every number in turn: one that is missing is asked for, and
+//! what comes before the answer is left out, since the answer contains it. So order needs no memory.
+//!
 //! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed,
 //! first. A packet that is refused leaves no state.
 
@@ -65,10 +68,14 @@ pub enum Delivery {
     Message(Message),
     /// More fragments are needed.
     Incomplete,
-    /// The source's history must be asked for before its messages can be delivered.
+    /// No message, but a sign that none is missing.
+    Mark,
+    /// The source must be asked for what is missing before its messages can be delivered; see [`Sink::ask`].
     NeedsHistory(SourceId),
-    /// The source's history is complete.
+    /// The source has sent what it was asked for.
     Synced(SourceId),
+    /// That many numbers of the source will never be delivered: nobody has their messages any more.
+    Lost(SourceId, u64),
     /// It waits for the grant that tells of its epoch or source; see [`Sink::regrant`].
     Parked,
 }
@@ -106,8 +113,8 @@ pub enum SinkDrop {
     /// The message's head is malformed.
     #[error("message head malformed")]
     Head,
-    /// The history of its source has not arrived yet, and will contain it.
-    #[error("awaiting the history that contains it")]
+    /// What its source was asked for has not arrived yet, and will contain it.
+    #[error("awaiting the answer that contains it")]
     AwaitingHistory,
     /// The bound on incomplete messages is reached.
     #[error("too many incomplete messages")]
@@ -154,6 +161,17 @@ impl SinkProgress {
     }
 }
 
+/// What to do about a source that was asked, if nothing was heard for a while.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AskAgain {
+    /// Nothing is missing any more.
+    No,
+    /// The answer is on its way.
+    Wait,
+    /// Ask for all from this number on.
+    From(u64),
+}
+
 /// What the next grant may explain.
 enum Unexplained {
     Epoch,
@@ -174,13 +192,23 @@ struct SourceState {
     newest: Arc<AtomicU64>,
     /// Packets to all below it are replays of what was published before this sink was told of the source.
     next: u64,
-    /// History below it was given up by the source before this sink was told of it.
+    /// Packets to this sink below it are none that this sink asked for.
     oldest: u64,
+    /// True if what is lost can be asked for: then its messages are delivered in the order of their numbers.
+    recovers: bool,
+    /// The next number: of such a source all below it are done with, of another it is one more than the newest.
+    expected: u64,
     partials: Partials,
-    /// False while a transient-local source's history is not here yet.
+    /// False while something is missing: a transient-local source's history, or what a broken way lost.
     synced: bool,
     /// True once it was asked for.
     asked: bool,
+    /// True if the history is to begin wherever it does.
+    anew: bool,
+    /// True if something of the answer came since somebody looked.
+    heard: bool,
+    /// True if the answer has a hole, so that it must be asked for once more.
+    torn: bool,
     /// The last epoch in which it is believed, if the newest grant no longer announces it.
     last_epoch: Option<u32>,
 }
@@ -216,7 +244,7 @@ impl Sink {
             scratch: Vec::new(),
             progress: Arc::default(),
         };
-        sink.announce(grant.sources, None);
+        sink.announce(grant.sources, None, false, &mut |_| ());
         sink
     }
 
@@ -226,8 +254,8 @@ impl Sink {
     ///   epochs before open until [`Self::retire_epochs`].
     /// - Another key for an epoch that was known, or an earlier epoch, is that of an owner that started anew:
     ///   nothing of before counts.
-    /// - Under another id (the way to the owner changed, and this sink asked again), histories must be asked
-    ///   for again.
+    /// - Under another id (the way to the owner changed, and this sink asked again), what a source has published
+    ///   beyond what is here must be asked for.
     /// - A source that is no longer announced is believed in the epochs until then, and in none that begins
     ///   later.
     pub fn regrant(
@@ -252,14 +280,16 @@ impl Sink {
                 self.drop_old_keys();
             }
         }
-        if id != self.id {
+        let moved = id != self.id;
+        if moved {
             self.id = id;
             for source in self.sources.values_mut() {
                 source.addressed = None;
-                source.unsync(self.transient_local);
+                // Whom it was asked as is nobody any more.
+                source.asked = false;
             }
         }
-        self.announce(grant.sources, Some(newest));
+        self.announce(grant.sources, Some(newest), moved, &mut deliver);
         for mut parked in self.parking.take() {
             let result = match self.handle(&parked.packet) {
                 Ok(Ok(delivery)) => Ok(delivery),
@@ -288,19 +318,41 @@ impl Sink {
         self.list_progress();
     }
 
-    /// The announced sources whose history has not arrived yet.
+    /// The announced sources of which something is missing.
     pub fn unsynced(&self) -> impl Iterator<Item = SourceId> + '_ {
         self.sources.iter().filter(|(_, s)| !s.synced && s.last_epoch.is_none()).map(|(id, _)| *id)
     }
 
-    /// True if a source's history must be asked for, which the caller then does.
-    pub fn expect(&mut self, source: SourceId) -> bool {
+    /// From which number on a source must be asked for its messages, which the caller then does; `None` if nothing is
+    /// missing. 0 stands for its history, wherever that begins.
+    pub fn ask(&mut self, source: SourceId) -> Option<u64> {
+        let state = self.sources.get_mut(&source).filter(|s| !s.synced && s.last_epoch.is_none())?;
+        state.asked = true;
+        state.heard = false;
+        state.torn = false;
+        Some(if state.anew { 0 } else { state.expected })
+    }
+
+    /// The same a while after it was asked.
+    pub fn ask_again(&mut self, source: SourceId) -> AskAgain {
         match self.sources.get_mut(&source) {
-            Some(state) if !state.synced => {
-                state.asked = true;
-                true
+            Some(state) if !state.synced && state.heard && !state.torn => {
+                state.heard = false;
+                AskAgain::Wait
             }
-            _ => false,
+            _ => self.ask(source).map_or(AskAgain::No, AskAgain::From),
+        }
+    }
+
+    /// True if the messages of a source can be asked for again, so that none need be taken that can go nowhere.
+    pub fn recovers(&self, source: &SourceId) -> bool {
+        self.sources.get(source).is_some_and(|s| s.recovers)
+    }
+
+    /// Something of these sources was not handed over: they must be asked for it.
+    pub fn suspect(&mut self) {
+        for source in self.sources.values_mut().filter(|s| s.recovers && s.last_epoch.is_none()) {
+            source.unsync();
         }
     }
 
@@ -310,7 +362,10 @@ impl Sink {
         if let Some(state) = self.sources.get_mut(source) {
             state.next = state.next.max(state.window.newest().saturating_add(1));
             state.window = ReplayWindow::default();
-            state.unsync(self.transient_local);
+            if self.transient_local {
+                state.anew = true;
+                state.unsync();
+            }
         }
     }
 
@@ -354,15 +409,29 @@ impl Sink {
         self.epochs.last().map_or(0, |known| known.epoch)
     }
 
-    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the
-    /// first.
-    fn announce(&mut self, announced: Vec<SourceAnnounce>, before: Option<u32>) {
+    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the first, and
+    /// `moved` says that packets came another way until now.
+    fn announce(
+        &mut self,
+        announced: Vec<SourceAnnounce>,
+        before: Option<u32>,
+        moved: bool,
+        deliver: &mut impl FnMut(Result<Delivery, SinkDrop>),
+    ) {
         for source in self.sources.values_mut() {
             source.last_epoch = source.last_epoch.or(before);
         }
         for announce in announced {
             match self.sources.get_mut(&announce.source) {
-                Some(known) => known.announce_again(announce.key),
+                Some(known) => {
+                    let lost = known.announce_again(&announce);
+                    if lost > 0 {
+                        deliver(Ok(Delivery::Lost(announce.source, lost)));
+                    }
+                    if moved && known.expected < announce.next && (known.recovers || self.transient_local) {
+                        known.unsync();
+                    }
+                }
                 None => {
                     self.make_room();
                     if self.sources.len() < self.limits.sources_max {
@@ -496,14 +565,31 @@ impl Sink {
             if head.is_none() || header.total > 0 {
                 return Err(SinkDrop::Head);
             }
-            source.synced = true;
-            return Ok(Delivery::Synced(header.source));
-        }
-        if !source.synced && header.to.is_none() {
-            if std::mem::replace(&mut source.asked, true) {
+            // With a hole in it the answer is asked for again, after a while.
+            if source.torn {
                 return Err(SinkDrop::AwaitingHistory);
             }
-            return Ok(Delivery::NeedsHistory(header.source));
+            source.synced = true;
+            source.anew = false;
+            return Ok(Delivery::Synced(header.source));
+        }
+        if header.to.is_some() {
+            source.heard = true;
+        }
+        if head.is_some_and(|head| head.kind == MessageKind::Mark) {
+            return source.take_mark(header, opened.text());
+        }
+        if header.to.is_some() && std::mem::take(&mut source.anew) {
+            source.expected = header.seq;
+        } else if source.recovers && header.seq > source.expected {
+            if header.to.is_some() {
+                source.torn = true;
+                return Err(SinkDrop::AwaitingHistory);
+            }
+            source.miss();
+        }
+        if !source.synced && header.to.is_none() {
+            return source.await_history(header.source);
         }
         let complete = match (opened, head) {
             (Opened::Whole(text), Some(head)) => Some((head, Bytes::from(std::mem::take(text)))),
@@ -522,8 +608,7 @@ impl Sink {
             }
         };
         let Some((head, payload)) = complete else { return Ok(Delivery::Incomplete) };
-        source.window.accept(header.seq);
-        source.newest.fetch_max(header.seq, Release);
+        source.done(header.seq);
         if header.reliable {
             // A reliable flow is in order: what is older and incomplete will never be complete.
             self.incomplete += source.partials.give_up(header.seq);
@@ -543,8 +628,19 @@ enum Opened {
     Aside(Vec<u8>),
 }
 
+impl Opened {
+    /// What it was opened to, if that is here.
+    fn text(&self) -> &[u8] {
+        match self {
+            Self::Whole(text) | Self::Aside(text) => text,
+            Self::InPlace => &[],
+        }
+    }
+}
+
 impl SourceState {
     fn new(announce: &SourceAnnounce, transient_local: bool) -> Self {
+        let first = if transient_local { announce.oldest } else { announce.next };
         Self {
             announced_key: announce.key.clone(),
             verifier: None,
@@ -553,28 +649,96 @@ impl SourceState {
             window: ReplayWindow::default(),
             newest: Arc::default(),
             next: announce.next,
-            oldest: announce.oldest,
+            oldest: first,
+            recovers: announce.recover > 0,
+            expected: first.max(1),
             partials: Partials::default(),
             synced: !transient_local,
             asked: false,
+            anew: false,
+            heard: false,
+            torn: false,
             last_epoch: None,
         }
     }
 
-    /// The floors stay those of the first announcement: what is under way since then was not delivered yet,
-    /// and what was is in the window.
-    fn announce_again(&mut self, key: Bytes) {
+    /// How many numbers are lost for good. The floors stay those of the first announcement: what is under way since
+    /// then was not delivered yet, and what was is in the window.
+    fn announce_again(&mut self, announce: &SourceAnnounce) -> u64 {
         self.last_epoch = None;
-        if self.announced_key != key {
-            self.announced_key = key;
+        if self.announced_key != announce.key {
+            self.announced_key = announce.key.clone();
             self.verifier = None;
+        }
+        // Nothing older will be sent to this node, whatever it asks for.
+        let lost = if self.recovers { announce.recover.saturating_sub(self.expected) } else { 0 };
+        self.give_up(lost);
+        lost
+    }
+
+    /// Something is missing from here on.
+    fn unsync(&mut self) {
+        self.synced = false;
+        self.asked = false;
+        self.partials.clear();
+    }
+
+    /// A number is missing.
+    fn miss(&mut self) {
+        if self.synced {
+            self.unsync();
         }
     }
 
-    fn unsync(&mut self, transient_local: bool) {
-        self.synced = !transient_local;
-        self.asked = false;
-        self.partials.clear();
+    /// A message that came too early.
+    fn await_history(&mut self, source: SourceId) -> Result<Delivery, SinkDrop> {
+        if std::mem::replace(&mut self.asked, true) {
+            return Err(SinkDrop::AwaitingHistory);
+        }
+        Ok(Delivery::NeedsHistory(source))
+    }
+
+    /// A number is done with: its message is complete.
+    fn done(&mut self, seq: u64) {
+        self.window.accept(seq);
+        self.newest.fetch_max(seq, Release);
+        self.expected = self.expected.max(seq.saturating_add(1));
+    }
+
+    /// The next numbers will never come.
+    fn give_up(&mut self, numbers: u64) {
+        if numbers > 0 {
+            self.expected += numbers;
+            self.partials.clear();
+        }
+    }
+
+    /// Takes a mark, of which each has its number. One that goes ahead of an answer says what is lost for good.
+    fn take_mark(&mut self, header: &PacketHeader, text: &[u8]) -> Result<Delivery, SinkDrop> {
+        let oldest = text.try_into().map(u64::from_be_bytes).map_err(|_| SinkDrop::Head)?;
+        if oldest > header.seq {
+            return Err(SinkDrop::Head);
+        }
+        let in_turn = !self.recovers || header.seq == self.expected;
+        if header.to.is_none() {
+            if !in_turn {
+                self.miss();
+            }
+            if !self.synced {
+                return self.await_history(header.source);
+            }
+        }
+        if in_turn {
+            self.done(header.seq);
+            return Ok(Delivery::Mark);
+        }
+        // It goes ahead of an answer; its turn comes.
+        let lost = if self.anew { 0 } else { oldest.saturating_sub(self.expected) };
+        if lost == 0 {
+            return Ok(Delivery::Incomplete);
+        }
+        self.give_up(lost);
+        Ok(Delivery::Lost(header.source, lost))
     }
 
     fn check_freshness(&self, header: &PacketHeader) -> Result<(), SinkDrop> {
@@ -585,6 +749,9 @@ impl SourceState {
         };
         if header.seq < floor {
             return Err(SinkDrop::BelowFloor);
+        }
+        if self.recovers && !self.anew && header.seq < self.expected {
+            return Err(SinkDrop::Replayed);
         }
         match self.window.check(header.seq) {
             Freshness::Fresh => Ok(()),

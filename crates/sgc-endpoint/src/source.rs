@@ -1,10 +1,9 @@
-//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners
-//! may ask for.
+//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners, and
+//! those who lost something, may ask for.
 //!
 //! A payload is read once, from where it is into the packets that leave; fragments of a large message leave
 //! before its end is read. Who may hear it, and when its epoch ends, is decided by the endpoint.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 
@@ -15,13 +14,12 @@ use sgc_wire::{
     SourceAnnounce, SourceId, TopicGrant,
 };
 
+use crate::history::{History, Kept, RecoveryLimits};
+
 /// Bytes of message in one packet.
 pub const FRAGMENT_BYTES: u16 = 16 * 1024;
 /// Most messages of one source. At a million a second it lasts nine years; a new source id begins anew.
 pub const SOURCE_MESSAGES_MAX: u64 = 1 << 48;
-
-/// What a kept message counts beyond its payload, bytes.
-const KEPT_OVERHEAD_BYTES: usize = 64;
 
 /// What a source is made of.
 #[derive(Clone, Debug)]
@@ -38,6 +36,8 @@ pub struct SourceConfig {
     pub history_depth: usize,
     /// Bytes kept for late joiners.
     pub history_bytes_max: usize,
+    /// What is kept beyond that for who loses something; of reliable sources only.
+    pub recovery: RecoveryLimits,
 }
 
 /// Why a message was not published.
@@ -59,8 +59,12 @@ pub enum PublishError {
 pub struct SourceProgress {
     source: SourceId,
     key: Bytes,
+    /// True if what is lost can be asked for.
+    recovers: bool,
     next: AtomicU64,
     oldest: AtomicU64,
+    /// The last number that is no mark.
+    last_message: AtomicU64,
     /// Messages published before the present epoch.
     epoch_start: AtomicU64,
     signatures: AtomicU64,
@@ -72,7 +76,8 @@ impl SourceProgress {
         // Both only grow, `next` first: read the other way round, the oldest is never beyond the next.
         let oldest = self.oldest.load(Acquire);
         let next = self.next.load(Acquire);
-        SourceAnnounce { source: self.source, key: self.key.clone(), oldest, next }
+        let recover = u64::from(self.recovers);
+        SourceAnnounce { source: self.source, key: self.key.clone(), oldest, next, recover }
     }
 
     /// Id of the source.
@@ -85,9 +90,19 @@ impl SourceProgress {
         &self.key
     }
 
-    /// Messages published.
+    /// True if what sinks lose can be sent to them again.
+    pub fn recovers(&self) -> bool {
+        self.recovers
+    }
+
+    /// Messages published, and marks.
     pub fn published(&self) -> u64 {
         self.next.load(Acquire).saturating_sub(1)
+    }
+
+    /// The number of the last message that is no mark: what has to change for a silence to end.
+    pub fn last_message(&self) -> u64 {
+        self.last_message.load(Acquire)
     }
 
     /// Messages published since the present epoch began; many ask for a new one.
@@ -99,19 +114,6 @@ impl SourceProgress {
     /// Signatures made: one for each batch.
     pub fn signatures(&self) -> u64 {
         self.signatures.load(Acquire)
-    }
-}
-
-/// A message as it was published.
-struct Kept {
-    seq: u64,
-    head: MessageHead,
-    payload: Bytes,
-}
-
-impl Kept {
-    fn bytes(&self) -> usize {
-        self.payload.len() + KEPT_OVERHEAD_BYTES
     }
 }
 
@@ -127,8 +129,7 @@ pub struct Source {
     batch: Batch,
     /// The packets of `batch`, sealed and not signed.
     unsigned: Vec<(PacketHeader, Vec<u8>)>,
-    history: VecDeque<Kept>,
-    history_bytes: usize,
+    history: History,
     progress: Arc<SourceProgress>,
 }
 
@@ -146,11 +147,15 @@ impl Source {
         let progress = SourceProgress {
             source: config.id,
             key: message_key.public().clone(),
+            recovers: config.reliable && config.recovery.messages_max > 0,
             next: AtomicU64::new(1),
             oldest: AtomicU64::new(1),
+            last_message: AtomicU64::new(0),
             epoch_start: AtomicU64::new(0),
             signatures: AtomicU64::new(0),
         };
+        let recovery = if progress.recovers { config.recovery } else { RecoveryLimits::NONE };
+        let history = History::new(config.history_depth, config.history_bytes_max, recovery);
         Some(Self {
             config,
             suite,
@@ -160,8 +165,7 @@ impl Source {
             seq: 0,
             batch: Batch::default(),
             unsigned: Vec::new(),
-            history: VecDeque::new(),
-            history_bytes: 0,
+            history,
             progress: Arc::new(progress),
         })
     }
@@ -212,21 +216,43 @@ impl Source {
         }
     }
 
+    /// Numbers and keeps one message that nobody listens to, without sealing it: who is on another way to this
+    /// source will ask for it.
+    pub fn record(&mut self, head: &MessageHead, payload: Bytes) -> Result<(), PublishError> {
+        let seq = self.next_number(&payload)?;
+        self.keep(Kept { seq, head: *head, payload });
+        Ok(())
+    }
+
+    /// Says to all what was published until here, so that who lost the last of it notices; nothing if there is
+    /// nothing that could be asked for.
+    pub fn mark(&mut self, mut emit: impl FnMut(Packet)) {
+        self.flush(&mut emit);
+        if !self.progress.recovers || self.seq == 0 || self.seq >= SOURCE_MESSAGES_MAX {
+            return;
+        }
+        self.seal_mark(&mut emit);
+        self.flush(emit);
+    }
+
     /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the
-    /// mark that they were sent. What was published before leaves before.
+    /// sign that they were sent. What was published before leaves before. From 0 it is what late joiners get; if the
+    /// first that is asked for is here no more, a mark that says so goes ahead.
     pub fn replay(&mut self, sink: SinkId, from: u64, to: u64, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
         let Some(key) = SourceKey::derive_addressed(&self.grant, &self.config.name, &self.config.id, &sink)
         else {
             return;
         };
+        let gone = from > 0 && from < self.history.oldest() && self.progress.recovers;
+        if gone && self.history.newest().is_none_or(|m| !m.is_mark()) && self.seq < SOURCE_MESSAGES_MAX {
+            self.seal_mark(&mut emit);
+        }
+        let mark = self.history.newest().filter(|m| gone && m.is_mark()).map(|m| m.seq);
+        let from = if from == 0 { self.history.late_from() } else { from };
         // Clones of references, so that the history can be read while packets are put aside for signing.
-        let asked: Vec<_> = self
-            .history
-            .iter()
-            .filter(|m| (from..=to).contains(&m.seq))
-            .map(|m| (m.seq, m.head, m.payload.clone()))
-            .collect();
+        let ahead = mark.into_iter().flat_map(|seq| self.history.range(seq, seq));
+        let asked: Vec<_> = ahead.chain(self.history.range(from, to)).collect();
         for (seq, head, payload) in asked {
             self.seal_fragments(Some(&key), seq, &head, &payload, &mut emit);
         }
@@ -240,7 +266,7 @@ impl Source {
         self.config.id
     }
 
-    /// Messages published.
+    /// Messages published, and marks.
     pub fn published(&self) -> u64 {
         self.seq
     }
@@ -271,6 +297,26 @@ impl Source {
         payload: Bytes,
         emit: &mut impl FnMut(Packet),
     ) -> Result<(), PublishError> {
+        let seq = self.next_number(&payload)?;
+        self.seal_fragments(None, seq, head, &payload, emit);
+        self.keep(Kept { seq, head: *head, payload });
+        Ok(())
+    }
+
+    /// Publishes a mark; the caller has room for its number.
+    fn seal_mark(&mut self, emit: &mut impl FnMut(Packet)) {
+        self.seq += 1;
+        let head = MessageHead { kind: MessageKind::Mark, source_timestamp_ns: 0 };
+        // Its own place in the history may be that of the oldest: what it says is what is left then.
+        self.keep(Kept { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
+        let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());
+        if let Some(mark) = self.history.newest_mut() {
+            mark.payload = payload.clone();
+        }
+        self.seal_fragments(None, self.seq, &head, &payload, emit);
+    }
+
+    fn next_number(&mut self, payload: &Bytes) -> Result<u64, PublishError> {
         if payload.len() > MESSAGE_BYTES_MAX as usize {
             return Err(PublishError::TooLarge { bytes: payload.len() });
         }
@@ -278,15 +324,18 @@ impl Source {
             return Err(PublishError::Exhausted);
         }
         self.seq += 1;
-        self.seal_fragments(None, self.seq, head, &payload, emit);
-        if self.config.history_depth > 0 {
-            self.keep(Kept { seq: self.seq, head: *head, payload });
-        }
+        Ok(self.seq)
+    }
+
+    fn keep(&mut self, message: Kept) {
+        let (seq, is_mark) = (message.seq, message.is_mark());
+        self.history.push(message);
         // What is announced as past can be asked for by now, so the order matters.
-        self.progress.next.store(self.seq + 1, Release);
-        let oldest = self.history.front().map_or(self.seq + 1, |m| m.seq);
-        self.progress.oldest.store(oldest, Release);
-        Ok(())
+        self.progress.next.store(seq + 1, Release);
+        self.progress.oldest.store(self.history.late_from(), Release);
+        if !is_mark {
+            self.progress.last_message.store(seq, Release);
+        }
     }
 
     /// Seals a message under the key for all, or the one for a sink.
@@ -325,19 +374,6 @@ impl Source {
             self.unsigned.push((header, sealed));
             if self.batch.is_full() {
                 self.flush(&mut *emit);
-            }
-        }
-    }
-
-    fn keep(&mut self, message: Kept) {
-        self.history_bytes += message.bytes();
-        self.history.push_back(message);
-        let over = |s: &Self| {
-            s.history.len() > s.config.history_depth || s.history_bytes > s.config.history_bytes_max
-        };
-        while over(self) && self.history.len() > 1 {
-            if let Some(old) = self.history.pop_front() {
-                self.history_bytes -= old.bytes();
             }
         }
     }

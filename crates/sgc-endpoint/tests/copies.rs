@@ -9,7 +9,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use bytes::Bytes;
-use sgc_endpoint::{Delivery, FRAGMENT_BYTES, Message, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{
+    Delivery, FRAGMENT_BYTES, Message, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig,
+};
 use sgc_trust::{MessageKey, Suite, trailer_bytes_max};
 use sgc_wire::{
     Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
@@ -80,6 +82,7 @@ fn ends(suite: Suite, history_depth: usize) -> (Source, Sink) {
         reliable: true,
         history_depth,
         history_bytes_max: 100 << 20,
+        recovery: RecoveryLimits::default(),
     };
     let key = SecretBytes::new([3; 32]);
     let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };

@@ -21,7 +21,7 @@ use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link};
 use sgc_trust::{CrlError, Identity, TrustAnchors};
 use sgc_wire::{Control, Credentials, Name, Now, RefuseReason, SinkId, SourceId, UnixMillis};
-use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
@@ -32,8 +32,9 @@ use crate::dataplane::DataPlane;
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
+use crate::replays::Replays;
 use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
-use crate::sources::{LocalShare, REPLAYS_MAX};
+use crate::sources::LocalShare;
 use crate::stats::{Drops, NameStats};
 use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 
@@ -43,7 +44,9 @@ pub(crate) const INBOX_MAX: usize = 4096;
 const SUPERSEDED_MAX: usize = 1024;
 /// Events handled before the timers are looked at again.
 const BATCH_MAX: usize = 256;
-/// How long a history may take before it is asked for again.
+/// How often sources are looked at that may have fallen silent.
+const SILENCE_LOOK: Duration = Duration::from_secs(1);
+/// How long nothing may come of what was asked for before it is asked for again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 /// Bytes of history kept for late joiners of one publisher.
 const HISTORY_BYTES_MAX: usize = 64 << 20;
@@ -189,7 +192,9 @@ pub(crate) struct Core<N: RosNetwork> {
     /// When to ask for another certificate.
     renew_due: Option<Instant>,
     redial: watch::Sender<()>,
-    replays: Arc<Semaphore>,
+    replays: Arc<Replays>,
+    /// When to look again for sources that fell silent; `None` until one publishes.
+    silence_due: Option<Instant>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
     ros_failures: Arc<Drops>,
@@ -272,7 +277,8 @@ impl<N: RosNetwork> Core<N> {
             keeper: parts.keeper,
             renew_due: None,
             redial: parts.redial,
-            replays: Arc::new(Semaphore::new(REPLAYS_MAX)),
+            replays: Arc::default(),
+            silence_due: None,
             requests,
             control_drops: Drops::default(),
             ros_failures: Arc::default(),
@@ -415,9 +421,7 @@ impl<N: RosNetwork> Core<N> {
     fn handle_sink(&mut self, request: SinkRequest) {
         match request {
             SinkRequest::History(name, source) => {
-                if self.writers.contains_key(&(name, Some(source))) {
-                    self.ask_history(name, source);
-                }
+                self.ask_history(name, source);
             }
             SinkRequest::Synced(name, source) => {
                 self.history_due.remove(&(name, source));
@@ -437,9 +441,13 @@ impl<N: RosNetwork> Core<N> {
             self.history_due.iter().filter(|(_, at)| **at <= now.instant).map(|(key, _)| *key).collect();
         for (name, source) in due {
             self.history_due.remove(&(name, source));
-            if self.writers.contains_key(&(name, Some(source))) {
-                self.ask_history(name, source);
-            }
+            self.ask_history_again(name, source);
+        }
+        if self.silence_due.is_none_or(|at| at <= now.instant) {
+            let looks = self.shares.values().map(|share| share.look_for_silence(now.instant));
+            // All of them, not up to the first.
+            let busy = looks.fold(false, |any, busy| any | busy);
+            self.silence_due = busy.then(|| now.instant + SILENCE_LOOK);
         }
         if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
             self.ask_renewal();
@@ -487,8 +495,9 @@ impl<N: RosNetwork> Core<N> {
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
-                let all = [router, endpoint, routes, history, retire, rekey, self.renew_due, self.look_due];
-                return all.into_iter().flatten().min();
+                let own = [self.renew_due, self.silence_due, self.look_due];
+                let all = [router, endpoint, routes, history, retire, rekey].into_iter().chain(own);
+                return all.flatten().min();
             }
         }
     }

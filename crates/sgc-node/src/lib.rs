@@ -21,6 +21,7 @@ pub mod partners;
 pub mod policy;
 mod queue;
 mod reload;
+mod replays;
 mod rules;
 mod sinks;
 mod sources;

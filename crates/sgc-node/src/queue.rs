@@ -114,7 +114,8 @@ impl<T> Queue<T> {
         self.closed.load(Ordering::Acquire)
     }
 
-    fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> Result<(), T> {
+    /// Queues an item if there is room; else gives it back.
+    pub(crate) fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> Result<(), T> {
         if self.is_closed() || !self.has_room(bytes, bytes_max) {
             return Err(item);
         }

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
+use sgc_endpoint::{AskAgain, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 use sgc_ros::{RosError, RosWriter, SampleKind};
 use sgc_router::LinkId;
 use sgc_wire::{MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
@@ -31,7 +31,7 @@ const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 /// What a sink asks of the control task.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum SinkRequest {
-    /// Ask for a source's history.
+    /// Ask a source for what is missing.
     History(Name, SourceId),
     /// It is here.
     Synced(Name, SourceId),
@@ -40,8 +40,10 @@ pub(crate) enum SinkRequest {
 #[derive(Default)]
 struct State {
     sink: Option<Sink>,
-    /// Releases that are not written yet.
+    /// Messages, one or several that waited for a grant, that are not written yet.
     releases: u32,
+    /// True if something that can be asked for again was not taken, for want of a writer.
+    missed: bool,
 }
 
 /// A joined name's end at this node.
@@ -49,7 +51,8 @@ pub(crate) struct LocalSink {
     name: Name,
     transient_local: bool,
     state: Mutex<State>,
-    /// Held while messages are written that waited for a grant: what comes after them is written after them.
+    /// Held while messages are written that waited for a grant, or for their writer: what comes after them is written
+    /// after them.
     releasing: Arc<tokio::sync::Mutex<()>>,
     writers: ArcSwap<BTreeMap<Option<SourceId>, Arc<WriterQueue>>>,
     requests: mpsc::Sender<SinkRequest>,
@@ -91,6 +94,7 @@ impl LocalSink {
         };
         let (this, data) = (self.clone(), data.clone());
         tokio::spawn(async move {
+            let releasing = Releasing(&this);
             let turn = match turn {
                 Some(turn) => turn,
                 None => this.releasing.clone().lock_owned().await,
@@ -100,7 +104,7 @@ impl LocalSink {
                     data.count(LinkId::LOCAL, &this.name, reason);
                 }
             }
-            this.lock().releases -= 1;
+            drop(releasing);
             drop(turn);
         });
     }
@@ -117,12 +121,25 @@ impl LocalSink {
         }
     }
 
-    /// Sources with a writer here whose history must be asked for.
+    /// Sources with a writer here of which something is missing.
     pub(crate) fn unsynced(&self) -> Vec<SourceId> {
-        let writers = self.writers.load();
-        let mut state = self.lock();
-        let Some(sink) = &mut state.sink else { return Vec::new() };
-        writers.keys().flatten().copied().filter(|source| sink.expect(*source)).collect()
+        let state = self.lock();
+        let sources = state.sink.iter().flat_map(Sink::unsynced);
+        sources.filter(|source| self.has_writer(source)).collect()
+    }
+
+    /// From which number on a source is to be asked for what is missing.
+    pub(crate) fn ask(&self, source: SourceId) -> Option<u64> {
+        // What came would go nowhere; it is asked for when there is a writer.
+        self.has_writer(&source).then(|| self.lock().sink.as_mut()?.ask(source)).flatten()
+    }
+
+    /// The same, some time after it was asked.
+    pub(crate) fn ask_again(&self, source: SourceId) -> AskAgain {
+        if !self.has_writer(&source) {
+            return AskAgain::No;
+        }
+        self.lock().sink.as_mut().map_or(AskAgain::No, |sink| sink.ask_again(source))
     }
 
     /// Adds, replaces or removes a writer; the old one ends after what is queued.
@@ -137,7 +154,14 @@ impl LocalSink {
                 writers.remove(&source)
             }
         };
+        let opened = writers.contains_key(&source);
         self.writers.store(Arc::new(writers));
+        if opened {
+            let state = &mut *self.lock();
+            if let (Some(sink), true) = (&mut state.sink, std::mem::take(&mut state.missed)) {
+                sink.suspect();
+            }
+        }
         if let Some(old) = old {
             old.queue.close();
         }
@@ -155,30 +179,57 @@ impl LocalSink {
 
     /// Takes a packet; says what was dropped. Waits while a reliable topic's local writer is full.
     pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Option<(DataDrop, u64)> {
-        let (result, behind) = {
+        let (result, behind, turn) = {
             let mut state = self.lock();
-            let Some(sink) = &mut state.sink else { return Some((DataDrop::NotGranted, 1)) };
-            (sink.handle_packet(&packet), state.releases > 0)
+            let State { sink, releases, missed } = &mut *state;
+            let Some(sink) = sink else { return Some((DataDrop::NotGranted, 1)) };
+            let source = packet.header.source;
+            if !self.has_writer(&source) && sink.recovers(&source) {
+                *missed = true;
+                return Some((DataDrop::NoWriter, 1));
+            }
+            let behind = *releases > 0;
+            match sink.handle_packet(&packet) {
+                // Under the lock, so that what comes over two links at once is written in the order of its numbers.
+                Ok(Delivery::Message(message)) if !behind => match self.write_now(message) {
+                    Ok(dropped) => return dropped,
+                    Err(message) => {
+                        *releases += 1;
+                        let turn = (Releasing(self), self.releasing.clone().try_lock_owned().ok());
+                        (Ok(Delivery::Message(message)), false, Some(turn))
+                    }
+                },
+                result => (result, behind, None),
+            }
         };
-        if behind {
-            drop(self.releasing.lock().await);
-        }
+        let _turn = match turn {
+            Some((releasing, Some(turn))) => Some((Some(releasing), turn)),
+            Some((releasing, None)) => Some((Some(releasing), self.releasing.clone().lock_owned().await)),
+            None if behind => Some((None, self.releasing.clone().lock_owned().await)),
+            None => None,
+        };
         self.finish(result, drops).await
     }
 
     /// Does what a packet came to.
     async fn finish(&self, result: Result<Delivery, SinkDrop>, drops: &Drops) -> Option<(DataDrop, u64)> {
         match result {
-            Ok(Delivery::Incomplete | Delivery::Parked) => None,
+            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => None,
             Ok(Delivery::Message(message)) => self.write(message).await,
             Ok(Delivery::NeedsHistory(source)) => {
-                // If the control task is busy, the next packet or the retry timer asks again.
-                let _ = self.requests.try_send(SinkRequest::History(self.name, source));
+                let _ = self.requests.send(SinkRequest::History(self.name, source)).await;
                 None
             }
             Ok(Delivery::Synced(source)) => {
                 let _ = self.requests.send(SinkRequest::Synced(self.name, source)).await;
                 None
+            }
+            Ok(Delivery::Lost(_, messages)) => {
+                debug!(name = %self.name.short(), messages, "lost for good");
+                if drops.add("sink_lost", messages) {
+                    warn!(messages, "a source keeps no more what was lost on the way; counted from here on");
+                }
+                Some((DataDrop::Sink, messages))
             }
             Err(error) => {
                 debug!(name = %self.name.short(), %error, "packet refused");
@@ -189,27 +240,55 @@ impl LocalSink {
     }
 
     async fn write(&self, message: Message) -> Option<(DataDrop, u64)> {
-        let writer = {
-            let writers = self.writers.load();
-            writers.get(&Some(message.source)).or_else(|| writers.get(&None)).cloned()
+        let message = match self.write_now(message) {
+            Ok(dropped) => return dropped,
+            Err(message) => message,
         };
-        let Some(writer) = writer else { return Some((DataDrop::NoWriter, 1)) };
-        self.delivered.fetch_add(1, Relaxed);
+        let Some(writer) = self.writer(&message.source) else { return Some((DataDrop::NoWriter, 1)) };
         let bytes = message.payload.len();
-        if message.reliable {
-            match writer.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await {
-                Ok(()) => None,
-                Err(_) => Some((DataDrop::Stalled, 1)),
-            }
-        } else {
-            let mut evicted = 0;
-            writer.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
-            (evicted > 0).then_some((DataDrop::Stale, evicted))
+        self.delivered.fetch_add(1, Relaxed);
+        match writer.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await {
+            Ok(()) => None,
+            Err(_) => Some((DataDrop::Stalled, 1)),
         }
+    }
+
+    /// Queues a message for its writer and says what was dropped; gives it back if it has to wait for room.
+    fn write_now(&self, message: Message) -> Result<Option<(DataDrop, u64)>, Message> {
+        let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
+        let bytes = message.payload.len();
+        let mut evicted = 0;
+        if message.reliable {
+            writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
+        } else {
+            writer.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
+        }
+        self.delivered.fetch_add(1, Relaxed);
+        Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
+    }
+
+    fn has_writer(&self, source: &SourceId) -> bool {
+        let writers = self.writers.load();
+        writers.contains_key(&Some(*source)) || writers.contains_key(&None)
+    }
+
+    /// The writer for a source's messages.
+    fn writer(&self, source: &SourceId) -> Option<Arc<WriterQueue>> {
+        let writers = self.writers.load();
+        writers.get(&Some(*source)).or_else(|| writers.get(&None)).cloned()
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Counts a release that is under way; the count holds whatever becomes of who waits.
+struct Releasing<'a>(&'a LocalSink);
+
+impl Drop for Releasing<'_> {
+    fn drop(&mut self) {
+        self.0.lock().releases -= 1;
     }
 }
 
@@ -235,7 +314,7 @@ impl WriterQueue {
                     MessageKind::Write => SampleKind::Write,
                     MessageKind::Dispose => SampleKind::Dispose,
                     MessageKind::Unregister => SampleKind::Unregister,
-                    MessageKind::Synced => continue,
+                    MessageKind::Synced | MessageKind::Mark => continue,
                 };
                 if let Err(error) = writer.write(kind, message.head.source_timestamp_ns, message.payload)
                     && failures.count(failure_key(&error))

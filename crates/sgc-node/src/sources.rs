@@ -4,24 +4,22 @@
 //! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are
 //! at hand together share a signature; none waits for one that is not.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{PublishError, Source, SourceProgress};
+use sgc_endpoint::{Marks, PublishError, Source, SourceProgress};
 use sgc_ros::{Guid, Sample, SampleKind};
 use sgc_router::LinkId;
 use sgc_wire::{MessageHead, MessageKind, Name, Packet, Recover, SourceId, TopicGrant};
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, Semaphore, mpsc};
+use tokio::sync::{Notify, mpsc};
 
 use crate::dataplane::DataPlane;
 use crate::stats::DataDrop;
-
-/// Histories that may be sent at once; a sink that comes too early asks again.
-pub(crate) const REPLAYS_MAX: usize = 16;
 
 /// Samples that may wait for their writer to be discovered.
 const EARLY_SAMPLES_MAX: usize = 256;
@@ -107,6 +105,10 @@ pub(crate) struct LocalShare {
     is_over: AtomicBool,
     /// Wakes the control task, which nothing else may wake while messages flow.
     over: Arc<Notify>,
+    /// What the control task saw of each source that says what it published last.
+    marks: Mutex<BTreeMap<SourceId, Marks>>,
+    /// True while there is nothing to see: the next message says that there is.
+    quiet: AtomicBool,
     published: AtomicU64,
 }
 
@@ -137,6 +139,8 @@ impl LocalShare {
             rotating: AtomicBool::new(false),
             is_over: AtomicBool::new(false),
             over,
+            marks: Mutex::default(),
+            quiet: AtomicBool::new(true),
             published: AtomicU64::new(0),
         }
     }
@@ -208,11 +212,13 @@ impl LocalShare {
         };
         match slot {
             None => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
-            Some(slot) if !slot.keeps_history && !self.data.is_wanted(&self.name) => {
-                self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
-            }
             Some(slot) => {
-                self.seal_and_send(&slot, sample, more);
+                let wanted = self.data.is_wanted(&self.name);
+                if !wanted && !slot.keeps_history && !slot.progress.recovers() {
+                    self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
+                    return Ok(());
+                }
+                self.seal_and_send(&slot, sample, more, wanted);
                 if more && open.iter().all(|o| o.id != slot.id) {
                     open.push(slot);
                 }
@@ -221,7 +227,7 @@ impl LocalShare {
         Ok(())
     }
 
-    fn seal_and_send(&self, slot: &SourceSlot, sample: Sample, more: bool) {
+    fn seal_and_send(&self, slot: &SourceSlot, sample: Sample, more: bool, wanted: bool) {
         let head = MessageHead {
             kind: match sample.kind {
                 SampleKind::Write => MessageKind::Write,
@@ -230,11 +236,19 @@ impl LocalShare {
             },
             source_timestamp_ns: sample.source_timestamp_ns,
         };
-        // Fragments leave as they are sealed: a large message is under way before its end is read.
-        let result = lock(&slot.source).publish(&head, sample.payload, more, self.emit());
+        let result = if wanted {
+            // Fragments leave as they are sealed: a large message is under way before its end is read.
+            lock(&slot.source).publish(&head, sample.payload, more, self.emit())
+        } else {
+            // For who joins later, or is on another way here.
+            lock(&slot.source).record(&head, sample.payload)
+        };
         match result {
             Ok(()) => {
                 self.published.fetch_add(1, Relaxed);
+                if self.quiet.load(Relaxed) && slot.progress.recovers() && self.quiet.swap(false, SeqCst) {
+                    self.over.notify_one();
+                }
                 if slot.progress.published_in_epoch() >= self.epoch_messages_max
                     && !self.rotating.swap(true, Relaxed)
                 {
@@ -287,21 +301,61 @@ impl LocalShare {
         self.is_over.swap(false, SeqCst)
     }
 
-    /// Sends a sink what it asks for, in order with what is published meanwhile.
-    pub(crate) fn replay(self: &Arc<Self>, recover: Recover, permits: &Arc<Semaphore>) {
+    /// Sends a sink what it asks for, in order with what is published meanwhile. Takes as long as that takes.
+    pub(crate) fn replay(&self, recover: &Recover) {
         let Some(slot) = self.map.load().slot(&recover.source) else { return };
-        let Ok(permit) = permits.clone().try_acquire_owned() else { return };
-        let (share, alive) = (self.clone(), self.alive.clone());
+        lock(&slot.source).replay(recover.sink, recover.from, recover.to, |packet| {
+            if !self.closed.load(Relaxed) {
+                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
+            }
+        });
+    }
+
+    /// Does something that may block, on a thread where it may.
+    pub(crate) fn run_blocking(&self, work: impl FnOnce() + Send + 'static) {
+        let alive = self.alive.clone();
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
-            let mut source = lock(&slot.source);
-            source.replay(recover.sink, recover.from, recover.to, |packet| {
-                if !share.closed.load(Relaxed) {
-                    share.runtime.block_on(share.data.forward(LinkId::LOCAL, packet));
-                }
-            });
-            drop(permit);
+            work();
         });
+    }
+
+    /// Lets sources that have fallen silent say what they published last. False if none will have to before the next
+    /// message.
+    pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
+        if self.quiet.load(SeqCst) {
+            return false;
+        }
+        let map = self.map();
+        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        marks.retain(|id, _| map.slot(id).is_some());
+        let mut look = || {
+            let mut busy = false;
+            for slot in map.slots() {
+                let marks = marks.entry(slot.id).or_default();
+                if marks.is_due(now, &slot.progress) && self.data.is_wanted(&self.name) {
+                    let (share, slot) = (self.clone(), slot.clone());
+                    self.run_blocking(move || {
+                        // Who has the source is about to publish.
+                        if let Ok(mut source) = slot.source.try_lock() {
+                            source.mark(share.emit());
+                        }
+                    });
+                }
+                busy |= marks.deadline().is_some();
+            }
+            busy
+        };
+        if look() {
+            return true;
+        }
+        self.quiet.store(true, SeqCst);
+        // A message may have come between the two.
+        let busy = look();
+        if busy {
+            self.quiet.store(false, SeqCst);
+        }
+        busy
     }
 
     /// Ends it: a reader's thread that is publishing stops at the next packet.
@@ -326,12 +380,16 @@ fn lock(source: &Mutex<Source>) -> std::sync::MutexGuard<'_, Source> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use bytes::Bytes;
-    use sgc_endpoint::SourceConfig;
+    use sgc_endpoint::{RecoveryLimits, SourceConfig};
+    use sgc_router::FibEntry;
     use sgc_trust::{MessageKey, Suite};
     use sgc_wire::{Class, SecretBytes};
 
     use super::*;
+    use crate::dataplane::Forward;
 
     const KNOWN: Guid = Guid([1; 16]);
     const STRANGER: Guid = Guid([2; 16]);
@@ -357,6 +415,7 @@ mod tests {
             reliable: true,
             history_depth: 10,
             history_bytes_max: 1000,
+            recovery: RecoveryLimits::default(),
         };
         let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
         let slot = SourceSlot::new(source, true, true);
@@ -379,7 +438,14 @@ mod tests {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, slot) = share();
+        // Without anybody who listens nothing is sealed.
         share.publish(sample(KNOWN, true));
+        assert_eq!((share.published(), unflushed(&slot)), (1, 0));
+        let nowhere = FibEntry {
+            trees: [].as_slice().into(),
+            sinks: vec![],
+        };
+        share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
         share.publish(sample(KNOWN, true));
         share.publish(sample(STRANGER, false));
         assert_eq!((share.published(), unflushed(&slot)), (2, 0));
@@ -408,5 +474,22 @@ mod tests {
             std::thread::yield_now();
         }
         assert_eq!(slot.progress.published_in_epoch(), 0);
+    }
+
+    #[test]
+    fn a_share_is_looked_at_until_its_silence_was_told_three_times() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        let begin = Instant::now();
+        let at = |seconds| begin + Duration::from_secs(seconds);
+        assert!(!share.look_for_silence(at(0)), "nothing was published");
+        for _ in 0..2 {
+            share.publish(sample(KNOWN, false));
+            assert!(share.look_for_silence(at(100)) && share.look_for_silence(at(102)));
+            assert!(share.look_for_silence(at(105)) && share.look_for_silence(at(114)));
+            assert!(!share.look_for_silence(at(116)) && !share.look_for_silence(at(900)));
+        }
+        assert_eq!(slot.progress.published(), 2, "without anybody who listens nothing is said");
     }
 }

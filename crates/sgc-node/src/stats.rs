@@ -95,6 +95,14 @@ impl Drops {
         *n == 1
     }
 
+    /// Counts several; true if they are the first of their kind.
+    pub(crate) fn add(&self, kind: &'static str, several: u64) -> bool {
+        let mut counts = self.lock();
+        let n = counts.kinds.entry(kind).or_default();
+        *n += several;
+        *n == several
+    }
+
     /// Counts one of somebody's; true if it is the first of its kind from there.
     pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Display) -> bool {
         let mut counts = self.lock();

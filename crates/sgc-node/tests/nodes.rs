@@ -98,6 +98,45 @@ fn whoever_is_killed_and_restarted_the_flow_resumes_without_duplicates() {
 }
 
 #[test]
+fn a_router_that_is_killed_costs_a_reliable_topic_nothing() {
+    let trio = Trio::new();
+    let mut cloud = trio.cloud();
+    let _nodes = (trio.robot(&["/chatter"], "desk"), trio.desk(&["/chatter"]));
+    let qos = Qos { history: History::KeepAll, ..Qos::default() };
+    let talker = Talker::new(&trio.robot_net, "/chatter", qos.clone());
+    let listener = Listener::new(&trio.desk_net, "/chatter", qos);
+    talker.wait_for_readers(1);
+    listener.hears_at_last(|_| talker.say("0"));
+    let mut said = 0u32;
+    let mut say = |talker: &Talker, n: usize| {
+        for _ in 0..n {
+            said += 1;
+            talker.say(said.to_string());
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        said
+    };
+    for _ in 0..3 {
+        say(&talker, 200);
+        // What it has, and what is said until it is back, is nowhere but at the robot.
+        cloud.kill();
+        say(&talker, 200);
+        cloud = trio.cloud();
+        say(&talker, 200);
+    }
+    // The last ones, before a silence.
+    let last = say(&talker, 1);
+    let mut heard = Vec::new();
+    while heard.last() != Some(&last) {
+        let sample = listener.samples.recv_timeout(PATIENCE).expect("all that was said");
+        heard.push(std::str::from_utf8(&sample).unwrap().parse::<u32>().unwrap());
+    }
+    heard.retain(|n| *n > 0);
+    assert_eq!(heard, (1..=last).collect::<Vec<_>>(), "each once, in order");
+    drop(cloud);
+}
+
+#[test]
 fn late_joiners_get_each_latched_publisher_once() {
     let trio = Trio::new();
     let cloud = trio.cloud();

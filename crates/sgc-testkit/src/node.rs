@@ -11,8 +11,8 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Message, ShareSpec, Sink, SinkDrop, SinkLimits,
-    Source, SourceConfig, Wish,
+    AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Marks, Message, RecoveryLimits,
+    ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig, Wish,
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
@@ -62,6 +62,8 @@ pub struct Sharing {
     pub publishers: BTreeSet<NodeKey>,
     /// How it is protected, unless as usual.
     pub suite: Option<Suite>,
+    /// What is kept for who loses something of it.
+    pub recovery: RecoveryLimits,
 }
 
 impl Sharing {
@@ -83,6 +85,12 @@ impl Sharing {
     /// As a transient-local topic that keeps the last `depth` messages.
     pub fn transient_local(self, depth: usize) -> Self {
         Self { depth, ..self }
+    }
+
+    /// As one of which so many messages are kept for who loses some.
+    pub fn recovering(self, messages_max: usize) -> Self {
+        let recovery = RecoveryLimits { messages_max, ..self.recovery };
+        Self { recovery, ..self }
     }
 
     /// As a best-effort topic.
@@ -187,6 +195,7 @@ pub(crate) struct Running {
 pub(crate) struct LocalSource {
     pub(crate) topic: String,
     pub(crate) source: Source,
+    marks: Marks,
 }
 
 pub(crate) struct LocalSink {
@@ -310,8 +319,15 @@ impl Running {
             .map(|(n, _)| *n)
             .collect();
         for name in due {
-            self.ask_history(now, name);
+            self.ask_again(now, name);
         }
+        let mut marks = Vec::new();
+        for local in self.sources.values_mut() {
+            if local.marks.is_due(now.instant, &local.source.progress()) {
+                local.source.mark(|p| marks.push(p));
+            }
+        }
+        self.send_packets(now, marks);
         for local in self.sinks.values_mut() {
             if local.retire_at.take_if(|at| *at <= now.instant).is_some()
                 && let Some(sink) = &mut local.sink
@@ -354,12 +370,13 @@ impl Running {
             reliable: !sharing.best_effort,
             history_depth: sharing.depth,
             history_bytes_max: HISTORY_BYTES_MAX,
+            recovery: sharing.recovery,
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
         let message_key = MessageKey::generate(suite);
         let source = Source::new(config, &grant, message_key).expect("a key of that suite");
         self.endpoint.set_sources(now, &name, vec![source.progress()]);
-        self.sources.insert(name, LocalSource { topic: topic.to_owned(), source });
+        self.sources.insert(name, LocalSource { topic: topic.to_owned(), source, marks: Marks::default() });
         Some(name)
     }
 
@@ -401,6 +418,7 @@ impl Running {
         let (_, local) = self.sources.iter_mut().find(|(_, s)| s.topic == topic)?;
         let packets = sealed(&mut local.source, id, bytes);
         let source = local.source.id();
+        local.marks.is_due(now.instant, &local.source.progress());
         self.send_packets(now, packets);
         Some(source)
     }
@@ -428,7 +446,8 @@ impl Running {
             wake = Some(wake.map_or(at, |w: Instant| w.min(at)));
         }
         let sinks = self.sinks.values().flat_map(|s| [s.retry_at, s.retire_at]).flatten();
-        self.wake = sinks.chain(wake).min();
+        let marks = self.sources.values().filter_map(|s| s.marks.deadline());
+        self.wake = sinks.chain(marks).chain(wake).min();
         std::mem::take(&mut self.effects)
     }
 
@@ -589,17 +608,28 @@ impl Running {
         }
     }
 
-    /// Asks for the histories that are not here yet, if the name is granted.
+    /// Asks for all that is missing, if the name is granted.
     fn ask_history(&mut self, now: Now, name: Name) {
+        self.ask(now, name, |sink, source| sink.ask(source).map_or(AskAgain::No, AskAgain::From));
+    }
+
+    /// The same, a while later.
+    fn ask_again(&mut self, now: Now, name: Name) {
+        self.ask(now, name, Sink::ask_again);
+    }
+
+    fn ask(&mut self, now: Now, name: Name, mut ask: impl FnMut(&mut Sink, SourceId) -> AskAgain) {
         let granted = self.endpoint.join_status(&name) == Some(JoinStatus::Granted);
         let Some(local) = self.sinks.get_mut(&name) else { return };
         local.retry_at = None;
         let Some(sink) = local.sink.as_mut().filter(|_| granted) else { return };
-        for source in local.sources.clone() {
-            if sink.expect(source) {
-                local.retry_at = Some(now.instant + HISTORY_RETRY);
-                self.endpoint.recover(name, source, 1, u64::MAX);
+        for source in sink.unsynced().collect::<Vec<_>>() {
+            match ask(sink, source) {
+                AskAgain::No => continue,
+                AskAgain::Wait => {}
+                AskAgain::From(from) => self.endpoint.recover(name, source, from, u64::MAX),
             }
+            local.retry_at = Some(now.instant + HISTORY_RETRY);
         }
     }
 
@@ -653,14 +683,19 @@ impl Running {
             }
             Ok(Delivery::NeedsHistory(source)) => {
                 local.retry_at.get_or_insert(now.instant + HISTORY_RETRY);
-                self.endpoint.recover(name, source, 1, u64::MAX);
+                if let Some(from) = local.sink.as_mut().and_then(|sink| sink.ask(source)) {
+                    self.endpoint.recover(name, source, from, u64::MAX);
+                }
+            }
+            Ok(Delivery::Lost(_, messages)) => {
+                self.effects.push(Effect::Log(What::SinkLost { name, messages }));
             }
             Ok(Delivery::Synced(_)) => {
                 if local.sink.as_ref().is_none_or(|sink| sink.unsynced().next().is_none()) {
                     local.retry_at = None;
                 }
             }
-            Ok(Delivery::Incomplete | Delivery::Parked) => {}
+            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use sgc_endpoint::{Sink, SinkLimits, Source, SourceConfig, Wish};
+use sgc_endpoint::{RecoveryLimits, Sink, SinkLimits, Source, SourceConfig, Wish};
 use sgc_trust::{MessageKey, Suite, name_of};
 use sgc_wire::{Name, NodeId, Now, Packet, Reliability, SinkId, SourceId, SourceOffer, TopicGrant};
 
@@ -68,6 +68,7 @@ impl Running {
                 reliable: entry.qos.reliability == Reliability::Reliable,
                 history_depth: 0,
                 history_bytes_max: 0,
+                recovery: RecoveryLimits::NONE,
             };
             let message_key = MessageKey::generate(suite);
             let offer = SourceOffer { source: config.id, key: message_key.public().clone() };

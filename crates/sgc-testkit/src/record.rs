@@ -79,6 +79,13 @@ pub enum What {
         /// Why.
         why: DataDrop,
     },
+    /// Messages that a sink will never get.
+    SinkLost {
+        /// Their name.
+        name: Name,
+        /// How many.
+        messages: u64,
+    },
     /// The router closed a link.
     Closed {
         /// Why.

@@ -19,6 +19,8 @@ pub(crate) struct Cable {
     pub(crate) latency: Duration,
     /// What an evil node at one end does to frames that it sends.
     pub(crate) tampers: [Option<Tamper>; 2],
+    /// True for an end whose packets are lost while its frames arrive, as if a queue stood still for too long.
+    pub(crate) loses: [bool; 2],
 }
 
 impl Cable {

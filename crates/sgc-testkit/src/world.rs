@@ -268,7 +268,14 @@ impl World {
     pub fn link(&mut self, a: NodeKey, b: NodeKey) {
         let latency = self.dice.time(&self.config.latency.clone());
         self.note(format!("link {a:?} {b:?} {latency:?}"));
-        let cable = Cable { ends: [a, b], whole: true, wire: None, latency, tampers: [None, None] };
+        let cable = Cable {
+            ends: [a, b],
+            whole: true,
+            wire: None,
+            latency,
+            tampers: [None, None],
+            loses: [false; 2],
+        };
         self.cables.push(cable);
         self.connect(self.cables.len() - 1);
     }
@@ -290,6 +297,14 @@ impl World {
             self.queue(self.clock.instant() + SUSPECT_AFTER, Pending::Quality { wire, to, suspect: true });
             self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to });
         }
+    }
+
+    /// From now on packets from one node to another are lost, or no longer; frames still arrive.
+    pub fn lose_packets(&mut self, from: NodeKey, to: NodeKey, lose: bool) {
+        self.note(format!("{} packets {from:?} {to:?}", if lose { "lose" } else { "carry" }));
+        let cable = self.cable(from, to);
+        let side = self.cables[cable].end_of(from).expect("its own cable");
+        self.cables[cable].loses[side] = lose;
     }
 
     /// Mends a cable and connects it.
@@ -700,6 +715,16 @@ impl World {
             .collect()
     }
 
+    /// Messages that a node was told it will never get.
+    pub fn lost(&self, node: NodeKey) -> u64 {
+        let of_node = self.log.iter().filter(|l| l.node == node);
+        let lost = of_node.filter_map(|l| match &l.what {
+            What::SinkLost { messages, .. } => Some(*messages),
+            _ => None,
+        });
+        lost.sum()
+    }
+
     /// What was done to this world, for a failing test's output.
     pub fn trace(&self) -> String {
         let mut text = format!("seed {}\n", self.config.seed);
@@ -853,7 +878,9 @@ impl World {
             let (from, to, at) = (ends[side].node, ends[1 - side].node, self.clock.elapsed());
             self.captured_packets.push(CapturedPacket { from, to, at, packet: packet.clone() });
         }
-        if !packet.header.reliable && self.dice.chance(self.config.loss_percent) {
+        let cable = &self.cables[self.wires[wire].cable];
+        let loses = cable.end_of(self.wires[wire].ends[side].node).is_some_and(|end| cable.loses[end]);
+        if loses || (!packet.header.reliable && self.dice.chance(self.config.loss_percent)) {
             let (name, ingress) = (packet.header.name, self.wires[wire].ends[side].link);
             let node = self.wires[wire].ends[side].node;
             return self.write_log(node, What::DataDrop { name, ingress, why: DataDrop::Lost });

@@ -337,6 +337,7 @@ impl Run {
         }
         self.check_histories(&model);
         self.check_deliveries();
+        self.check_order();
         self.check_log();
     }
 
@@ -372,6 +373,26 @@ impl Run {
         }
     }
 
+    /// Of each source a use gets the messages in order, from the first that it got on, and leaves out none.
+    fn check_order(&self) {
+        let published = self.world.all_published();
+        let mut numbers = BTreeMap::new();
+        let mut of_source: BTreeMap<_, Vec<_>> = BTreeMap::new();
+        for p in published {
+            let all = of_source.entry(p.source).or_default();
+            numbers.insert(p.id, all.len());
+            all.push(p.id);
+        }
+        let mut last = BTreeMap::new();
+        for r in self.world.all_received().iter().filter(|r| self.world.lost(r.node) == 0) {
+            let source = published[r.id.0 as usize].source;
+            let before = last.insert((r.node, r.run, r.use_number, source), numbers[&r.id]);
+            let due = before.map_or(numbers[&r.id], |n| n + 1);
+            let expected = of_source[&source][due];
+            assert_eq!(r.id, expected, "{r:?} of {source:?} is not the one whose turn it is");
+        }
+    }
+
     /// Honest nodes give each other no reason for suspicion.
     fn check_log(&self) {
         for logged in self.world.log() {
@@ -399,7 +420,7 @@ impl Run {
                     }
                     _ => true,
                 },
-                What::Closed { .. } | What::Event(_) => true,
+                What::Closed { .. } | What::Event(_) | What::SinkLost { .. } => true,
             };
             assert!(fine, "{logged:?}");
         }
@@ -422,6 +443,7 @@ impl Run {
             assert_eq!(left, (0, 0, 0), "names, branches and entries left behind in {node:?}");
         }
         self.check_deliveries();
+        self.check_order();
         self.check_log();
     }
 

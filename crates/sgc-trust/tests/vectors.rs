@@ -154,7 +154,13 @@ fn the_grants_of_the_vectors_open() {
         epoch: 7,
         suite: 3,
         key: SecretBytes::new(std::array::from_fn(|i| i as u8)),
-        sources: vec![SourceAnnounce { source: SOURCE, key: vec![0xdd; 32].into(), oldest: 5, next: 9 }],
+        sources: vec![SourceAnnounce {
+            source: SOURCE,
+            key: vec![0xdd; 32].into(),
+            oldest: 5,
+            next: 9,
+            recover: 3,
+        }],
         entry: None,
     });
     assert_eq!(content.to_vec(), hex(&all["content"]));

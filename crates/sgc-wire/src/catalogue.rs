@@ -53,10 +53,13 @@ pub struct SourceAnnounce {
     /// What its messages verify with: an Ed25519 public key of 32 bytes, or the SubjectPublicKeyInfo of an RSA key;
     /// empty if the suite has no signatures.
     pub key: Bytes,
-    /// The oldest message that it may be asked for when this was said; its next one if it keeps none.
+    /// The oldest message that a late joiner may ask for when this was said; its next one if it keeps none for those.
     pub oldest: u64,
     /// The number of its next message when this was said: what is older than it and was not asked for is a replay.
     pub next: u64,
+    /// The first message that the one who is told this may ever ask for again, if it lost it; 0 if what is lost of this
+    /// source stays lost.
+    pub recover: u64,
 }
 
 /// What a member needs to stay one.
@@ -198,6 +201,7 @@ impl Encode for SourceAnnounce {
         w.bytes(&self.key);
         w.u64(self.oldest);
         w.u64(self.next);
+        w.u64(self.recover);
     }
 }
 
@@ -208,6 +212,7 @@ impl Decode for SourceAnnounce {
             key: r.bytes("source key", SOURCE_KEY_BYTES_MAX).map(Bytes::copy_from_slice)?,
             oldest: r.u64()?,
             next: r.u64()?,
+            recover: r.u64()?,
         })
     }
 }
@@ -272,6 +277,7 @@ mod tests {
             key: Bytes::from_static(&[5; 32]),
             oldest: 3,
             next: 9,
+            recover: 2,
         };
         let topic = TopicGrant {
             epoch: 3,

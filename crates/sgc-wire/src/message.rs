@@ -16,6 +16,9 @@ pub enum MessageKind {
     Unregister,
     /// No message: the history that a sink asked for has been sent. Sequence number 0, always the same bytes.
     Synced,
+    /// No message, but numbered as one: what was published until here, and what can still be asked for. Its payload is the
+    /// number of the oldest such message, 8 bytes.
+    Mark,
 }
 
 /// Travels sealed, behind the first fragment of each message.
@@ -43,6 +46,7 @@ impl Decode for MessageHead {
             1 => MessageKind::Dispose,
             2 => MessageKind::Unregister,
             3 => MessageKind::Synced,
+            4 => MessageKind::Mark,
             v => return Err(DecodeError::value("message kind", v.into())),
         };
         match (r.u8()?, r.u16()?) {

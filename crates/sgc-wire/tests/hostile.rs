@@ -113,6 +113,7 @@ fn signed_bodies_and_grants_survive_mutation() {
                 key: Bytes::new(),
                 oldest: 1,
                 next: 2,
+                recover: 1,
             }],
             entry: Some(Box::new(entry.clone())),
         }),

@@ -51,7 +51,7 @@ fn a_new_epoch_loses_nothing_whichever_comes_first() {
 
 #[test]
 fn epochs_open_in_any_order_until_they_are_retired() {
-    let mut source = source(SUITE, 0);
+    let mut source = unrecovered(SUITE, 5);
     let mut sink = sink(SUITE, &[&source]);
     let mut packets = published(&mut source, bytes(1), false);
     for epoch in 2..=4 {
@@ -133,7 +133,7 @@ fn what_no_grant_explains_is_given_up() {
 
 #[test]
 fn parking_is_bounded_and_takes_only_what_opens() {
-    let mut unknown = source_with(SUITE, config(6, 0));
+    let mut unknown = unrecovered(SUITE, 6);
     let mut sink = sink(SUITE, &[]);
     let mut forged = published(&mut unknown, bytes(1), false).remove(0);
     forged.header.seq = 77;
@@ -193,7 +193,8 @@ fn recorded_packets_are_nothing_to_a_fresh_sink() {
                 let mut readdressed = packet.clone();
                 readdressed.header.to = Some(id);
                 let refused = fresh.handle_packet(&readdressed);
-                assert_eq!(refused, Err(OpenError::Forged.into()));
+                let floor = refused == Err(SinkDrop::BelowFloor) && !transient_local;
+                assert!(floor || refused == Err(OpenError::Forged.into()), "{refused:?}");
                 readdressed.header.to = None;
                 readdressed.header.seq = readdressed.header.seq.max(1) + 10;
                 assert_eq!(fresh.handle_packet(&readdressed), Err(OpenError::Forged.into()));

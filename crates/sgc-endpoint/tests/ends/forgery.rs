@@ -24,7 +24,7 @@ fn batch(source: &mut Source, count: usize) -> Vec<Packet> {
 #[test]
 fn any_altered_bit_is_detected() {
     for suite in Suite::ALL {
-        let mut source = source(suite, 0);
+        let mut source = unrecovered(suite, 5);
         let mut fresh = sink(suite, &[&source]);
         // One that knows the batch already, whose checks are others.
         let mut knowing = sink(suite, &[&source]);
@@ -66,7 +66,7 @@ fn any_altered_bit_is_detected() {
 #[test]
 fn trailers_of_impossible_lengths_and_places_are_refused() {
     let suite = Suite::Standard;
-    let mut source = source(suite, 0);
+    let mut source = unrecovered(suite, 5);
     let mut sink = sink(suite, &[&source]);
     let good = batch(&mut source, 7).swap_remove(6);
     let payload = text(&good);
@@ -103,7 +103,7 @@ fn trailers_of_impossible_lengths_and_places_are_refused() {
 fn every_size_of_batch_verifies_whatever_is_lost_in_any_order() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     for suite in [Suite::Standard, Suite::Paper] {
-        let mut source = source(suite, 0);
+        let mut source = unrecovered(suite, 5);
         let mut sink = sink(suite, &[&source]);
         for count in 1..=BATCH_PACKETS_MAX {
             let mut packets = batch(&mut source, count);
@@ -121,7 +121,7 @@ fn every_size_of_batch_verifies_whatever_is_lost_in_any_order() {
 #[test]
 fn mingled_batches_are_each_verified_once() {
     let suite = Suite::Standard;
-    let mut source = source(suite, 0);
+    let mut source = unrecovered(suite, 5);
     let mut sink = sink(suite, &[&source]);
     let batches: Vec<_> = (0..4).map(|_| batch(&mut source, 64)).collect();
     let mingled: Vec<_> = (0..64).flat_map(|n| batches.iter().map(move |b| b[n].clone())).collect();

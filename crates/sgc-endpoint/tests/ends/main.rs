@@ -5,11 +5,14 @@ mod epochs;
 mod forgery;
 mod messages;
 mod nonces;
+mod recovery;
 
 use std::sync::OnceLock;
 
 use bytes::Bytes;
-use sgc_endpoint::{Delivery, Message, Sink, SinkDrop, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{
+    AskAgain, Delivery, Message, RecoveryLimits, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
+};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
     Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
@@ -41,6 +44,7 @@ fn config(id: u8, history_depth: usize) -> SourceConfig {
         reliable: true,
         history_depth,
         history_bytes_max: 1 << 20,
+        recovery: RecoveryLimits::default(),
     }
 }
 
@@ -50,6 +54,11 @@ fn source(suite: Suite, history_depth: usize) -> Source {
 
 fn source_with(suite: Suite, config: SourceConfig) -> Source {
     Source::new(config, &grant(suite, 1, &[]), message_key(suite)).expect("the key is of the suite")
+}
+
+/// A source whose messages stay lost if they are, and are delivered in any order.
+fn unrecovered(suite: Suite, id: u8) -> Source {
+    source_with(suite, SourceConfig { recovery: RecoveryLimits::NONE, ..config(id, 0) })
 }
 
 /// A sink that was told of these sources as they are now, in epoch 1.
@@ -73,9 +82,14 @@ fn flushed(source: &mut Source) -> Vec<Packet> {
     packets
 }
 
+/// What a late joiner gets.
 fn replayed(source: &mut Source) -> Vec<Packet> {
+    replayed_to(source, SINK, 0)
+}
+
+fn replayed_to(source: &mut Source, sink: SinkId, from: u64) -> Vec<Packet> {
     let mut packets = Vec::new();
-    source.replay(SINK, 1, u64::MAX, |p| packets.push(p));
+    source.replay(sink, from, u64::MAX, |p| packets.push(p));
     packets
 }
 

@@ -52,7 +52,7 @@ fn a_message_is_delivered_once_however_often_it_comes() {
 
 #[test]
 fn nothing_waits_without_more_and_a_batch_is_signed_once() {
-    let mut source = source(Suite::Standard, 0);
+    let mut source = unrecovered(Suite::Standard, 5);
     let mut sink = sink(Suite::Standard, &[&source]);
     assert_eq!(published(&mut source, bytes(10), false).len(), 1);
     // Message 1 was not seen by the sink; the rest comes in one batch.
@@ -98,7 +98,7 @@ fn batches_are_full_at_64_packets_and_leave() {
 
 #[test]
 fn incomplete_messages_are_bounded_and_counted() {
-    let mut source = source(Suite::Standard, 0);
+    let mut source = unrecovered(Suite::Standard, 5);
     let limits = SinkLimits { partial_bytes_max: 200_000, ..SinkLimits::default() };
     let announced = grant(Suite::Standard, 1, &[source.announce()]);
     let mut sink = Sink::new(NAME, SINK, announced, false, limits);
@@ -130,19 +130,24 @@ fn a_late_joiner_gets_the_history_first_and_each_message_once() {
         let live = published(&mut source, bytes(6), false);
         assert_eq!(sink.handle_packet(&live[0]), Ok(Delivery::NeedsHistory(source.id())));
         assert_eq!(sink.handle_packet(&live[0]), Err(SinkDrop::AwaitingHistory));
-        let history = replayed(&mut source);
-        assert_eq!(delivered(&mut sink, &history), [4, 5, 6].map(bytes));
+        // All that was there when it joined, and what came since.
+        assert_eq!(sink.ask(source.id()), Some(3));
+        let history = replayed_to(&mut source, SINK, 3);
+        assert_eq!(delivered(&mut sink, &history), [3, 4, 5, 6].map(bytes));
         assert_eq!(sink.unsynced().count(), 0);
         assert_eq!(delivered(&mut sink, &live).len(), 0);
         let next = published(&mut source, bytes(7), false);
         assert_eq!(delivered(&mut sink, &next), [bytes(7)]);
-        // The way changed: history again, nothing twice.
-        let id = SinkId([3; 16]);
-        regranted(&mut sink, id, late);
-        assert!(sink.expect(source.id()));
-        let mut history = Vec::new();
-        source.replay(id, 1, u64::MAX, |p| history.push(p));
-        assert_eq!(delivered(&mut sink, &history).len(), 0);
+        // The way changed: only what was lost, nothing twice.
+        let here = grant(suite, 1, &[source.announce()]);
+        regranted(&mut sink, SinkId([3; 16]), here);
+        assert_eq!(sink.unsynced().count(), 0, "nothing was lost");
+        published(&mut source, bytes(8), false);
+        let id = SinkId([4; 16]);
+        regranted(&mut sink, id, grant(suite, 1, &[source.announce()]));
+        assert_eq!(sink.ask(source.id()), Some(8));
+        let history = replayed_to(&mut source, id, 8);
+        assert_eq!((history.len(), delivered(&mut sink, &history)), (2, vec![bytes(8)]));
         assert_eq!(sink.unsynced().count(), 0);
     }
 }

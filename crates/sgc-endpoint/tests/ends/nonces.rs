@@ -35,7 +35,10 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut dice = move |n: u32| rng.next_u32() % n;
         let (mut sealed, mut epoch, mut incarnation) = (Sealed::default(), 1, 0u8);
-        let mut source = source_with(suite, config(incarnation, 4));
+        // So few that marks of what is gone go ahead of many an answer.
+        let recovery = RecoveryLimits { messages_max: 6, bytes_max: 1 << 20 };
+        let config = |id| SourceConfig { recovery, ..config(id, 4) };
+        let mut source = source_with(suite, config(incarnation));
         let (mut replays, mut live) = (0, 0);
         for _ in 0..300 {
             let mut packets = Vec::new();
@@ -48,9 +51,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
                 1 if incarnation < 40 => {
                     // The process restarts; the topic's key may live on.
                     incarnation += 1;
-                    source =
-                        Source::new(config(incarnation, 4), &grant(suite, epoch, &[]), message_key(suite))
-                            .unwrap();
+                    source = Source::new(config(incarnation), &grant(suite, epoch, &[]), message_key(suite))
+                        .unwrap();
                 }
                 2..=5 => {
                     let sink = SinkId([dice(3) as u8; 16]);
@@ -58,6 +60,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
                     source.replay(sink, from, from + u64::from(dice(1000)), |p| packets.push(p));
                     replays += packets.len();
                 }
+                6 => source.mark(|p| packets.push(p)),
+                7 => source.record(&HEAD, vec![dice(256) as u8; 100].into()).unwrap(),
                 n => {
                     let payload = vec![dice(256) as u8; dice(40_000) as usize];
                     let head = MessageHead { source_timestamp_ns: i64::from(dice(1000)), ..HEAD };

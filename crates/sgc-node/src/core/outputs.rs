@@ -118,8 +118,10 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::OwnGrant { name, grant } => self.own_grant(name, grant),
             Event::Recover(recover) => {
-                if let Some(share) = self.shares.get(&recover.name) {
-                    share.replay(recover, &self.replays);
+                if let Some(share) = self.shares.get(&recover.name)
+                    && !self.replays.ask(share.clone(), recover)
+                {
+                    self.control_drops.count("replays_full");
                 }
             }
             Event::Granted { name, sink, grant } => {

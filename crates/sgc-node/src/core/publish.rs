@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{Source, SourceConfig, Wish};
+use sgc_endpoint::{RecoveryLimits, Source, SourceConfig, Wish};
 use sgc_ros::RosNetwork;
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
@@ -94,9 +94,17 @@ impl<N: RosNetwork> Core<N> {
             Some(_) | None => {
                 publishing.grant = Some(grant.clone());
                 publishing.next = None;
+                // Nobody can ask a source that is not the owner's.
                 let (id, class, reliable) = (publishing.id, publishing.class, publishing.reliable);
-                let config =
-                    SourceConfig { name, id, class, reliable, history_depth: 0, history_bytes_max: 0 };
+                let config = SourceConfig {
+                    name,
+                    id,
+                    class,
+                    reliable,
+                    history_depth: 0,
+                    history_bytes_max: 0,
+                    recovery: RecoveryLimits::NONE,
+                };
                 let key = self.message_key(grant.suite);
                 let source = key.and_then(|key| Source::new(config, grant, key));
                 if let (Some(source), Some(share)) = (source, self.shares.get(&name)) {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_endpoint::{Source, SourceConfig, Wish};
+use sgc_endpoint::{AskAgain, RecoveryLimits, Source, SourceConfig, Wish};
 use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Sample, SampleHandler};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
@@ -119,6 +119,7 @@ impl<N: RosNetwork> Core<N> {
                 reliable: qos.is_reliable(),
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
+                recovery: RecoveryLimits::default(),
             };
             let source = Source::new(config, &grant, message_key.clone())?;
             Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
@@ -191,7 +192,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Asks for every history that a sink's writers still lack.
+    /// Asks for all that a sink's writers still lack.
     pub(super) fn ask_histories(&mut self, name: Name) {
         let Some(sink) = self.sinks.get(&name) else { return };
         for source in sink.unsynced() {
@@ -200,7 +201,22 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn ask_history(&mut self, name: Name, source: SourceId) {
-        self.endpoint.recover(name, source, 1, u64::MAX);
+        let from = self.sinks.get(&name).and_then(|sink| sink.ask(source));
+        self.recover(name, source, from.map_or(AskAgain::No, AskAgain::From));
+    }
+
+    /// The same, a while later.
+    pub(super) fn ask_history_again(&mut self, name: Name, source: SourceId) {
+        let again = self.sinks.get(&name).map_or(AskAgain::No, |sink| sink.ask_again(source));
+        self.recover(name, source, again);
+    }
+
+    fn recover(&mut self, name: Name, source: SourceId, ask: AskAgain) {
+        match ask {
+            AskAgain::No => return,
+            AskAgain::Wait => {}
+            AskAgain::From(from) => self.endpoint.recover(name, source, from, u64::MAX),
+        }
         self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
     }
 

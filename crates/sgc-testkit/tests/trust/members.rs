@@ -1,7 +1,7 @@
 //! Members, and routers that help them, who act as somebody else.
 
 use bytes::Bytes;
-use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, Source, SourceConfig};
+use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, RecoveryLimits, Source, SourceConfig};
 use sgc_testkit::{DataDrop, Member, NodeKey, World, WorldConfig, identity};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
@@ -22,6 +22,7 @@ fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, f
         reliable: true,
         history_depth: 0,
         history_bytes_max: 0,
+        recovery: RecoveryLimits::default(),
     };
     let suite = Suite::from_id(grant.suite).expect("a suite of this build");
     let mut source = Source::new(config, grant, MessageKey::generate(suite)).expect("a key that fits");

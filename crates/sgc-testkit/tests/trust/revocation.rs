@@ -86,7 +86,7 @@ fn a_removed_member_opens_nothing_of_the_new_epoch_with_the_keys_that_it_kept() 
     world.run(ms(500));
     // A router that colludes hands it everything that it sees.
     let seen: Vec<_> = packets(world, *west, *desk).into_iter().filter(|p| p.header.epoch == 2).collect();
-    assert_eq!(seen.len(), of_new_epoch.len());
+    assert!(seen.len() >= of_new_epoch.len(), "messages, and marks");
     let mut sink = Sink::new(world.name(*arm, "/chatter"), id, grant.clone(), false, SinkLimits::default());
     for packet in &seen {
         let _ = sink.handle_packet(packet);

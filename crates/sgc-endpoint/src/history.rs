@@ -1,0 +1,233 @@
+//! What a source keeps of what it published: for late joiners, and for who lost something on the way.
+//!
+//! One queue of consecutive numbers serves both; each has its own end of it. Payloads are references.
+
+use std::collections::VecDeque;
+
+use bytes::Bytes;
+use sgc_wire::{MessageHead, MessageKind};
+
+/// Messages that a reliable source keeps for who lost them.
+pub const RECOVERY_MESSAGES_MAX: usize = 4096;
+/// Bytes of those; the newest message is kept whatever its size.
+pub const RECOVERY_BYTES_MAX: usize = 16 << 20;
+
+/// What a kept message counts beyond its payload, bytes.
+const KEPT_OVERHEAD_BYTES: usize = 64;
+
+/// How much a reliable source keeps for who lost it. By number and bytes alone: that bounds memory as it is, and a
+/// bound by age would take away what is asked for after a long interruption, when nobody else has it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RecoveryLimits {
+    /// Messages, marks among them; 0 if what is lost stays lost.
+    pub messages_max: usize,
+    /// Bytes.
+    pub bytes_max: usize,
+}
+
+impl RecoveryLimits {
+    /// Nothing: nobody can ask for it.
+    pub const NONE: Self = Self { messages_max: 0, bytes_max: 0 };
+}
+
+impl Default for RecoveryLimits {
+    fn default() -> Self {
+        Self { messages_max: RECOVERY_MESSAGES_MAX, bytes_max: RECOVERY_BYTES_MAX }
+    }
+}
+
+/// A message as it was published.
+pub(crate) struct Kept {
+    pub(crate) seq: u64,
+    pub(crate) head: MessageHead,
+    pub(crate) payload: Bytes,
+}
+
+impl Kept {
+    pub(crate) fn is_mark(&self) -> bool {
+        self.head.kind == MessageKind::Mark
+    }
+
+    fn bytes(&self) -> usize {
+        self.payload.len() + KEPT_OVERHEAD_BYTES
+    }
+}
+
+/// The newest part of the queue, for one of its purposes.
+struct Tail {
+    from: u64,
+    numbers: usize,
+    /// Numbers that are no marks.
+    messages: usize,
+    bytes: usize,
+}
+
+impl Tail {
+    fn add(&mut self, kept: &Kept) {
+        self.numbers += 1;
+        self.messages += usize::from(!kept.is_mark());
+        self.bytes += kept.bytes();
+    }
+
+    fn drop_first(&mut self, first: &Kept) {
+        self.from = first.seq + 1;
+        self.numbers -= 1;
+        self.messages -= usize::from(!first.is_mark());
+        self.bytes -= first.bytes();
+    }
+}
+
+pub(crate) struct History {
+    depth: usize,
+    bytes_max: usize,
+    recovery: RecoveryLimits,
+    /// Consecutive numbers, up to the last published.
+    kept: VecDeque<Kept>,
+    /// What late joiners get.
+    late: Tail,
+    /// What is there to be recovered.
+    recent: Tail,
+}
+
+impl History {
+    /// Keeps `depth` messages of at most `bytes_max` for late joiners.
+    pub(crate) fn new(depth: usize, bytes_max: usize, recovery: RecoveryLimits) -> Self {
+        let tail = || Tail { from: 1, numbers: 0, messages: 0, bytes: 0 };
+        Self { depth, bytes_max, recovery, kept: VecDeque::new(), late: tail(), recent: tail() }
+    }
+
+    /// Takes the next message.
+    pub(crate) fn push(&mut self, message: Kept) {
+        let next = message.seq + 1;
+        self.late.add(&message);
+        self.recent.add(&message);
+        self.kept.push_back(message);
+        let front = self.kept.front().map_or(next, |m| m.seq);
+        let at = |tail: &Tail| (tail.from - front) as usize;
+        // Marks are small, and count for late joiners in nothing but bytes.
+        while self.depth > 0
+            && (self.late.messages > self.depth || self.late.bytes > self.bytes_max)
+            && let Some(first) = self.kept.get(at(&self.late))
+            && (first.is_mark() || self.late.messages > 1)
+        {
+            self.late.drop_first(first);
+        }
+        while self.recovery.messages_max > 0
+            && (self.recent.numbers > self.recovery.messages_max
+                || self.recent.bytes > self.recovery.bytes_max)
+            && let Some(first) = self.kept.get(at(&self.recent))
+            && (first.is_mark() || self.recent.messages > 1)
+        {
+            self.recent.drop_first(first);
+        }
+        if self.depth == 0 {
+            self.late = Tail { from: next, numbers: 0, messages: 0, bytes: 0 };
+        }
+        if self.recovery.messages_max == 0 {
+            self.recent = Tail { from: next, numbers: 0, messages: 0, bytes: 0 };
+        }
+        let from = self.late.from.min(self.recent.from);
+        while self.kept.front().is_some_and(|m| m.seq < from) {
+            self.kept.pop_front();
+        }
+    }
+
+    /// Where the history for late joiners begins: the next number if there is none.
+    pub(crate) fn late_from(&self) -> u64 {
+        self.late.from
+    }
+
+    /// The oldest number that is here; the next one if there is none.
+    pub(crate) fn oldest(&self) -> u64 {
+        self.late.from.min(self.recent.from)
+    }
+
+    /// The number published last, if it is here.
+    pub(crate) fn newest(&self) -> Option<&Kept> {
+        self.kept.back()
+    }
+
+    pub(crate) fn newest_mut(&mut self) -> Option<&mut Kept> {
+        self.kept.back_mut()
+    }
+
+    /// What is here of `from..=to`, as references that outlive a change.
+    pub(crate) fn range(&self, from: u64, to: u64) -> Vec<(u64, MessageHead, Bytes)> {
+        let begin = self.kept.partition_point(|m| m.seq < from);
+        let asked = self.kept.iter().skip(begin).take_while(|m| m.seq <= to);
+        asked.map(|m| (m.seq, m.head, m.payload.clone())).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn history(depth: usize, bytes_max: usize, messages_max: usize, recovery_bytes_max: usize) -> History {
+        History::new(depth, bytes_max, RecoveryLimits { messages_max, bytes_max: recovery_bytes_max })
+    }
+
+    fn push(history: &mut History, kind: MessageKind, bytes: usize) {
+        let seq = history.newest().map_or(history.oldest(), |m| m.seq + 1);
+        let head = MessageHead { kind, source_timestamp_ns: 0 };
+        history.push(Kept { seq, head, payload: vec![0; bytes].into() });
+    }
+
+    fn seqs(history: &History, from: u64) -> Vec<u64> {
+        history.range(from, u64::MAX).iter().map(|(seq, ..)| *seq).collect()
+    }
+
+    #[test]
+    fn each_purpose_has_its_own_bounds() {
+        let mut history = history(2, 10_000, 5, 10_000);
+        for _ in 0..8 {
+            push(&mut history, MessageKind::Write, 10);
+        }
+        assert_eq!((history.late_from(), history.oldest()), (7, 4));
+        assert_eq!(seqs(&history, 0), [4, 5, 6, 7, 8]);
+        assert_eq!(seqs(&history, 7), [7, 8]);
+        assert_eq!(seqs(&history, 9), []);
+    }
+
+    #[test]
+    fn marks_take_no_place_of_late_joiners() {
+        let mut history = history(2, 10_000, 4, 10_000);
+        for kind in [MessageKind::Write, MessageKind::Write, MessageKind::Mark, MessageKind::Mark] {
+            push(&mut history, kind, 8);
+        }
+        assert_eq!((history.late_from(), history.oldest()), (1, 1));
+        for _ in 0..5 {
+            push(&mut history, MessageKind::Mark, 8);
+        }
+        assert_eq!(seqs(&history, history.late_from()).len(), 9);
+        push(&mut history, MessageKind::Write, 8);
+        assert_eq!((history.late_from(), seqs(&history, 2).len()), (2, 9));
+    }
+
+    #[test]
+    fn the_newest_message_stays_whatever_its_size() {
+        for depth in [0, 3] {
+            let mut history = history(depth, 1000, 100, 1000);
+            push(&mut history, MessageKind::Write, 500);
+            push(&mut history, MessageKind::Write, 5000);
+            assert_eq!(seqs(&history, 0), [2]);
+            push(&mut history, MessageKind::Mark, 8);
+            assert_eq!(seqs(&history, 0), [2, 3]);
+            push(&mut history, MessageKind::Write, 10);
+            assert_eq!((seqs(&history, 0).last(), history.oldest() > 2), (Some(&4), true));
+        }
+    }
+
+    #[test]
+    fn without_a_purpose_nothing_is_kept() {
+        let mut history = history(0, 1000, 0, 0);
+        for n in 1..4 {
+            history.push(Kept {
+                seq: n,
+                head: MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 },
+                payload: Bytes::from_static(b"x"),
+            });
+            assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (n + 1, n + 1, 0));
+        }
+    }
+}
