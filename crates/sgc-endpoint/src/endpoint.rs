@@ -342,6 +342,7 @@ impl Endpoint {
             Control::Interest { .. } | Control::Uninterest { .. } => self.unexpected("interest"),
             Control::Goodbye => self.unexpected("goodbye"),
             Control::Crl { .. } => self.unexpected("revocation list"),
+            Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
         }
     }
 

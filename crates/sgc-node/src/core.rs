@@ -539,6 +539,8 @@ impl<N: RosNetwork> Core<N> {
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
+                labels_sent: entry.control.labels_known(),
+                labels_received: entry.link.labels_defined(),
             }
         });
         let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));

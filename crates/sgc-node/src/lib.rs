@@ -13,6 +13,7 @@ mod core;
 mod credentials;
 mod dataplane;
 mod fleet_file;
+mod labels;
 mod links;
 mod message_keys;
 mod node;

@@ -53,6 +53,10 @@ pub struct LinkStatus {
     pub sent_bytes: u64,
     /// Bytes received.
     pub received_bytes: u64,
+    /// Names that this node sends packets of under labels.
+    pub labels_sent: u32,
+    /// Names that the peer may send packets of under labels.
+    pub labels_received: u32,
 }
 
 /// A share or a use.

@@ -360,6 +360,9 @@ impl Router {
             Control::Recover(recover) => self.handle_recover(link, recover),
             Control::Crl { der } => self.handle_crl(now, link, &der),
             Control::Ack { name, sink, serial } => self.handle_ack(link, name, sink, serial),
+            Control::Label { .. } | Control::LabelAck { .. } => {
+                self.drop_frame(link, DropReason::Unknown { what: "label" });
+            }
             Control::Goodbye => {
                 self.outputs.push_back(Output::Close { link, reason: LinkClose::Goodbye });
                 self.forget_link(link);
