@@ -19,6 +19,7 @@ mod message_keys;
 mod node;
 mod outflow;
 pub mod partners;
+mod peer_rate;
 pub mod policy;
 mod queue;
 mod reload;

@@ -7,8 +7,10 @@ use std::time::Duration;
 
 use rand_core::{OsRng, TryRngCore};
 use sgc_router::LinkId;
-use sgc_transport::{AnyLink, CloseReason, Dialer, FlowError, Link, LinkError, LinkUrl, Listener};
-use sgc_wire::{Control, Decode, DecodeError, Encode, Name};
+use sgc_transport::{
+    AnyLink, CloseReason, Dialer, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
+};
+use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
@@ -17,6 +19,7 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
 use crate::labels::{LabelBook, NameLabel, Progress};
+use crate::peer_rate::PeerRate;
 use crate::stats::DataDrop;
 
 /// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
@@ -269,8 +272,9 @@ fn spawn_tasks(
 ) {
     tokio::spawn(send_control(link.clone(), outgoing));
     tokio::spawn(reader.run());
-    tokio::spawn(receive_flows(link.clone(), id, data.clone()));
-    tokio::spawn(receive_datagrams(link.clone(), id, data));
+    let inflow = Inflow::new(link, id, data);
+    tokio::spawn(inflow.clone().accept_flows());
+    tokio::spawn(inflow.read_datagrams());
 }
 
 async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
@@ -334,42 +338,98 @@ impl ControlRx {
     }
 }
 
-async fn receive_flows(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
-    while let Ok(mut flow) = link.accept_flow().await {
-        let (data, remote) = (data.clone(), link.remote());
-        tokio::spawn(async move {
-            loop {
-                match flow.recv().await {
-                    Ok(Some(packet)) => data.forward(id, packet).await,
-                    Ok(None) => return,
-                    Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
-                    Err(error) => {
-                        // Cut short is what a lost link looks like; anything else is the peer's doing.
-                        let reason = match &error {
-                            FlowError::Truncated => None,
-                            FlowError::Packet(error) => Some(malformed(error)),
-                            _ => Some(DataDrop::Malformed),
-                        };
-                        if reason.is_some_and(|reason| data.drops().count_from(reason.key(), id)) {
-                            warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
-                        }
-                        debug!(link = id.0, %remote, %error, "flow ended early");
-                        return;
-                    }
-                }
-            }
-        });
-    }
+/// Brings what comes over a link into the data path, within what its peer may send.
+#[derive(Clone)]
+struct Inflow {
+    link: AnyLink,
+    id: LinkId,
+    data: Arc<DataPlane>,
+    rate: Option<Arc<PeerRate>>,
 }
 
-async fn receive_datagrams(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
-    while let Ok(received) = link.recv_datagram().await {
-        match received {
-            Ok(packet) => data.forward(id, packet).await,
-            Err(error) => {
-                debug!(link = id.0, %error, "malformed datagram");
-                if data.drops().count_from(malformed(&error).key(), id) {
-                    warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
+/// What becomes of a packet.
+enum Admission {
+    /// It goes on.
+    Granted,
+    /// It is dropped, and so is what follows of its message.
+    OverRate,
+    /// The link ended meanwhile.
+    LinkEnded,
+}
+
+impl Inflow {
+    fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>) -> Self {
+        let rate = data.rates().of(link.peer().node_id);
+        Self { link: link.clone(), id, data, rate }
+    }
+
+    /// A message that cannot wait is judged by its beginning; one that is under way is slowed like a reliable one.
+    async fn admit(&self, packet: &Packet) -> Admission {
+        let Some(rate) = &self.rate else { return Admission::Granted };
+        let bytes = packet.encoded_bytes();
+        if !packet.header.reliable && packet.header.index == 0 {
+            return if rate.take_now(bytes) { Admission::Granted } else { Admission::OverRate };
+        }
+        let wait = rate.take_later(bytes);
+        if wait.is_zero() {
+            return Admission::Granted;
+        }
+        tokio::select! {
+            () = tokio::time::sleep(wait) => Admission::Granted,
+            _ = self.link.closed() => Admission::LinkEnded,
+        }
+    }
+
+    async fn accept_flows(self) {
+        while let Ok(flow) = self.link.accept_flow().await {
+            tokio::spawn(self.clone().read_flow(flow));
+        }
+    }
+
+    async fn read_flow(self, mut flow: FlowRx) {
+        let (id, data, remote) = (self.id, &self.data, self.link.remote());
+        loop {
+            match flow.recv().await {
+                Ok(Some(packet)) => match self.admit(&packet).await {
+                    Admission::Granted => data.forward(id, packet).await,
+                    Admission::OverRate if packet.header.fragments() == 1 => {}
+                    Admission::OverRate => return flow.stop(FlowEnd::Stale),
+                    Admission::LinkEnded => return,
+                },
+                Ok(None) => return,
+                Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
+                Err(error) => {
+                    // Cut short is what a lost link looks like; anything else is the peer's doing.
+                    let reason = match &error {
+                        FlowError::Truncated => None,
+                        FlowError::Packet(error) => Some(malformed(error)),
+                        _ => Some(DataDrop::Malformed),
+                    };
+                    if reason.is_some_and(|reason| data.drops().count_from(reason.key(), id)) {
+                        warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
+                    }
+                    debug!(link = id.0, %remote, %error, "flow ended early");
+                    return;
+                }
+            }
+        }
+    }
+
+    async fn read_datagrams(self) {
+        let (id, data) = (self.id, &self.data);
+        while let Ok(received) = self.link.recv_datagram().await {
+            match received {
+                // Whatever it says of itself, a datagram keeps those behind it waiting.
+                Ok(packet) => {
+                    if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
+                        data.forward(id, packet).await;
+                    }
+                }
+                Err(error) => {
+                    debug!(link = id.0, %error, "malformed datagram");
+                    if data.drops().count_from(malformed(&error).key(), id) {
+                        warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
+                    }
                 }
             }
         }

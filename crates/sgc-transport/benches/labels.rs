@@ -62,36 +62,37 @@ fn main() {
         let (near, far) = (near.unwrap(), far.unwrap().unwrap());
         let label = Label::new(0);
         far.define_label(label.unwrap(), Name([1; 32])).unwrap();
-        println!("{:<22}{:>12}{:>12}{:>8}", "a packet", "name", "label", "ratio");
+        println!("{:<26}{:>12}{:>12}{:>8}", "a packet", "name", "label", "ratio");
         for message in [16, 100, 1000] {
-            let (mut bytes, mut rates) = ([vec![], vec![]], [vec![], vec![]]);
+            let (mut bytes, mut rates, mut costs) = ([vec![], vec![]], [vec![], vec![]], [vec![], vec![]]);
             for round in 0..2 * ROUNDS {
                 let form = (round + round / 2) % 2;
-                let (sent, rate) = measure(&near, &far, message, label.filter(|_| form == 1)).await;
+                let (sent, rate, cost) = measure(&near, &far, message, label.filter(|_| form == 1)).await;
                 bytes[form].push(sent);
                 rates[form].push(rate);
+                costs[form].push(cost);
             }
-            let [named, labelled] = bytes.map(median);
-            println!(
-                "{:<22}{named:>12.1}{labelled:>12.1}{:>8.2}",
-                format!("{message} B: bytes"),
-                labelled / named
-            );
-            let [named, labelled] = rates.map(median);
-            println!(
-                "{:<22}{named:>12.0}{labelled:>12.0}{:>8.2}",
-                format!("{message} B: a second"),
-                labelled / named
-            );
+            for (what, all) in [("bytes", bytes), ("packets a second", rates), ("CPU, ns", costs)] {
+                let [named, labelled] = all.map(median);
+                let what = format!("{message} B: {what}");
+                println!("{what:<26}{named:>12.1}{labelled:>12.1}{:>8.2}", labelled / named);
+            }
         }
         near.close(CloseReason::Goodbye);
         dialer.close(CloseReason::Goodbye).await;
     });
 }
 
-/// Bytes of a packet, and packets a second, over a flow of its own.
-async fn measure(near: &AnyLink, far: &AnyLink, message: usize, label: Option<Label>) -> (f64, f64) {
-    let (packet, before) = (packet(1, message), near.stats().sent_bytes);
+/// CPU time of the process's threads until now, nanoseconds: less than the clock's it depends on what else runs.
+fn cpu_ns() -> f64 {
+    let tasks = std::fs::read_dir("/proc/self/task").unwrap().flatten();
+    let times = tasks.filter_map(|t| std::fs::read_to_string(t.path().join("schedstat")).ok());
+    times.filter_map(|t| t.split(' ').next()?.parse::<f64>().ok()).sum()
+}
+
+/// Bytes of a packet, packets a second, and CPU time of a packet at both ends, over a flow of its own.
+async fn measure(near: &AnyLink, far: &AnyLink, message: usize, label: Option<Label>) -> (f64, f64, f64) {
+    let (packet, before, cpu) = (packet(1, message), near.stats().sent_bytes, cpu_ns());
     let begun = Instant::now();
     let mut flow = near.open_flow(Class::Default).await.unwrap();
     let sender = tokio::spawn(async move {
@@ -110,7 +111,8 @@ async fn measure(near: &AnyLink, far: &AnyLink, message: usize, label: Option<La
     let took = begun.elapsed().as_secs_f64();
     sender.await.unwrap();
     let sent = near.stats().sent_bytes - before;
-    (sent as f64 / PACKETS as f64, PACKETS as f64 / took)
+    let all = PACKETS as f64;
+    (sent as f64 / all, all / took, (cpu_ns() - cpu) / all)
 }
 
 fn median(mut all: Vec<f64>) -> f64 {
