@@ -12,6 +12,10 @@ use crate::framing::{Pieces, packet_head};
 use crate::labels::Labels;
 use crate::quic;
 
+/// Payloads up to this are copied behind their header: what that costs is less than what a transport takes to keep
+/// another piece (quinn looks through all that are not acknowledged for each that it sends).
+const JOINED_PAYLOAD_BYTES_MAX: usize = 1024;
+
 /// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once.
 #[derive(Debug)]
 pub struct FlowTx {
@@ -29,7 +33,8 @@ impl FlowTx {
         Self { outlet, has_begun: false }
     }
 
-    /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied.
+    /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied, unless it is
+    /// short.
     ///
     /// If the future is dropped, the packet is either not sent at all or sent as a whole before the next.
     pub async fn send(&mut self, packet: &Packet) -> Result<(), LinkError> {
@@ -39,11 +44,12 @@ impl FlowTx {
     /// Sends a packet with this label in place of its name, if there is one: the peer must have said that it knows
     /// what it stands for. Otherwise as [`Self::send`].
     pub async fn send_as(&mut self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let pieces = packet.payload.0.iter().filter(|p| !p.is_empty()).cloned();
+        let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
+        let pieces = packet.payload.0.iter().filter(|p| !joined && !p.is_empty()).cloned();
         match &mut self.outlet {
             Outlet::Quic(outlet) => {
                 outlet.flush().await?;
-                let head = packet_head(packet, label, !self.has_begun);
+                let head = packet_head(packet, label, !self.has_begun, joined);
                 self.has_begun = true;
                 outlet.queue(std::iter::once(head).chain(pieces));
                 outlet.flush().await

@@ -159,14 +159,20 @@ pub(crate) fn control_head(length: usize) -> Bytes {
     Bytes::copy_from_slice(&u32::try_from(length).unwrap_or(u32::MAX).to_be_bytes())
 }
 
-/// What stands before the payload of a packet in a flow, with the flow's version if it is the first.
-pub(crate) fn packet_head(packet: &Packet, label: Option<Label>, is_first: bool) -> Bytes {
-    let mut head = BytesMut::with_capacity(1 + LENGTH_BYTES + HEADER_BYTES_MAX);
+/// What stands before the payload of a packet in a flow, with the flow's version if it is the first; `joined` with the
+/// payload behind it.
+pub(crate) fn packet_head(packet: &Packet, label: Option<Label>, is_first: bool, joined: bool) -> Bytes {
+    let payload_bytes = if joined { packet.payload.len() } else { 0 };
+    let header_bytes = packet.header.encoded_bytes_as(label);
+    let mut head = BytesMut::with_capacity(1 + LENGTH_BYTES + header_bytes + payload_bytes);
     if is_first {
         head.put_u8(FLOW_VERSION);
     }
     head.put_u32(u32::try_from(packet.encoded_bytes_as(label)).unwrap_or(u32::MAX));
     packet.header.put_as(label, &mut head);
+    if joined {
+        packet.payload.copy_into(&mut head);
+    }
     head.freeze()
 }
 
@@ -243,8 +249,10 @@ mod tests {
         let mut stream = Vec::new();
         for (index, p) in sent.iter().enumerate() {
             let label = Label::new(0).filter(|_| index > 2);
-            stream.extend_from_slice(&packet_head(p, label, index == 0));
-            p.payload.copy_into(&mut stream);
+            stream.extend_from_slice(&packet_head(p, label, index == 0, index == 1));
+            if index != 1 {
+                p.payload.copy_into(&mut stream);
+            }
         }
         for size in 1..=stream.len() {
             let mut pieces = pieces(&stream, size);
@@ -266,7 +274,7 @@ mod tests {
     #[test]
     fn payloads_are_slices_of_what_was_received() {
         let p = packet(&[7; 300], None);
-        let stream = Bytes::from([&packet_head(&p, None, false)[..], &[7; 300]].concat());
+        let stream = Bytes::from([&packet_head(&p, None, false, false)[..], &[7; 300]].concat());
         let (mut pieces, labels) = (Pieces::default(), Labels::default());
         pieces.push(stream.slice(..200));
         pieces.push(stream.slice(200..));
