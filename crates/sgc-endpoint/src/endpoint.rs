@@ -351,6 +351,7 @@ impl Endpoint {
             Control::Crl { .. } => self.unexpected("revocation list"),
             Control::LinkState { .. } => self.unexpected("link state"),
             Control::Query { .. } => self.unexpected("query"),
+            Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
         }
     }
 

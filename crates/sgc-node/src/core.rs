@@ -32,6 +32,7 @@ use crate::dataplane::DataPlane;
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
+use crate::peer_rate::PeerRates;
 use crate::replays::Replays;
 use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::LocalShare;
@@ -212,6 +213,8 @@ pub(crate) struct CoreParts<N> {
     pub identity: Arc<Identity>,
     /// What links are made with.
     pub credentials: CredentialStore,
+    /// What peers may send into this node.
+    pub(crate) rates: PeerRates,
     /// The fleet's file, if this node is the authority of its fleet.
     pub authority: Option<PathBuf>,
     /// Messages of one source under one key.
@@ -256,7 +259,7 @@ impl<N: RosNetwork> Core<N> {
             endpoint: parts.endpoint,
             routes: parts.routes,
             network: parts.network,
-            data: Arc::default(),
+            data: Arc::new(DataPlane::new(parts.rates)),
             links: BTreeMap::new(),
             look_due: None,
             next_link: 1,
@@ -547,6 +550,7 @@ impl<N: RosNetwork> Core<N> {
     fn status(&self) -> Status {
         let links = self.links.iter().map(|(id, entry)| {
             let stats = entry.link.stats();
+            let over = self.data.rates().over(&entry.link.peer().node_id);
             LinkStatus {
                 id: id.0,
                 peer: entry.link.peer().node_id.to_string(),
@@ -559,11 +563,16 @@ impl<N: RosNetwork> Core<N> {
                 silent: self.router.link_cost(*id).is_some_and(|(_, silent)| silent),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
+                labels_sent: entry.control.labels_known(),
+                labels_received: entry.link.labels_defined(),
+                peer_slowed: over.slowed,
+                peer_dropped: over.dropped,
             }
         });
         let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
         let mut drops = self.control_drops.snapshot();
         drops.extend(self.data.drops().snapshot());
+        drops.extend(self.data.rates().drops());
         drops.extend(self.ros_failures.snapshot());
         drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
         let router = self.router.stats();

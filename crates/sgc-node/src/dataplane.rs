@@ -14,6 +14,7 @@ use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
 use crate::outflow::OutFlow;
+use crate::peer_rate::PeerRates;
 use crate::sinks::LocalSink;
 use crate::stats::{DataDrop, Drops, NameStats};
 
@@ -50,15 +51,26 @@ impl Forward {
 pub(crate) struct DataPlane {
     shards: [ArcSwap<HashMap<Name, Arc<Forward>>>; SHARDS],
     drops: Drops,
+    rates: PeerRates,
 }
 
 impl Default for DataPlane {
     fn default() -> Self {
-        Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops: Drops::default() }
+        Self::new(PeerRates::default())
     }
 }
 
 impl DataPlane {
+    /// Empty tables.
+    pub(crate) fn new(rates: PeerRates) -> Self {
+        Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops: Drops::default(), rates }
+    }
+
+    /// What peers may send into it.
+    pub(crate) fn rates(&self) -> &PeerRates {
+        &self.rates
+    }
+
     /// Puts the forwarding of a name in place, or ends it.
     pub(crate) fn set(&self, name: Name, forward: Option<Forward>) {
         let shard = self.shard(&name);

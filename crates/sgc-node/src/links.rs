@@ -7,8 +7,10 @@ use std::time::Duration;
 
 use rand_core::{OsRng, TryRngCore};
 use sgc_router::LinkId;
-use sgc_transport::{AnyLink, CloseReason, Dialer, FlowError, Link, LinkError, LinkUrl, Listener};
-use sgc_wire::{Control, Decode, Encode};
+use sgc_transport::{
+    AnyLink, CloseReason, Dialer, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
+};
+use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
@@ -16,6 +18,8 @@ use tracing::{debug, info, warn};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
+use crate::labels::{LabelBook, NameLabel, Progress};
+use crate::peer_rate::PeerRate;
 use crate::stats::DataDrop;
 
 /// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
@@ -33,9 +37,21 @@ const GOODBYE_MAX: Duration = Duration::from_secs(1);
 /// Sends frames of the control task over a link, in order.
 pub(crate) struct ControlTx {
     frames: mpsc::Sender<Control>,
+    labels: LabelBook,
 }
 
 impl ControlTx {
+    /// The label of a name on this link, if it has one; a new one is told to the peer.
+    pub(crate) fn label(&mut self, name: Name) -> Option<NameLabel> {
+        let frames = &self.frames;
+        self.labels.label(name, |label| frames.try_send(Control::Label { label, name }).is_ok())
+    }
+
+    /// How many labels the peer knows.
+    pub(crate) fn labels_known(&self) -> u32 {
+        self.labels.known()
+    }
+
     /// Queues a frame; false if the peer is too far behind.
     pub(crate) fn send(&self, frame: Control) -> bool {
         self.frames.try_send(frame).is_ok()
@@ -187,11 +203,15 @@ impl Served {
         let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
         let (reply, id) = oneshot::channel();
         let (count, heard) = watch::channel(0);
-        let up = CoreEvent::LinkUp { link: link.clone(), url, control: ControlTx { frames }, reply };
+        let progress = Arc::<Progress>::default();
+        let control = ControlTx { frames: frames.clone(), labels: LabelBook::new(progress.clone()) };
+        let up = CoreEvent::LinkUp { link: link.clone(), url, control, reply };
         let id = match (core.send(up).await, id.await) {
             (Ok(()), Ok(Some((id, data)))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
-                spawn_tasks(&link, id, data, outgoing, count, core);
+                let reader =
+                    ControlRx { link: link.clone(), id, frames, progress, count, core: core.clone() };
+                spawn_tasks(&link, id, data, outgoing, reader);
                 Some(id)
             }
             _ => {
@@ -248,13 +268,13 @@ fn spawn_tasks(
     id: LinkId,
     data: Arc<DataPlane>,
     outgoing: mpsc::Receiver<Control>,
-    count: watch::Sender<u64>,
-    core: &mpsc::Sender<CoreEvent>,
+    reader: ControlRx,
 ) {
     tokio::spawn(send_control(link.clone(), outgoing));
-    tokio::spawn(receive_control(link.clone(), id, count, core.clone()));
-    tokio::spawn(receive_flows(link.clone(), id, data.clone()));
-    tokio::spawn(receive_datagrams(link.clone(), id, data));
+    tokio::spawn(reader.run());
+    let inflow = Inflow::new(link, id, data);
+    tokio::spawn(inflow.clone().accept_flows());
+    tokio::spawn(inflow.read_datagrams());
 }
 
 async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
@@ -266,64 +286,160 @@ async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
     }
 }
 
-async fn receive_control(
+/// Takes control frames in. Those about labels end here, the rest is the control task's.
+struct ControlRx {
     link: AnyLink,
     id: LinkId,
+    /// For acknowledgements.
+    frames: mpsc::Sender<Control>,
+    progress: Arc<Progress>,
+    /// How many frames came.
     count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
-) {
-    while let Ok(bytes) = link.recv_control().await {
-        match Control::from_slice(&bytes) {
-            Ok(frame) => {
-                if core.send(CoreEvent::Frame { link: id, frame }).await.is_err() {
-                    return;
+}
+
+impl ControlRx {
+    async fn run(self) {
+        while let Ok(bytes) = self.link.recv_control().await {
+            match self.take(Control::from_slice(&bytes)).await {
+                Ok(true) => self.count.send_modify(|n| *n += 1),
+                Ok(false) => return,
+                Err(error) => {
+                    let (link, remote) = (self.id.0, self.link.remote());
+                    warn!(link, %remote, error, "malformed control frame; the link is closed");
+                    let _ = self.core.send(CoreEvent::Malformed { link: self.id }).await;
+                    return self.link.close(CloseReason::Protocol(error));
                 }
-                count.send_modify(|n| *n += 1);
             }
-            Err(error) => {
-                warn!(link = id.0, remote = %link.remote(), %error, "malformed control frame; the link is closed");
-                let _ = core.send(CoreEvent::Malformed { link: id }).await;
-                return link.close(CloseReason::Protocol(error.to_string()));
+        }
+    }
+
+    /// False if no more is to be taken in; the error is the peer's.
+    async fn take(&self, frame: Result<Control, DecodeError>) -> Result<bool, String> {
+        let frame = frame.map_err(|error| error.to_string())?;
+        // What stands in the place of the greeting is the router's to judge.
+        let is_greeted = *self.count.borrow() > 0;
+        match frame {
+            Control::Label { label, name } if is_greeted => {
+                self.link.define_label(label, name).map_err(|error| error.to_string())?;
+                if self.frames.try_send(Control::LabelAck { label }).is_err() {
+                    warn!(link = self.id.0, remote = %self.link.remote(), "the peer does not take control frames; the link is closed");
+                    self.link.close(CloseReason::Overloaded);
+                    return Ok(false);
+                }
+                Ok(true)
             }
+            Control::LabelAck { label } if is_greeted => match self.progress.acknowledge(label) {
+                true => Ok(true),
+                false => Err(format!("label {} is acknowledged but was not given", label.index())),
+            },
+            frame => Ok(self.core.send(CoreEvent::Frame { link: self.id, frame }).await.is_ok()),
         }
     }
 }
 
-async fn receive_flows(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
-    while let Ok(mut flow) = link.accept_flow().await {
-        let (data, remote) = (data.clone(), link.remote());
-        tokio::spawn(async move {
-            loop {
-                match flow.recv().await {
-                    Ok(Some(packet)) => data.forward(id, packet).await,
-                    Ok(None) => return,
-                    Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
-                    Err(error) => {
-                        // Cut short is what a lost link looks like; anything else is the peer's doing.
-                        let broken = !matches!(error, FlowError::Truncated);
-                        if broken && data.drops().count_from(DataDrop::Malformed.key(), id) {
-                            warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
-                        }
-                        debug!(link = id.0, %remote, %error, "flow ended early");
-                        return;
+/// Brings what comes over a link into the data path, within what its peer may send.
+#[derive(Clone)]
+struct Inflow {
+    link: AnyLink,
+    id: LinkId,
+    data: Arc<DataPlane>,
+    rate: Option<Arc<PeerRate>>,
+}
+
+/// What becomes of a packet.
+enum Admission {
+    /// It goes on.
+    Granted,
+    /// It is dropped, and so is what follows of its message.
+    OverRate,
+    /// The link ended meanwhile.
+    LinkEnded,
+}
+
+impl Inflow {
+    fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>) -> Self {
+        let rate = data.rates().of(link.peer().node_id);
+        Self { link: link.clone(), id, data, rate }
+    }
+
+    /// A message that cannot wait is judged by its beginning; one that is under way is slowed like a reliable one.
+    async fn admit(&self, packet: &Packet) -> Admission {
+        let Some(rate) = &self.rate else { return Admission::Granted };
+        let bytes = packet.encoded_bytes();
+        if !packet.header.reliable && packet.header.index == 0 {
+            return if rate.take_now(bytes) { Admission::Granted } else { Admission::OverRate };
+        }
+        let wait = rate.take_later(bytes);
+        if wait.is_zero() {
+            return Admission::Granted;
+        }
+        tokio::select! {
+            () = tokio::time::sleep(wait) => Admission::Granted,
+            _ = self.link.closed() => Admission::LinkEnded,
+        }
+    }
+
+    async fn accept_flows(self) {
+        while let Ok(flow) = self.link.accept_flow().await {
+            tokio::spawn(self.clone().read_flow(flow));
+        }
+    }
+
+    async fn read_flow(self, mut flow: FlowRx) {
+        let (id, data, remote) = (self.id, &self.data, self.link.remote());
+        loop {
+            match flow.recv().await {
+                Ok(Some(packet)) => match self.admit(&packet).await {
+                    Admission::Granted => data.forward(id, packet).await,
+                    Admission::OverRate if packet.header.fragments() == 1 => {}
+                    Admission::OverRate => return flow.stop(FlowEnd::Stale),
+                    Admission::LinkEnded => return,
+                },
+                Ok(None) => return,
+                Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
+                Err(error) => {
+                    // Cut short is what a lost link looks like; anything else is the peer's doing.
+                    let reason = match &error {
+                        FlowError::Truncated => None,
+                        FlowError::Packet(error) => Some(malformed(error)),
+                        _ => Some(DataDrop::Malformed),
+                    };
+                    if reason.is_some_and(|reason| data.drops().count_from(reason.key(), id)) {
+                        warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
+                    }
+                    debug!(link = id.0, %remote, %error, "flow ended early");
+                    return;
+                }
+            }
+        }
+    }
+
+    async fn read_datagrams(self) {
+        let (id, data) = (self.id, &self.data);
+        while let Ok(received) = self.link.recv_datagram().await {
+            match received {
+                // Whatever it says of itself, a datagram keeps those behind it waiting.
+                Ok(packet) => {
+                    if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
+                        data.forward(id, packet).await;
+                    }
+                }
+                Err(error) => {
+                    debug!(link = id.0, %error, "malformed datagram");
+                    if data.drops().count_from(malformed(&error).key(), id) {
+                        warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
                     }
                 }
             }
-        });
+        }
     }
 }
 
-async fn receive_datagrams(link: AnyLink, id: LinkId, data: Arc<DataPlane>) {
-    while let Ok(received) = link.recv_datagram().await {
-        match received {
-            Ok(packet) => data.forward(id, packet).await,
-            Err(error) => {
-                debug!(link = id.0, %error, "malformed datagram");
-                if data.drops().count_from(DataDrop::Malformed.key(), id) {
-                    warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
-                }
-            }
-        }
+fn malformed(error: &DecodeError) -> DataDrop {
+    match error {
+        DecodeError::UnknownLabel { .. } => DataDrop::UnknownLabel,
+        _ => DataDrop::Malformed,
     }
 }
 
@@ -337,7 +453,7 @@ mod tests {
     use rand_core::OsRng;
     use sgc_transport::{CredentialStore, LinkOptions, RefusalKind, TransportMetrics};
     use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
-    use sgc_wire::Hello;
+    use sgc_wire::{Hello, Label};
 
     use super::*;
     use crate::core::now;
@@ -455,6 +571,48 @@ mod tests {
         async fn expect_up(&mut self, id: u32) {
             let (near, far) = (Self::cert(&self.router), Self::cert(&self.arm));
             self.expect(Told::Up(LinkId(id), near), Told::Up(LinkId(id), far)).await;
+        }
+    }
+
+    /// Greets as another node and gives so many labels, which are acknowledged; then sends this frame. How the link ends.
+    async fn end_after(labels: u32, frame: Control) -> CloseReason {
+        let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+        let addr = "quic://127.0.0.1:0".parse().unwrap();
+        let (router, arm) = (CredentialStore::new(enroll(&fleet, "router")), enroll(&fleet, "arm"));
+        let listener = Listener::bind(&addr, router, LinkOptions::default(), Arc::default()).unwrap();
+        let url = listener.local().to_string().parse().unwrap();
+        let (core, _told) = control_task(Arc::default(), Arc::default(), mpsc::channel(1).1);
+        let (_stop, stopped) = oneshot::channel();
+        tokio::spawn(keep_accepting(listener, core, stopped, Audit::default()));
+        let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
+        let link = soon(dialer.dial(&url)).await.unwrap();
+        let hello = Hello { minor: 0, incarnation: 9, transit: false };
+        link.send_control(Control::Hello(hello).to_bytes()).await.unwrap();
+        let heard = async || Control::from_slice(&soon(link.recv_control()).await.unwrap()).unwrap();
+        assert!(matches!(heard().await, Control::Hello(_)));
+        for index in 0..labels {
+            let label = Label::new(index).unwrap();
+            link.send_control(Control::Label { label, name: Name([1; 32]) }.to_bytes()).await.unwrap();
+            assert_eq!(heard().await, Control::LabelAck { label });
+        }
+        link.send_control(frame.to_bytes()).await.unwrap();
+        match soon(link.closed()).await {
+            LinkError::Closed { by_peer: true, reason } => reason,
+            end => panic!("{end}"),
+        }
+    }
+
+    #[tokio::test]
+    async fn labels_are_acknowledged_and_who_breaks_their_order_is_cut_off() {
+        let label = |index| Control::Label { label: Label::new(index).unwrap(), name: Name([2; 32]) };
+        let ack = Control::LabelAck { label: Label::new(0).unwrap() };
+        assert_eq!(end_after(3, Control::Goodbye).await, CloseReason::Goodbye);
+        for (labels, frame, why) in [
+            (1, label(0), "label 0 was given where 1 comes next"),
+            (1, label(2), "label 2 was given where 1 comes next"),
+            (1, ack, "label 0 is acknowledged but was not given"),
+        ] {
+            assert_eq!(end_after(labels, frame).await, CloseReason::Protocol(why.into()));
         }
     }
 

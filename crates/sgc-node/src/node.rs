@@ -28,6 +28,7 @@ use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
 use crate::links::{keep_accepting, keep_dialled};
 use crate::message_keys;
+use crate::peer_rate::PeerRates;
 use crate::reload::{ConfigSource, Reloader, Running};
 use crate::rules::{Rules, RulesError};
 use crate::state::{self, StateError};
@@ -287,6 +288,7 @@ pub async fn run_on<N: RosNetwork>(
         message_keys,
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
+        rates: PeerRates::new(config.peer_rate),
         keeper: Keeper::spawn(state.clone(), config.identity.clone(), alive.clone()),
         redial,
         alive,

@@ -12,6 +12,7 @@ use sgc_wire::{Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
 
+use crate::labels::NameLabel;
 use crate::queue::{PushError, Queue};
 use crate::stats::DataDrop;
 
@@ -36,7 +37,7 @@ pub(crate) struct OutFlow {
 
 impl OutFlow {
     /// Starts the task that sends; it ends when the flow is closed and empty, or the link ends.
-    pub(crate) fn spawn(link: AnyLink, name: Name) -> Arc<Self> {
+    pub(crate) fn spawn(link: AnyLink, name: Name, label: Option<NameLabel>) -> Arc<Self> {
         let flow = Arc::new(Self {
             queue: Queue::new(OUTFLOW_PACKETS_MAX),
             complete: AtomicUsize::new(0),
@@ -44,7 +45,7 @@ impl OutFlow {
         });
         let task = flow.clone();
         tokio::spawn(async move {
-            let mut sender = Sender { link, reliable: None, message: None };
+            let mut sender = Sender { link, label, reliable: None, message: None };
             while let Some((packet, since)) = task.queue.pop().await {
                 // Judged by its beginning: a large message that is under way goes on.
                 let begins = !packet.header.reliable && packet.header.index == 0;
@@ -143,6 +144,8 @@ fn ends_large_message(packet: &Packet) -> bool {
 /// The link's end.
 struct Sender {
     link: AnyLink,
+    /// Of the one name that all packets are of.
+    label: Option<NameLabel>,
     reliable: Option<FlowTx>,
     /// The best-effort message in several packets that is being sent: source and number, the next index, its flow.
     message: Option<((SourceId, u64), u16, FlowTx)>,
@@ -151,12 +154,13 @@ struct Sender {
 impl Sender {
     async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
         let header = &packet.header;
+        let label = self.label.as_ref().and_then(NameLabel::known);
         if header.reliable {
             let flow = match &mut self.reliable {
                 Some(flow) => flow,
                 none => none.insert(self.link.open_flow(header.class).await?),
             };
-            return match flow.send(&packet).await {
+            return match flow.send_as(&packet, label).await {
                 // The far side gave up this flow, not the link: begin another.
                 Err(LinkError::FlowStopped(_)) => {
                     self.reliable = None;
@@ -166,9 +170,9 @@ impl Sender {
             };
         }
         if header.fragments() == 1
-            && self.link.datagram_max().is_some_and(|max| packet.encoded_bytes() <= max)
+            && self.link.datagram_max().is_some_and(|max| packet.encoded_bytes_as(label) <= max)
         {
-            return match self.link.send_datagram(&packet).await {
+            return match self.link.send_datagram_as(&packet, label).await {
                 // The path's limit sank in between.
                 Err(LinkError::DatagramTooLong { .. }) => self.send_alone(&packet).await,
                 other => other,
@@ -185,7 +189,7 @@ impl Sender {
         }
         match self.message.take() {
             Some((id, next, mut flow)) if (id, next) == ((header.source, header.seq), header.index) => {
-                match flow.send(&packet).await {
+                match flow.send_as(&packet, label).await {
                     Ok(()) if header.is_last() => flow.finish().await,
                     Ok(()) => {
                         self.message = Some((id, next + 1, flow));
@@ -205,7 +209,7 @@ impl Sender {
 
     async fn send_alone(&mut self, packet: &Packet) -> Result<(), LinkError> {
         let mut flow = self.link.open_flow(packet.header.class).await?;
-        match flow.send(packet).await {
+        match flow.send_as(packet, self.label.as_ref().and_then(NameLabel::known)).await {
             Ok(()) => flow.finish().await,
             // The far side gave up this flow, not the link.
             Err(LinkError::FlowStopped(_)) => Ok(()),

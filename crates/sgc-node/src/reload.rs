@@ -273,6 +273,7 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.identity != config.identity, "`identity`"),
         (now.routers != config.routers, "`routers`"),
         (now.listen != config.listen, "`listen` in [router]"),
+        (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
         // Shares and uses join the default network where the file says nothing of it.
         (now.ros != config.ros, "[ros]"),
         (now.state != config.state, "`state`"),

@@ -441,10 +441,7 @@ mod tests {
         // Without anybody who listens nothing is sealed.
         share.publish(sample(KNOWN, true));
         assert_eq!((share.published(), unflushed(&slot)), (1, 0));
-        let nowhere = FibEntry {
-            trees: [].as_slice().into(),
-            sinks: vec![],
-        };
+        let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
         share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
         share.publish(sample(KNOWN, true));
         share.publish(sample(STRANGER, false));

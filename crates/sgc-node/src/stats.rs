@@ -43,6 +43,8 @@ pub(crate) enum DataDrop {
     LinkClosed,
     /// Malformed.
     Malformed,
+    /// Under a label that stands for no name.
+    UnknownLabel,
     /// No grant for the name (yet).
     NotGranted,
     /// A sink refused it; the sink's own counter says why.
@@ -65,6 +67,7 @@ impl DataDrop {
             Self::Stale => "stale",
             Self::LinkClosed => "link_closed",
             Self::Malformed => "malformed",
+            Self::UnknownLabel => "unknown_label",
             Self::NotGranted => "not_granted",
             Self::Sink => "sink",
             Self::NoWriter => "no_writer",

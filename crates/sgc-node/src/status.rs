@@ -57,6 +57,14 @@ pub struct LinkStatus {
     pub sent_bytes: u64,
     /// Bytes received.
     pub received_bytes: u64,
+    /// Names that this node sends packets of under labels.
+    pub labels_sent: u32,
+    /// Names that the peer may send packets of under labels.
+    pub labels_received: u32,
+    /// Packets of the peer, over whichever link, that waited since it sends more than `peer_rate`.
+    pub peer_slowed: u64,
+    /// Those that were dropped for it.
+    pub peer_dropped: u64,
 }
 
 /// A share or a use.

@@ -588,6 +588,19 @@ fn partners_are_described_once_and_completely() {
 }
 
 #[test]
+fn a_rate_for_peers_is_taken_over() {
+    assert_eq!(good(NODE).peer_rate, None);
+    for (text, bits) in [("50Mbps", 50_000_000), ("64kbps", 64_000), ("1 Gbps", 1_000_000_000)] {
+        assert_eq!(good(&format!("{NODE}[router]\npeer_rate = '{text}'")).peer_rate, Some(bits));
+    }
+    let right = "it takes a number with kbps, Mbps or Gbps (bits a second), from \"64kbps\" to \"1000Gbps\"";
+    for text in ["63kbps", "1001Gbps", "50", "50mbps", "50MB", "-1Mbps", "99999999999999999999Gbps"] {
+        let said = said_about(&format!("[router]\npeer_rate = '{text}'"));
+        assert_eq!(said, [format!("node.toml:4: `peer_rate` is \"{text}\"; {right}")]);
+    }
+}
+
+#[test]
 fn trust_authority_rotation_and_audit_are_taken_over() {
     let config = good(
         r#"

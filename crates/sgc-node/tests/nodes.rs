@@ -31,6 +31,31 @@ fn a_topic_crosses_a_router_and_leaves_no_loop() {
 }
 
 #[test]
+fn names_get_labels_on_every_link_that_they_cross() {
+    let trio = Trio::new();
+    let (cloud, robot) = (trio.cloud(), trio.robot(&["/a", "/b"], "desk"));
+    let desk = trio.desk(&["/a", "/b"]);
+    let labels = |node: &Node, which: &str| {
+        let links = node.status()["links"].as_array().unwrap().clone();
+        links.iter().map(|l| l[which].as_u64().unwrap()).sum::<u64>()
+    };
+    for (index, topic) in ["/a", "/b"].into_iter().enumerate() {
+        let talker = Talker::new(&trio.robot_net, topic, Qos::default());
+        let listener = Listener::new(&trio.desk_net, topic, Qos::default());
+        talker.wait_for_readers(1);
+        listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+        // The catalogue has one, too.
+        let n = index as u64 + 2;
+        wait("labels", || labels(&robot, "labels_sent") == n && labels(&cloud, "labels_sent") == n);
+        assert_eq!((labels(&desk, "labels_received"), labels(&desk, "labels_sent")), (n, 0));
+        talker.say("under a label");
+        wait("the message", || listener.drain().last().is_some_and(|b| b == "under a label"));
+    }
+    let drops = cloud.status()["drops"].clone();
+    assert!(drops.get("unknown_label").is_none() && drops.get("malformed").is_none(), "{drops}");
+}
+
+#[test]
 fn large_messages_cross_whole() {
     let trio = Trio::new();
     let _nodes = (trio.cloud(), trio.robot(&["/image"], "desk"), trio.desk(&["/image"]));

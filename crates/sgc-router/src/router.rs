@@ -345,6 +345,9 @@ impl Router {
             Control::LinkState { signed } => self.handle_link_state(now, link, signed),
             Control::Query { hops, names } => self.handle_query(now, link, hops, &names),
             Control::Reroute { name, sink } => self.handle_reroute(link, name, sink),
+            Control::Label { .. } | Control::LabelAck { .. } => {
+                self.drop_frame(link, DropReason::Unknown { what: "label" });
+            }
             Control::Goodbye => {
                 self.outputs.push_back(Output::Close { link, reason: LinkClose::Goodbye });
                 self.forget_link(link);

@@ -339,6 +339,16 @@ impl FlowError {
     }
 }
 
+/// A peer gives labels out of order, or one twice.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("label {found} was given where {expected} comes next")]
+pub struct LabelError {
+    /// What it gave.
+    pub found: u32,
+    /// The next in order; the number of labels if there may be no more.
+    pub expected: u32,
+}
+
 /// Why a peer that came to a listener has no link.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum Refusal {

@@ -2,12 +2,19 @@
 //!
 //! The framing is the same over every transport; the halves of the stream below are the transport's.
 
+use std::sync::Arc;
+
 use bytes::Bytes;
-use sgc_wire::Packet;
+use sgc_wire::{Label, Packet};
 
 use crate::error::{FlowEnd, FlowError, LinkError};
 use crate::framing::{Pieces, packet_head};
+use crate::labels::Labels;
 use crate::quic;
+
+/// Payloads up to this are copied behind their header: what that costs is less than what a transport takes to keep
+/// another piece (quinn looks through all that are not acknowledged for each that it sends).
+const JOINED_PAYLOAD_BYTES_MAX: usize = 1024;
 
 /// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once.
 #[derive(Debug)]
@@ -26,15 +33,23 @@ impl FlowTx {
         Self { outlet, has_begun: false }
     }
 
-    /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied.
+    /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied, unless it is
+    /// short.
     ///
     /// If the future is dropped, the packet is either not sent at all or sent as a whole before the next.
     pub async fn send(&mut self, packet: &Packet) -> Result<(), LinkError> {
-        let pieces = packet.payload.0.iter().filter(|p| !p.is_empty()).cloned();
+        self.send_as(packet, None).await
+    }
+
+    /// Sends a packet with this label in place of its name, if there is one: the peer must have said that it knows
+    /// what it stands for. Otherwise as [`Self::send`].
+    pub async fn send_as(&mut self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
+        let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
+        let pieces = packet.payload.0.iter().filter(|p| !joined && !p.is_empty()).cloned();
         match &mut self.outlet {
             Outlet::Quic(outlet) => {
                 outlet.flush().await?;
-                let head = packet_head(packet, !self.has_begun);
+                let head = packet_head(packet, label, !self.has_begun, joined);
                 self.has_begun = true;
                 outlet.queue(std::iter::once(head).chain(pieces));
                 outlet.flush().await
@@ -61,6 +76,7 @@ impl FlowTx {
 #[derive(Debug)]
 pub struct FlowRx {
     inlet: Inlet,
+    labels: Arc<Labels>,
     pieces: Pieces,
     state: State,
 }
@@ -78,8 +94,8 @@ enum State {
 }
 
 impl FlowRx {
-    pub(crate) fn new(inlet: Inlet) -> Self {
-        Self { inlet, pieces: Pieces::default(), state: State::ExpectVersion }
+    pub(crate) fn new(inlet: Inlet, labels: Arc<Labels>) -> Self {
+        Self { inlet, labels, pieces: Pieces::default(), state: State::ExpectVersion }
     }
 
     /// Receives the next packet, `None` once the flow is over. The payload consists of slices of what the
@@ -116,7 +132,7 @@ impl FlowRx {
                     }
                 }
                 State::ExpectPacket => {
-                    if let Some(packet) = self.pieces.next_packet()? {
+                    if let Some(packet) = self.pieces.next_packet(&self.labels)? {
                         return Ok(Some(packet));
                     }
                 }

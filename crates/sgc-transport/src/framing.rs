@@ -9,11 +9,12 @@ use std::collections::VecDeque;
 
 use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use sgc_wire::{
-    Decode, DecodeError, Encode, HEADER_BYTES_MAX, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload, Reader,
-    Writer,
+    Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
+    Reader, Writer,
 };
 
 use crate::error::{FlowError, ProtocolError};
+use crate::labels::Labels;
 
 /// Version of what two nodes say on a link, in the greeting.
 pub const LINK_VERSION: u16 = 1;
@@ -77,7 +78,7 @@ impl Pieces {
     }
 
     /// Takes the next packet of a flow, if it is complete. The payload is never copied.
-    pub(crate) fn next_packet(&mut self) -> Result<Option<Packet>, FlowError> {
+    pub(crate) fn next_packet(&mut self, labels: &Labels) -> Result<Option<Packet>, FlowError> {
         let Some(length) = self.peek_length() else { return Ok(None) };
         if length as usize > FLOW_PACKET_BYTES_MAX {
             return Err(FlowError::PacketTooLong { bytes: length.into() });
@@ -91,7 +92,8 @@ impl Pieces {
         let header = &mut header[..length.min(HEADER_BYTES_MAX)];
         self.copy_front(header);
         let mut reader = Reader::new(header);
-        let decoded = PacketHeader::decode(&mut reader).map_err(FlowError::Packet)?;
+        let decoded = PacketHeader::read(&mut reader, |label| labels.name_of(label));
+        let decoded = decoded.map_err(FlowError::Packet)?;
         let header_bytes = header.len() - reader.remaining();
         self.skip(header_bytes);
         let payload = self.take(length - header_bytes);
@@ -157,21 +159,27 @@ pub(crate) fn control_head(length: usize) -> Bytes {
     Bytes::copy_from_slice(&u32::try_from(length).unwrap_or(u32::MAX).to_be_bytes())
 }
 
-/// What stands before the payload of a packet in a flow, with the flow's version if it is the first.
-pub(crate) fn packet_head(packet: &Packet, is_first: bool) -> Bytes {
-    let mut head = BytesMut::with_capacity(1 + LENGTH_BYTES + HEADER_BYTES_MAX);
+/// What stands before the payload of a packet in a flow, with the flow's version if it is the first; `joined` with the
+/// payload behind it.
+pub(crate) fn packet_head(packet: &Packet, label: Option<Label>, is_first: bool, joined: bool) -> Bytes {
+    let payload_bytes = if joined { packet.payload.len() } else { 0 };
+    let header_bytes = packet.header.encoded_bytes_as(label);
+    let mut head = BytesMut::with_capacity(1 + LENGTH_BYTES + header_bytes + payload_bytes);
     if is_first {
         head.put_u8(FLOW_VERSION);
     }
-    head.put_u32(u32::try_from(packet.encoded_bytes()).unwrap_or(u32::MAX));
-    packet.header.put_into(&mut head);
+    head.put_u32(u32::try_from(packet.encoded_bytes_as(label)).unwrap_or(u32::MAX));
+    packet.header.put_as(label, &mut head);
+    if joined {
+        packet.payload.copy_into(&mut head);
+    }
     head.freeze()
 }
 
 /// A packet in one piece, as a datagram carries it.
-pub(crate) fn datagram(packet: &Packet) -> Bytes {
-    let mut out = BytesMut::with_capacity(packet.encoded_bytes());
-    packet.header.put_into(&mut out);
+pub(crate) fn datagram(packet: &Packet, label: Option<Label>) -> Bytes {
+    let mut out = BytesMut::with_capacity(packet.encoded_bytes_as(label));
+    packet.header.put_as(label, &mut out);
     packet.payload.copy_into(&mut out);
     out.freeze()
 }
@@ -235,36 +243,42 @@ mod tests {
     #[test]
     fn packets_survive_any_division_of_the_stream() {
         let sent = [packet(b"", None), packet(&[7; 300], Some(SinkId([5; 16]))), packet(b"x", None)];
+        let sent: Vec<_> = sent.iter().chain(&sent).collect();
+        let labels = Labels::default();
+        labels.define(Label::new(0).unwrap(), sent[0].header.name).unwrap();
         let mut stream = Vec::new();
         for (index, p) in sent.iter().enumerate() {
-            stream.extend_from_slice(&packet_head(p, index == 0));
-            p.payload.copy_into(&mut stream);
+            let label = Label::new(0).filter(|_| index > 2);
+            stream.extend_from_slice(&packet_head(p, label, index == 0, index == 1));
+            if index != 1 {
+                p.payload.copy_into(&mut stream);
+            }
         }
         for size in 1..=stream.len() {
             let mut pieces = pieces(&stream, size);
             assert!(matches!(pieces.next_flow_version(), Ok(Some(()))));
             for p in &sent {
-                let got = pieces.next_packet().unwrap().unwrap();
+                let got = pieces.next_packet(&labels).unwrap().unwrap();
                 assert_eq!(got.header, p.header);
-                assert_eq!(datagram(&got), datagram(p));
+                assert_eq!(datagram(&got, None), datagram(p, None));
             }
-            assert!(pieces.is_empty() && pieces.next_packet().unwrap().is_none());
+            assert!(pieces.is_empty() && pieces.next_packet(&labels).unwrap().is_none());
         }
         for cut in 1..stream.len() {
             let mut pieces = pieces(&stream[..cut], 50);
             pieces.next_flow_version().unwrap();
-            while pieces.next_packet().unwrap().is_some() {}
+            while pieces.next_packet(&labels).unwrap().is_some() {}
         }
     }
 
     #[test]
     fn payloads_are_slices_of_what_was_received() {
         let p = packet(&[7; 300], None);
-        let stream = Bytes::from([&packet_head(&p, false)[..], &[7; 300]].concat());
-        let mut pieces = Pieces::default();
+        let stream = Bytes::from([&packet_head(&p, None, false, false)[..], &[7; 300]].concat());
+        let (mut pieces, labels) = (Pieces::default(), Labels::default());
         pieces.push(stream.slice(..200));
         pieces.push(stream.slice(200..));
-        let got = pieces.next_packet().unwrap().unwrap();
+        let got = pieces.next_packet(&labels).unwrap().unwrap();
         assert_eq!(got.payload.0.len(), 2);
         let inside = stream.as_ptr() as usize..stream.as_ptr() as usize + stream.len();
         assert!(got.payload.0.iter().all(|b| inside.contains(&(b.as_ptr() as usize))));
@@ -275,13 +289,14 @@ mod tests {
         let mut control = pieces(&u32::MAX.to_be_bytes(), 4);
         let bytes = u32::MAX.into();
         assert_eq!(control.next_control(), Err(ProtocolError::ControlFrameTooLong { bytes }));
+        let labels = Labels::default();
         let mut flow = pieces(&(FLOW_PACKET_BYTES_MAX as u32 + 1).to_be_bytes(), 4);
-        assert!(matches!(flow.next_packet(), Err(FlowError::PacketTooLong { .. })));
+        assert!(matches!(flow.next_packet(&labels), Err(FlowError::PacketTooLong { .. })));
         assert!(matches!(pieces(&[9], 1).next_flow_version(), Err(FlowError::Version { found: 9 })));
         let mut short = pieces(&[0, 0, 0, 2, 0x10, 0], 6);
-        assert!(matches!(short.next_packet(), Err(FlowError::Packet(DecodeError::Truncated { .. }))));
+        assert!(matches!(short.next_packet(&labels), Err(FlowError::Packet(DecodeError::Truncated { .. }))));
         let mut empty = pieces(&[0; 4], 4);
-        assert!(matches!(empty.next_packet(), Err(FlowError::Packet(DecodeError::Truncated { .. }))));
+        assert!(matches!(empty.next_packet(&labels), Err(FlowError::Packet(DecodeError::Truncated { .. }))));
     }
 
     #[test]

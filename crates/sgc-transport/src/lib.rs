@@ -13,6 +13,7 @@ mod endpoint;
 mod error;
 mod flow;
 mod framing;
+mod labels;
 mod link;
 mod metrics;
 mod options;
@@ -21,7 +22,9 @@ mod url;
 
 pub use credentials::CredentialStore;
 pub use endpoint::{Dialer, Listener, RefusedPeer};
-pub use error::{CloseReason, DialError, FlowEnd, FlowError, LinkError, PeerRefusal, ProtocolError, Refusal};
+pub use error::{
+    CloseReason, DialError, FlowEnd, FlowError, LabelError, LinkError, PeerRefusal, ProtocolError, Refusal,
+};
 pub use flow::{FlowRx, FlowTx};
 pub use framing::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
 pub use link::{AnyLink, KeyExchange, Link, LinkStats};

@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Packet};
+use sgc_wire::{Class, DecodeError, Label, Name, Packet};
 
-use crate::error::{CloseReason, LinkError};
+use crate::error::{CloseReason, LabelError, LinkError};
 use crate::flow::{FlowRx, FlowTx};
 use crate::quic::QuicLink;
 
@@ -42,11 +42,27 @@ pub trait Link: Clone + Send + Sync + 'static {
     fn datagram_max(&self) -> Option<usize>;
 
     /// Sends a packet that may be lost; waits while those before it have not left.
-    fn send_datagram(&self, packet: &Packet) -> impl Future<Output = Result<(), LinkError>> + Send;
+    fn send_datagram(&self, packet: &Packet) -> impl Future<Output = Result<(), LinkError>> + Send {
+        self.send_datagram_as(packet, None)
+    }
+
+    /// The same with this label in place of the packet's name, if there is one: the peer must have said that it knows
+    /// what it stands for.
+    fn send_datagram_as(
+        &self,
+        packet: &Packet,
+        label: Option<Label>,
+    ) -> impl Future<Output = Result<(), LinkError>> + Send;
 
     /// Receives the next packet that came as a datagram. The inner error is one datagram that was malformed
     /// and is dropped; the outer one is the end of the link. Dropping the future loses nothing.
     fn recv_datagram(&self) -> impl Future<Output = Result<Result<Packet, DecodeError>, LinkError>> + Send;
+
+    /// From here on packets of the peer under this label are of this name. The error is the peer's mistake.
+    fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError>;
+
+    /// How many labels of the peer stand for names.
+    fn labels_defined(&self) -> u32;
 
     /// What the transport measured so far.
     fn stats(&self) -> LinkStats;
@@ -154,12 +170,20 @@ impl Link for AnyLink {
         each!(self, l => l.datagram_max())
     }
 
-    async fn send_datagram(&self, packet: &Packet) -> Result<(), LinkError> {
-        each!(self, l => l.send_datagram(packet).await)
+    async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
+        each!(self, l => l.send_datagram_as(packet, label).await)
     }
 
     async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
         each!(self, l => l.recv_datagram().await)
+    }
+
+    fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError> {
+        each!(self, l => l.define_label(label, name))
+    }
+
+    fn labels_defined(&self) -> u32 {
+        each!(self, l => l.labels_defined())
     }
 
     fn stats(&self) -> LinkStats {

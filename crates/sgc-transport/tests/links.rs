@@ -11,7 +11,7 @@ use quinn::{ConnectionError, VarInt};
 use sgc_transport::*;
 use sgc_trust::{CertError, Identity};
 use sgc_wire::{
-    Class, DecodeError, Encode, HOP_LIMIT, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis,
+    Class, DecodeError, Encode, HOP_LIMIT, Label, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis,
 };
 use support::*;
 
@@ -489,6 +489,52 @@ async fn a_malformed_datagram_is_dropped_alone() {
     assert!(matches!(results[0], Err(DecodeError::Version { found: 0x20, .. })));
     assert!(matches!(results[1], Err(DecodeError::Truncated { .. })));
     assert!(results[2].is_ok());
+}
+
+#[tokio::test]
+async fn packets_under_labels_arrive_under_their_names() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let [first, second] = [0, 1].map(|index| Label::new(index).unwrap());
+    far.define_label(first, Name([9; 32])).unwrap();
+    far.define_label(second, Name([1; 32])).unwrap();
+    assert_eq!(far.define_label(second, Name([2; 32])), Err(LabelError { found: 1, expected: 2 }));
+    assert_eq!((near.labels_defined(), far.labels_defined()), (0, 2));
+    let sent = packet(5, Bytes::from(vec![3; 700]));
+    let mut flow = near.open_flow(Class::Default).await.unwrap();
+    for label in [None, Some(second), None, Some(second)] {
+        near.send_datagram_as(&sent, label).await.unwrap();
+        let got = soon(far.recv_datagram()).await.unwrap().unwrap();
+        assert_eq!((got.header, joined(&got.payload)), (sent.header.clone(), joined(&sent.payload)));
+        flow.send_as(&sent, label).await.unwrap();
+    }
+    flow.finish().await.unwrap();
+    let mut flow = soon(far.accept_flow()).await.unwrap();
+    for _ in 0..4 {
+        let got = soon(flow.recv()).await.unwrap().unwrap();
+        assert_eq!((got.header, joined(&got.payload)), (sent.header.clone(), joined(&sent.payload)));
+    }
+    assert!(soon(flow.recv()).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn an_unknown_label_ends_its_flow_or_datagram_alone() {
+    let (near, far) = pair(LinkOptions::default()).await;
+    let (label, sent) = (Label::new(3), packet(5, Bytes::from_static(b"lost")));
+    near.send_datagram_as(&sent, label).await.unwrap();
+    let unknown = DecodeError::UnknownLabel { label: 3 };
+    assert_eq!(soon(far.recv_datagram()).await.unwrap().unwrap_err(), unknown);
+    let mut flow = near.open_flow(Class::Default).await.unwrap();
+    flow.send_as(&sent, label).await.unwrap();
+    let mut received = soon(far.accept_flow()).await.unwrap();
+    assert!(matches!(soon(received.recv()).await, Err(FlowError::Packet(e)) if e == unknown));
+    loop {
+        if let Err(error) = soon(flow.send(&sent)).await {
+            assert!(matches!(error, LinkError::FlowStopped(FlowEnd::Malformed)), "{error}");
+            break;
+        }
+    }
+    near.send_datagram(&sent).await.unwrap();
+    assert!(soon(far.recv_datagram()).await.unwrap().is_ok());
 }
 
 // Ends.

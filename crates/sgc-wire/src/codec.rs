@@ -89,6 +89,12 @@ pub enum DecodeError {
         /// The version known.
         known: u16,
     },
+    /// A packet under a label that the link has not given to a name.
+    #[error("label {label} stands for no name on this link")]
+    UnknownLabel {
+        /// The label.
+        label: u32,
+    },
 }
 
 impl DecodeError {

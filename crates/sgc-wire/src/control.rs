@@ -7,7 +7,7 @@
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::{Blind, Name, NodeId, NodeTag, SinkId, SourceId, UnixMillis};
+use crate::ids::{Blind, Label, Name, NodeId, NodeTag, SinkId, SourceId, UnixMillis};
 
 /// Longest control frame, bytes.
 pub const CONTROL_FRAME_BYTES_MAX: usize = 1024 * 1024;
@@ -129,6 +129,19 @@ pub enum Control {
         name: Name,
         /// Sink.
         sink: SinkId,
+    },
+    /// From here on the sender may put this label in place of this name, in packets over this link. Between the two
+    /// nodes of a link alone; labels are given in order, from 0, and stand for one name as long as the link lives.
+    Label {
+        /// Label.
+        label: Label,
+        /// Name.
+        name: Name,
+    },
+    /// The sender knows what this label and all before it stand for: packets under them may come.
+    LabelAck {
+        /// Label.
+        label: Label,
     },
 }
 
@@ -701,6 +714,15 @@ impl Encode for Control {
                 name.encode(w);
                 sink.encode(w);
             }
+            Self::Label { label, name } => {
+                w.u8(20);
+                label.encode(w);
+                name.encode(w);
+            }
+            Self::LabelAck { label } => {
+                w.u8(21);
+                label.encode(w);
+            }
         }
     }
 }
@@ -734,6 +756,8 @@ impl Decode for Control {
             14 => Self::LinkState { signed: Signed::decode(r)? },
             15 => Self::Query { hops: r.u8()?, names: decode_names(r)? },
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
+            20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
+            21 => Self::LabelAck { label: Label::decode(r)? },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -742,10 +766,12 @@ impl Decode for Control {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ids::LABELS_MAX;
 
     fn frames() -> Vec<Control> {
         let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
+        let label = Label::new(LABELS_MAX - 1).unwrap();
         vec![
             Control::Hello(Hello { minor: 3, incarnation: 9, transit: true }),
             Control::Advert { cost: 2, signed: signed.clone() },
@@ -763,6 +789,8 @@ mod tests {
             Control::LinkState { signed },
             Control::Query { hops: 1, names: vec![name; 2] },
             Control::Reroute { name, sink },
+            Control::Label { label, name },
+            Control::LabelAck { label },
         ]
     }
 
@@ -841,5 +869,10 @@ mod tests {
         w.u32(u32::MAX);
         let frame = w.into_vec();
         assert!(matches!(Control::from_slice(&frame), Err(DecodeError::TooLong { field: "names", .. })));
+        let mut w = Writer::default();
+        w.u8(21);
+        w.u32(LABELS_MAX);
+        let frame = w.into_vec();
+        assert!(matches!(Control::from_slice(&frame), Err(DecodeError::Value { field: "label", .. })));
     }
 }

@@ -100,6 +100,38 @@ impl NodeId {
     }
 }
 
+/// Names that may have a label on one link, each way: 2 MiB at the receiver.
+pub const LABELS_MAX: u32 = 1 << 16;
+
+/// What stands for a name on one link, in one direction; below [`LABELS_MAX`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Label(u32);
+
+impl Label {
+    /// The label with this number, if there may be one.
+    pub fn new(index: u32) -> Option<Self> {
+        (index < LABELS_MAX).then_some(Self(index))
+    }
+
+    /// Its number.
+    pub fn index(self) -> u32 {
+        self.0
+    }
+}
+
+impl Encode for Label {
+    fn encode(&self, w: &mut Writer) {
+        w.u32(self.0);
+    }
+}
+
+impl Decode for Label {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let index = r.u32()?;
+        Self::new(index).ok_or(DecodeError::value("label", index.into()))
+    }
+}
+
 /// 256 secret bits: a key, or what keys are derived from. Wiped when dropped, compared in constant time, never
 /// printed.
 #[derive(Clone, zeroize::Zeroize, zeroize::ZeroizeOnDrop)]

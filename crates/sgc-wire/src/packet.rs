@@ -8,7 +8,7 @@ use bytes::{BufMut, Bytes};
 use smallvec::SmallVec;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::{Name, SinkId, SourceId};
+use crate::ids::{Label, Name, SinkId, SourceId};
 
 /// Version of the data packet, in the high half of the first byte.
 pub const PACKET_VERSION: u8 = 1;
@@ -16,6 +16,8 @@ pub const PACKET_VERSION: u8 = 1;
 pub const HEADER_BYTES_MAX: usize = HEADER_BYTES + 16;
 /// Header without an addressee, bytes.
 pub const HEADER_BYTES: usize = 76;
+/// What a label in place of the name saves, bytes.
+pub const LABEL_SAVES_BYTES: usize = 32;
 /// Longest payload of one packet, bytes: a fragment of 32 KiB and what a suite adds to it, which is a message
 /// head (12), a tag (16) and the trailer of a batch of 64 under RSA-3072 (6 · 32 + 4 + 384), rounded up.
 pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 1024;
@@ -65,6 +67,11 @@ pub struct PacketHeader {
     pub to: Option<SinkId>,
 }
 
+/// First byte of a header with its name.
+const FORM_NAMED: u8 = PACKET_VERSION << 4;
+/// First byte of a header with a label in place of the name.
+const FORM_LABELLED: u8 = FORM_NAMED | 1;
+
 const FLAG_RELIABLE: u8 = 0x01;
 const FLAG_TO: u8 = 0x02;
 const CLASS_SHIFT: u8 = 2;
@@ -87,16 +94,22 @@ impl PacketHeader {
         u32::from(self.index) + 1 == self.fragments()
     }
 
-    /// The bytes that the seal authenticates: the encoding with hop limit zero.
+    /// The bytes that the seal authenticates: the encoding with its name and with hop limit zero, whatever form
+    /// links carry it in.
     pub fn associated_data(&self) -> AssociatedData {
         let mut bytes = [0; HEADER_BYTES_MAX];
-        self.put(&mut &mut bytes[..], 0);
+        self.put(&mut &mut bytes[..], 0, None);
         AssociatedData { bytes, len: self.encoded_bytes() }
     }
 
     /// Appends the encoding.
     pub fn put_into(&self, out: &mut impl BufMut) {
-        self.put(out, self.hops);
+        self.put(out, self.hops, None);
+    }
+
+    /// Appends the encoding with the label in place of the name, if there is one.
+    pub fn put_as(&self, label: Option<Label>, out: &mut impl BufMut) {
+        self.put(out, self.hops, label);
     }
 
     /// Length of the encoding, bytes.
@@ -104,22 +117,91 @@ impl PacketHeader {
         if self.to.is_some() { HEADER_BYTES_MAX } else { HEADER_BYTES }
     }
 
-    fn put(&self, out: &mut impl BufMut, hops: u8) {
+    /// Length of what [`Self::put_as`] appends, bytes.
+    pub fn encoded_bytes_as(&self, label: Option<Label>) -> usize {
+        self.encoded_bytes() - if label.is_some() { LABEL_SAVES_BYTES } else { 0 }
+    }
+
+    /// Decodes a header of either form; `name_of` knows what the labels of the link stand for.
+    pub fn read(
+        r: &mut Reader<'_>,
+        name_of: impl FnOnce(Label) -> Option<Name>,
+    ) -> Result<Self, DecodeError> {
+        let first = r.u8()?;
+        if first != FORM_NAMED && first != FORM_LABELLED {
+            return Err(DecodeError::Version {
+                what: "data packet",
+                found: first.into(),
+                known: FORM_NAMED.into(),
+            });
+        }
+        let flags = r.u8()?;
+        if flags & !FLAGS_KNOWN != 0 {
+            return Err(DecodeError::value("packet flags", flags.into()));
+        }
+        let mut header = Self {
+            reliable: flags & FLAG_RELIABLE != 0,
+            class: match (flags >> CLASS_SHIFT) & 3 {
+                0 => Class::Bulk,
+                1 => Class::Default,
+                2 => Class::Realtime,
+                v => return Err(DecodeError::value("class", v.into())),
+            },
+            hops: r.u8()?,
+            suite: r.u8()?,
+            epoch: r.u32()?,
+            name: if first == FORM_NAMED { Name::decode(r)? } else { Name([0; 32]) },
+            source: SourceId::decode(r)?,
+            seq: r.u64()?,
+            total: r.u32()?,
+            index: r.u16()?,
+            grid: r.u16()?,
+            to: None,
+        };
+        let label = r.u32()?;
+        if first == FORM_LABELLED {
+            let name = Label::new(label).and_then(name_of);
+            header.name = name.ok_or(DecodeError::UnknownLabel { label })?;
+        } else if label != 0 {
+            return Err(DecodeError::value("reserved", label.into()));
+        }
+        if flags & FLAG_TO != 0 {
+            header.to = Some(SinkId::decode(r)?);
+        }
+        if header.total > MESSAGE_BYTES_MAX {
+            return Err(DecodeError::TooLong {
+                field: "message",
+                value: header.total as usize,
+                max: MESSAGE_BYTES_MAX as usize,
+            });
+        }
+        if header.grid == 0 || usize::from(header.grid) > PAYLOAD_BYTES_MAX {
+            return Err(DecodeError::value("fragment grid", header.grid.into()));
+        }
+        if u32::from(header.index) >= header.fragments() {
+            return Err(DecodeError::value("fragment index", header.index.into()));
+        }
+        Ok(header)
+    }
+
+    fn put(&self, out: &mut impl BufMut, hops: u8, label: Option<Label>) {
         let flags = (if self.reliable { FLAG_RELIABLE } else { 0 })
             | (if self.to.is_some() { FLAG_TO } else { 0 })
             | ((self.class as u8) << CLASS_SHIFT);
-        out.put_u8(PACKET_VERSION << 4);
+        out.put_u8(if label.is_some() { FORM_LABELLED } else { FORM_NAMED });
         out.put_u8(flags);
         out.put_u8(hops);
         out.put_u8(self.suite);
         out.put_u32(self.epoch);
-        out.put_slice(&self.name.0);
+        if label.is_none() {
+            out.put_slice(&self.name.0);
+        }
         out.put_slice(&self.source.0);
         out.put_u64(self.seq);
         out.put_u32(self.total);
         out.put_u16(self.index);
         out.put_u16(self.grid);
-        out.put_u32(0); // reserved: a label, once links agree on them
+        out.put_u32(label.map_or(0, Label::index));
         if let Some(to) = self.to {
             out.put_slice(&to.0);
         }
@@ -147,60 +229,10 @@ impl Encode for PacketHeader {
     }
 }
 
+/// With its name; of labels it knows none.
 impl Decode for PacketHeader {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
-        let first = r.u8()?;
-        if first != PACKET_VERSION << 4 {
-            return Err(DecodeError::Version {
-                what: "data packet",
-                found: first.into(),
-                known: (PACKET_VERSION << 4).into(),
-            });
-        }
-        let flags = r.u8()?;
-        if flags & !FLAGS_KNOWN != 0 {
-            return Err(DecodeError::value("packet flags", flags.into()));
-        }
-        let mut header = Self {
-            reliable: flags & FLAG_RELIABLE != 0,
-            class: match (flags >> CLASS_SHIFT) & 3 {
-                0 => Class::Bulk,
-                1 => Class::Default,
-                2 => Class::Realtime,
-                v => return Err(DecodeError::value("class", v.into())),
-            },
-            hops: r.u8()?,
-            suite: r.u8()?,
-            epoch: r.u32()?,
-            name: Name::decode(r)?,
-            source: SourceId::decode(r)?,
-            seq: r.u64()?,
-            total: r.u32()?,
-            index: r.u16()?,
-            grid: r.u16()?,
-            to: None,
-        };
-        let reserved = r.u32()?;
-        if reserved != 0 {
-            return Err(DecodeError::value("reserved", reserved.into()));
-        }
-        if flags & FLAG_TO != 0 {
-            header.to = Some(SinkId::decode(r)?);
-        }
-        if header.total > MESSAGE_BYTES_MAX {
-            return Err(DecodeError::TooLong {
-                field: "message",
-                value: header.total as usize,
-                max: MESSAGE_BYTES_MAX as usize,
-            });
-        }
-        if header.grid == 0 || usize::from(header.grid) > PAYLOAD_BYTES_MAX {
-            return Err(DecodeError::value("fragment grid", header.grid.into()));
-        }
-        if u32::from(header.index) >= header.fragments() {
-            return Err(DecodeError::value("fragment index", header.index.into()));
-        }
-        Ok(header)
+        Self::read(r, |_| None)
     }
 }
 
@@ -249,10 +281,23 @@ impl Packet {
         self.header.encoded_bytes() + self.payload.len()
     }
 
-    /// Reads a packet that came in one piece (a datagram); the payload shares `datagram`.
+    /// Length of the encoding with the label in place of the name, if there is one, bytes.
+    pub fn encoded_bytes_as(&self, label: Option<Label>) -> usize {
+        self.header.encoded_bytes_as(label) + self.payload.len()
+    }
+
+    /// Reads a packet that came in one piece (a datagram); the payload shares `datagram`. Of labels it knows none.
     pub fn from_datagram(datagram: Bytes) -> Result<Self, DecodeError> {
+        Self::from_datagram_as(datagram, |_| None)
+    }
+
+    /// Reads a packet of either form that came in one piece; `name_of` knows what the labels of the link stand for.
+    pub fn from_datagram_as(
+        datagram: Bytes,
+        name_of: impl FnOnce(Label) -> Option<Name>,
+    ) -> Result<Self, DecodeError> {
         let mut r = Reader::new(&datagram);
-        let header = PacketHeader::decode(&mut r)?;
+        let header = PacketHeader::read(&mut r, name_of)?;
         let payload = datagram.slice(datagram.len() - r.remaining()..);
         Self::new(header, payload.into())
     }
@@ -296,6 +341,29 @@ mod tests {
             let bytes = h.to_vec();
             assert_eq!(bytes.len(), h.encoded_bytes());
             assert_eq!(PacketHeader::from_slice(&bytes), Ok(h));
+        }
+    }
+
+    #[test]
+    fn a_label_stands_for_the_name_and_for_nothing_else() {
+        let label = Label::new(0x0102).unwrap();
+        let name_of = |l: Label| (l == label).then_some(Name([0xaa; 32]));
+        for to in [None, Some(SinkId([3; 16]))] {
+            let h = PacketHeader { to, ..header() };
+            let mut bytes = Vec::new();
+            h.put_as(Some(label), &mut bytes);
+            assert_eq!((bytes.len(), h.encoded_bytes_as(Some(label))), (h.to_vec().len() - 32, bytes.len()));
+            let mut r = Reader::new(&bytes);
+            let read = PacketHeader::read(&mut r, name_of).unwrap();
+            assert_eq!((r.remaining(), read.associated_data()), (0, h.associated_data()));
+            assert_eq!(read, h);
+            let unknown = |bytes: &[u8]| PacketHeader::read(&mut Reader::new(bytes), name_of).unwrap_err();
+            bytes[43] = 3;
+            assert_eq!(unknown(&bytes), DecodeError::UnknownLabel { label: 0x0103 });
+            bytes[40] = 1;
+            assert_eq!(unknown(&bytes), DecodeError::UnknownLabel { label: 0x0100_0103 });
+            bytes.truncate(43);
+            assert!(matches!(unknown(&bytes), DecodeError::Truncated { .. }));
         }
     }
 

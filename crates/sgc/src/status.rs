@@ -62,6 +62,8 @@ pub(crate) struct Link {
     rtt_us: u64,
     sent_bytes: u64,
     received_bytes: u64,
+    peer_slowed: u64,
+    peer_dropped: u64,
 }
 
 /// A share or use of a node.
@@ -212,6 +214,14 @@ impl Status {
             &["peer", "remote", "round trip", "sent", "received", "dialled"],
             self.links.iter().map(Link::row).collect(),
         );
+        let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
+        if !over.is_empty() {
+            section(
+                "Peers that send more than `peer_rate`",
+                &["peer", "packets slowed", "dropped"],
+                over.iter().map(|l| l.over_row()).collect(),
+            );
+        }
         section(
             "Topics",
             &["", "topic", "type", "owner", "messages", "state"],
@@ -246,6 +256,11 @@ impl Link {
             output::bytes(self.received_bytes),
             self.url.clone().unwrap_or_default(),
         ]
+    }
+
+    fn over_row(&self) -> Vec<String> {
+        let peer = self.peer.chars().take(8).collect();
+        vec![peer, self.peer_slowed.to_string(), self.peer_dropped.to_string()]
     }
 }
 

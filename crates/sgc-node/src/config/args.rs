@@ -88,6 +88,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         name: None,
         routers: all("--router", &args.routers),
         listen: all("--listen", &args.listen),
+        peer_rate: None,
         ros: touches_ros.then(RosDraft::default),
         shares,
         uses,

@@ -50,6 +50,7 @@ pub(super) struct Draft {
     pub(super) name: Option<Located<String>>,
     pub(super) routers: Vec<Located<String>>,
     pub(super) listen: Vec<Located<String>>,
+    pub(super) peer_rate: Option<Located<String>>,
     pub(super) ros: Option<RosDraft>,
     pub(super) shares: Vec<ShareDraft>,
     pub(super) uses: Vec<UseDraft>,

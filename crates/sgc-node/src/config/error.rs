@@ -11,7 +11,8 @@ use std::time::Duration;
 use sgc_transport::UrlError;
 use sgc_trust::TokenError;
 
-use super::names::duration_text;
+use super::names::{duration_text, rate_text};
+use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
 /// Everything that is wrong, in the order of the file; never empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -368,6 +369,18 @@ pub enum Mistake {
         min: Duration,
         /// The longest.
         max: Duration,
+    },
+    /// Not a rate, or out of bounds.
+    #[error(
+        "`{key}` is {value:?}; it takes a number with kbps, Mbps or Gbps (bits a second), from \"{}\" to \"{}\"",
+        rate_text(PEER_RATE_MIN),
+        rate_text(PEER_RATE_MAX)
+    )]
+    Rate {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
     },
     /// A number out of bounds.
     #[error("`{key}` is {value}; it takes {what} from {min} to {max}")]

@@ -100,6 +100,7 @@ impl FileReader<'_> {
                 "listen",
                 "an array of strings, such as [\"quic://0.0.0.0:7447\"]",
             ),
+            peer_rate: self.string(router.as_ref(), "peer_rate", "a string, such as \"50Mbps\""),
             ros: ros.map(|ros| self.ros(&ros)),
             shares: self
                 .repeated(&top, "share", Table::Share)

@@ -30,7 +30,7 @@ use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
-pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration};
+pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration, parse_rate};
 pub use resolve::{
     LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES,
     TRUST_MAX, USES_MAX,
@@ -40,6 +40,11 @@ pub use schema::Table;
 
 /// The largest file that is read as a configuration: 1024 shares with all their metadata fit.
 pub const CONFIG_BYTES_MAX: u64 = 4 * 1024 * 1024;
+
+/// The least that a peer may be held to: below it a large message takes minutes.
+pub const PEER_RATE_MIN: u64 = 64_000;
+/// More than any network carries.
+pub const PEER_RATE_MAX: u64 = 1_000_000_000_000;
 
 /// Looks up an environment variable; `&|name| std::env::var(name).ok()` outside of tests.
 pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
@@ -55,6 +60,8 @@ pub struct Config {
     pub routers: Vec<LinkUrl>,
     /// Where to listen; port 0 lets the system choose. Not empty: this node is a router.
     pub listen: Vec<ListenAddr>,
+    /// What one peer may send into this node, bits a second; [`PEER_RATE_MIN`] to [`PEER_RATE_MAX`].
+    pub peer_rate: Option<u64>,
     /// The local ROS 2 network; none for a node that is only a router.
     pub ros: Option<RosConfig>,
     /// What this node offers, each topic once.

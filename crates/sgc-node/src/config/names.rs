@@ -11,6 +11,7 @@ use sgc_trust::{FleetName, GroupName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
 
 use super::error::{Mistake, TopicRule};
+use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
 /// The longest topic: 256 bytes of DDS less a terminator and 8 for the prefix that rmw adds.
 pub const TOPIC_BYTES_MAX: usize = 247;
@@ -195,6 +196,27 @@ pub(super) fn duration_text(duration: Duration) -> String {
     let unit = units.into_iter().find(|(unit, _)| seconds.is_multiple_of(*unit) && seconds > 0);
     unit.map_or_else(|| format!("{seconds}s"), |(unit, text)| format!("{}{text}", seconds / unit))
 }
+
+/// Checks what a peer may send.
+pub(super) fn rate(key: &'static str, value: &str) -> Result<u64, Mistake> {
+    let rate = parse_rate(value).filter(|rate| (PEER_RATE_MIN..=PEER_RATE_MAX).contains(rate));
+    rate.ok_or_else(|| Mistake::Rate { key, value: value.to_owned() })
+}
+
+/// A rate as the configuration has it: `500kbps`, `50Mbps`, `1Gbps`; in bits a second.
+pub fn parse_rate(text: &str) -> Option<u64> {
+    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
+    let unit = RATE_UNITS.into_iter().find(|(_, name)| *name == unit.trim_start())?.0;
+    number.parse::<u64>().ok()?.checked_mul(unit)
+}
+
+/// A rate in the largest unit that divides it.
+pub(super) fn rate_text(rate: u64) -> String {
+    let unit = RATE_UNITS.into_iter().find(|(unit, _)| rate.is_multiple_of(*unit));
+    unit.map_or_else(|| format!("{rate}bps"), |(unit, name)| format!("{}{name}", rate / unit))
+}
+
+const RATE_UNITS: [(u64, &str); 3] = [(1_000_000_000, "Gbps"), (1_000_000, "Mbps"), (1000, "kbps")];
 
 /// Checks one entry of `to` or `publish`.
 pub(super) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mistake> {

@@ -79,6 +79,7 @@ pub(super) fn resolve(
     let routers = resolver.addresses(&draft.routers, names::router, ROUTERS_MAX);
     let listen = resolver.addresses(&draft.listen, names::listen, LISTEN_MAX);
     let attempted = |key| draft.attempted.contains(key);
+    let peer_rate = draft.peer_rate.as_ref().and_then(|rate| resolver.keep(rate, names::rate));
     let connects = !draft.routers.is_empty() || !draft.listen.is_empty();
     if !connects && !["routers", "listen", "node", "router"].into_iter().any(attempted) {
         let (dial, listen) = (draft.words.dial, draft.words.listen);
@@ -105,6 +106,7 @@ pub(super) fn resolve(
             identity,
             routers,
             listen,
+            peer_rate,
             ros,
             shares,
             uses,

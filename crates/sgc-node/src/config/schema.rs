@@ -96,7 +96,7 @@ impl Table {
                 "node",
             ],
             Self::Use => &["from", "topic", "type", "publish", "token"],
-            Self::Router => &["listen"],
+            Self::Router => &["listen", "peer_rate"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],

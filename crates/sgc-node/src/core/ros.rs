@@ -240,8 +240,9 @@ impl<N: RosNetwork> Core<N> {
                     outs.push((*id, Out::Local(sink.clone())));
                 }
             } else if let Some(link) = self.links.get_mut(id) {
-                let flow =
-                    link.flows.entry(name).or_insert_with(|| OutFlow::spawn(link.link.clone(), name)).clone();
+                let (to, control) = (&link.link, &mut link.control);
+                let begin = || OutFlow::spawn(to.clone(), name, control.label(name));
+                let flow = link.flows.entry(name).or_insert_with(begin).clone();
                 outs.push((*id, Out::Link(flow)));
             }
         }

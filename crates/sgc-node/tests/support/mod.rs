@@ -184,8 +184,13 @@ impl Trio {
     }
 
     pub fn cloud(&self) -> Node {
+        self.cloud_with(|_| {})
+    }
+
+    pub fn cloud_with(&self, change: impl FnOnce(&mut Config)) -> Node {
         let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
-        let config = Config { routers: vec![], listen: vec![addr], ..self.config() };
+        let mut config = Config { routers: vec![], listen: vec![addr], ..self.config() };
+        change(&mut config);
         let node = Node::start(config, identity("cloud", true), None);
         assert_eq!(node.addr.unwrap().port(), self.port);
         node

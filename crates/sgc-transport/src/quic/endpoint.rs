@@ -349,7 +349,8 @@ fn link(
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
     let key_exchange = key_exchange(&connection);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
-    let shared = Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, fate };
+    let labels = Arc::default();
+    let shared = Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, labels, fate };
     Ok(QuicLink { shared: Arc::new(shared) })
 }
 

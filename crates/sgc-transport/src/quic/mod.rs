@@ -19,12 +19,13 @@ use quinn::{
     Connection, ConnectionError, ReadError, RecvStream, SendDatagramError, SendStream, VarInt, WriteError,
 };
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Packet};
+use sgc_wire::{Class, DecodeError, Label, Name, Packet};
 use tokio::sync::Mutex;
 
-use crate::error::{CloseReason, FlowEnd, FlowError, LinkError, ProtocolError};
+use crate::error::{CloseReason, FlowEnd, FlowError, LabelError, LinkError, ProtocolError};
 use crate::flow::{self, Chunks, FlowRx, FlowTx};
 use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
+use crate::labels::Labels;
 use crate::link::{KeyExchange, Link, LinkStats};
 
 const PRIORITY_CONTROL: i32 = 3;
@@ -44,6 +45,7 @@ struct Shared {
     key_exchange: KeyExchange,
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
+    labels: Arc<Labels>,
     fate: Arc<Fate>,
 }
 
@@ -231,23 +233,23 @@ impl Link for QuicLink {
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
-        let Shared { connection, fate, .. } = &*self.shared;
+        let Shared { connection, fate, labels, .. } = &*self.shared;
         let stream = connection.accept_uni().await.map_err(|e| fate.explain(&e))?;
-        Ok(FlowRx::new(flow::Inlet::Quic(Inlet::new(stream, fate))))
+        Ok(FlowRx::new(flow::Inlet::Quic(Inlet::new(stream, fate)), Arc::clone(labels)))
     }
 
     fn datagram_max(&self) -> Option<usize> {
         self.shared.connection.max_datagram_size()
     }
 
-    async fn send_datagram(&self, packet: &Packet) -> Result<(), LinkError> {
+    async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
         let Shared { connection, fate, .. } = &*self.shared;
-        let bytes = packet.encoded_bytes();
+        let bytes = packet.encoded_bytes_as(label);
         let max = connection.max_datagram_size().unwrap_or(0);
         if bytes > max {
             return Err(LinkError::DatagramTooLong { bytes, max });
         }
-        connection.send_datagram_wait(datagram(packet)).await.map_err(|e| match e {
+        connection.send_datagram_wait(datagram(packet, label)).await.map_err(|e| match e {
             SendDatagramError::ConnectionLost(e) => fate.explain(&e),
             // The path may have narrowed in between.
             _ => LinkError::DatagramTooLong { bytes, max: connection.max_datagram_size().unwrap_or(0) },
@@ -255,9 +257,17 @@ impl Link for QuicLink {
     }
 
     async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
-        let Shared { connection, fate, .. } = &*self.shared;
+        let Shared { connection, fate, labels, .. } = &*self.shared;
         let datagram = connection.read_datagram().await.map_err(|e| fate.explain(&e))?;
-        Ok(Packet::from_datagram(datagram))
+        Ok(Packet::from_datagram_as(datagram, |label| labels.name_of(label)))
+    }
+
+    fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError> {
+        self.shared.labels.define(label, name)
+    }
+
+    fn labels_defined(&self) -> u32 {
+        self.shared.labels.count()
     }
 
     fn stats(&self) -> LinkStats {

@@ -1,0 +1,266 @@
+//! How much data one peer may send into this node: a bucket for each node id, whatever number of links it has.
+//!
+//! What can wait is slowed, so that the transport pushes back to the peer; what cannot is dropped. No lock on the way of
+//! a packet; without a limit nothing at all. Control frames are the router machine's to limit.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use sgc_wire::NodeId;
+use tracing::warn;
+
+/// How much of its rate a peer may save up: this much time's worth, at least [`BURST_BYTES_MIN`].
+const BURST: Duration = Duration::from_millis(250);
+/// Several of the longest packets.
+const BURST_BYTES_MIN: u64 = 256 << 10;
+/// Peers that are remembered without a link, since they have not paid for what they sent; beyond it one is forgotten.
+const PEERS_MAX: usize = 4096;
+
+/// The buckets of all peers.
+#[derive(Debug)]
+pub(crate) struct PeerRates {
+    limit: Option<Limit>,
+    /// Looked at when links begin, and for the status.
+    peers: Mutex<BTreeMap<NodeId, Arc<PeerRate>>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Limit {
+    bits_per_second: u64,
+    burst_ns: u64,
+    /// Of the clock below.
+    origin: Instant,
+}
+
+impl Default for PeerRates {
+    fn default() -> Self {
+        Self::new(None)
+    }
+}
+
+impl PeerRates {
+    /// The same limit for every peer, in bits a second.
+    pub(crate) fn new(limit: Option<u64>) -> Self {
+        let limit = limit.map(|bits_per_second| {
+            let mut limit = Limit { bits_per_second, burst_ns: 0, origin: Instant::now() };
+            limit.burst_ns = nanos(BURST).max(limit.cost_ns(BURST_BYTES_MIN));
+            limit
+        });
+        Self { limit, peers: Mutex::default() }
+    }
+
+    /// The bucket of a peer that has a link now, if there is a limit. It outlives the link until what was sent is paid
+    /// for, so that linking again gains nothing.
+    pub(crate) fn of(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
+        self.of_at(self.limit?.now(), peer)
+    }
+
+    fn of_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
+        let limit = self.limit?;
+        let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        peers.retain(|id, rate| *id == peer || Arc::strong_count(rate) > 1 || !rate.is_paid(now));
+        let idle = |rate: &Arc<PeerRate>| Arc::strong_count(rate) == 1;
+        if peers.len() >= PEERS_MAX
+            && let Some(one) = peers.iter().find(|(id, rate)| **id != peer && idle(rate)).map(|(id, _)| *id)
+        {
+            peers.remove(&one);
+        }
+        Some(peers.entry(peer).or_insert_with(|| Arc::new(PeerRate::new(peer, limit))).clone())
+    }
+
+    /// What was slowed and dropped of a peer.
+    pub(crate) fn over(&self, peer: &NodeId) -> Over {
+        let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        peers.get(peer).map(|rate| rate.over()).unwrap_or_default()
+    }
+
+    /// Drops, by peer.
+    pub(crate) fn drops(&self) -> BTreeMap<String, u64> {
+        let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut drops = BTreeMap::new();
+        for (peer, dropped) in
+            peers.iter().map(|(id, rate)| (id, rate.over().dropped)).filter(|(_, n)| *n > 0)
+        {
+            *drops.entry("over_rate".to_owned()).or_default() += dropped;
+            drops.insert(format!("over_rate from {}", peer.short()), dropped);
+        }
+        drops
+    }
+}
+
+impl Limit {
+    fn now(&self) -> u64 {
+        nanos(self.origin.elapsed())
+    }
+
+    /// How long a peer takes to earn so many bytes.
+    fn cost_ns(&self, bytes: u64) -> u64 {
+        let ns = u128::from(bytes) * 8_000_000_000 / u128::from(self.bits_per_second.max(1));
+        ns.try_into().unwrap_or(u64::MAX)
+    }
+}
+
+fn nanos(time: Duration) -> u64 {
+    time.as_nanos().try_into().unwrap_or(u64::MAX)
+}
+
+/// Packets of a peer that were over its rate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Over {
+    /// Taken in later.
+    pub slowed: u64,
+    /// Not taken in.
+    pub dropped: u64,
+}
+
+/// The bucket of one peer, as the time at which all that was taken is paid for (the generic cell rate algorithm).
+#[derive(Debug)]
+pub(crate) struct PeerRate {
+    peer: NodeId,
+    limit: Limit,
+    /// For all packets.
+    all_ns: AtomicU64,
+    /// For those that could not wait: they go before the others, within the same rate.
+    hasty_ns: AtomicU64,
+    slowed: AtomicU64,
+    dropped: AtomicU64,
+    is_named: AtomicBool,
+}
+
+impl PeerRate {
+    fn new(peer: NodeId, limit: Limit) -> Self {
+        Self {
+            peer,
+            limit,
+            all_ns: AtomicU64::new(0),
+            hasty_ns: AtomicU64::new(0),
+            slowed: AtomicU64::new(0),
+            dropped: AtomicU64::new(0),
+            is_named: AtomicBool::new(false),
+        }
+    }
+
+    /// Takes bytes that cannot wait; false if they are to be dropped, which is counted.
+    pub(crate) fn take_now(&self, bytes: usize) -> bool {
+        self.take_now_at(self.limit.now(), bytes)
+    }
+
+    /// Takes bytes that can wait, for as long as is returned.
+    pub(crate) fn take_later(&self, bytes: usize) -> Duration {
+        self.take_later_at(self.limit.now(), bytes)
+    }
+
+    fn take_now_at(&self, now: u64, bytes: usize) -> bool {
+        let cost = self.limit.cost_ns(bytes as u64);
+        let most = now.saturating_add(self.limit.burst_ns);
+        let after = |paid: u64| Some(paid.max(now).saturating_add(cost)).filter(|after| *after <= most);
+        if self.hasty_ns.fetch_update(Relaxed, Relaxed, after).is_err() {
+            self.dropped.fetch_add(1, Relaxed);
+            self.name_it("what cannot wait is dropped");
+            return false;
+        }
+        self.charge(now, cost);
+        true
+    }
+
+    fn take_later_at(&self, now: u64, bytes: usize) -> Duration {
+        let paid = self.charge(now, self.limit.cost_ns(bytes as u64));
+        let wait = Duration::from_nanos(paid.saturating_sub(now.saturating_add(self.limit.burst_ns)));
+        if !wait.is_zero() {
+            self.slowed.fetch_add(1, Relaxed);
+            self.name_it("what can wait is slowed");
+        }
+        wait
+    }
+
+    /// When all is paid for that was taken, this included.
+    fn charge(&self, now: u64, cost: u64) -> u64 {
+        let after = |paid: u64| paid.max(now).saturating_add(cost);
+        // It never fails: the closure always has a value.
+        let before = self.all_ns.fetch_update(Relaxed, Relaxed, |paid| Some(after(paid)));
+        after(before.unwrap_or_else(|paid| paid))
+    }
+
+    fn is_paid(&self, now: u64) -> bool {
+        self.all_ns.load(Relaxed) <= now
+    }
+
+    fn over(&self) -> Over {
+        Over { slowed: self.slowed.load(Relaxed), dropped: self.dropped.load(Relaxed) }
+    }
+
+    fn name_it(&self, what: &str) {
+        if !self.is_named.swap(true, Relaxed) {
+            warn!(peer = %self.peer.short(), "a peer sends more than `peer_rate` lets it: {what}, and counted from here on");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PACKET: usize = 1000;
+    const SECOND: u64 = 1_000_000_000;
+
+    /// 8 Mbit/s: a packet a millisecond, and 262 144 bytes at once.
+    fn rate() -> Arc<PeerRate> {
+        PeerRates::new(Some(8_000_000)).of(NodeId([1; 32])).unwrap()
+    }
+
+    #[test]
+    fn what_cannot_wait_passes_at_the_rate_and_no_faster() {
+        let rate = rate();
+        let passed = |now| (0..2000).filter(|_| rate.take_now_at(now, PACKET)).count();
+        assert_eq!(passed(0), 262);
+        assert_eq!(passed(SECOND / 10), 100);
+        // What is saved up is bounded.
+        assert_eq!(passed(100 * SECOND), 262);
+        assert_eq!(rate.over(), Over { slowed: 0, dropped: 3 * 2000 - 262 - 100 - 262 });
+    }
+
+    #[test]
+    fn what_can_wait_takes_what_the_hasty_leave() {
+        let rate = rate();
+        let mut now = 0;
+        let mut hasty = 0;
+        for _ in 0..4000 {
+            now += nanos(rate.take_later_at(now, PACKET));
+            // Half of the rate.
+            while hasty < now / 2_000_000 {
+                assert!(rate.take_now_at(now, PACKET));
+                hasty += 1;
+            }
+        }
+        let seconds = now as f64 / SECOND as f64;
+        let all = (4000 + hasty) as f64;
+        assert!((all - 262.0 - seconds * 1000.0).abs() < 10.0, "{all} in {seconds} s");
+        assert!(rate.over().slowed > 3000 && rate.over().dropped == 0);
+        // And it does not keep those from passing.
+        for _ in 0..10_000 {
+            rate.take_later_at(now, PACKET);
+        }
+        assert!(rate.take_later_at(now, PACKET) > Duration::from_secs(9));
+        assert!(rate.take_now_at(now, PACKET));
+    }
+
+    #[test]
+    fn linking_again_gains_nothing() {
+        let rates = PeerRates::new(Some(8_000_000));
+        let of = |now, id| rates.of_at(now, NodeId([id; 32])).unwrap();
+        let first = of(0, 1);
+        assert!(Arc::ptr_eq(&first, &of(0, 1)));
+        while first.take_now_at(0, PACKET) {}
+        drop(first);
+        assert!(of(SECOND / 10, 2).take_now_at(SECOND / 10, 200 * PACKET));
+        assert!(!of(SECOND / 10, 1).take_now_at(SECOND / 10, 200 * PACKET));
+        assert_eq!((rates.drops()["over_rate"], rates.over(&NodeId([1; 32])).dropped), (2, 2));
+        // Who has paid is forgotten.
+        assert!(of(SECOND, 3).take_now_at(SECOND, PACKET));
+        assert!(rates.drops().is_empty());
+        let one = NodeId([1; 32]);
+        assert!(PeerRates::new(None).of(one).is_none());
+    }
+}

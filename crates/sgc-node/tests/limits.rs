@@ -1,0 +1,235 @@
+//! What happens where there is more to carry than may be, or can be, carried: whole nodes over real QUIC.
+
+#![allow(clippy::unwrap_used)]
+
+mod support;
+
+use std::net::UdpSocket;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::SeqCst};
+use std::sync::mpsc::channel;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata};
+use sgc_trust::Suite;
+use sgc_wire::{Class, History, Qos, Reliability};
+use support::*;
+
+/// Reliable, and nothing is forgotten.
+fn all() -> Qos {
+    Qos { history: History::KeepAll, ..Qos::default() }
+}
+
+fn best_effort() -> Qos {
+    Qos { reliability: Reliability::BestEffort, ..all() }
+}
+
+/// What a node counts for its links to a peer.
+fn of_peer(node: &Node, peer: &str, what: &str) -> u64 {
+    let status = node.status();
+    let links = status["links"].as_array().unwrap().iter();
+    links.filter(|l| l["peer"] == peer).map(|l| l[what].as_u64().unwrap()).sum()
+}
+
+#[test]
+fn a_peer_over_its_rate_is_slowed_where_it_can_wait_and_loses_what_cannot() {
+    const RATE: u64 = 2_000_000;
+    let trio = Trio::new();
+    let cloud = trio.cloud_with(|config: &mut Config| config.peer_rate = Some(RATE));
+    let _robot = trio.robot(&["/slow", "/fast"], "desk");
+    let _desk = trio.desk(&["/slow", "/fast"]);
+    let slow = Talker::new(&trio.robot_net, "/slow", all());
+    let fast = Talker::new(&trio.robot_net, "/fast", best_effort());
+    let hears_slow = Listener::new(&trio.desk_net, "/slow", all());
+    let hears_fast = Listener::new(&trio.desk_net, "/fast", best_effort());
+    for (talker, listener) in [(&slow, &hears_slow), (&fast, &hears_fast)] {
+        talker.wait_for_readers(1);
+        listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+    }
+    let [robots, desks] = ["robot", "desk"].map(|node| identity(node, false).node_id().to_string());
+    let over = |peer: &str| (of_peer(&cloud, peer, "peer_slowed"), of_peer(&cloud, peer, "peer_dropped"));
+    assert_eq!((over(&robots), over(&desks)), ((0, 0), (0, 0)));
+
+    // Reliable: all of it, in order, and not before its time. Half a second's worth may have been saved up.
+    let begun = Instant::now();
+    let payload = |n: u8| vec![n; 25_000];
+    (0..40).for_each(|n| slow.say(payload(n)));
+    let mut next = 0;
+    while next < 40 {
+        let heard = hears_slow.samples.recv_timeout(PATIENCE).expect("all arrive");
+        if heard.len() == 25_000 {
+            assert_eq!(heard[0], next);
+            next += 1;
+        }
+    }
+    let least = Duration::from_millis((1_000_000 - 262_144) * 8000 / RATE);
+    assert!(begun.elapsed() >= least, "1 MB in {:?}", begun.elapsed());
+    let (slowed, dropped) = over(&robots);
+    assert!(slowed > 0 && dropped == 0, "{slowed} slowed, {dropped} dropped");
+
+    // Best effort: what is over it is gone, and counted under the peer's name.
+    let deadline = Instant::now() + PATIENCE;
+    let mut said = 0;
+    while over(&robots).1 == 0 {
+        assert!(Instant::now() < deadline, "nothing is dropped");
+        for _ in 0..100 {
+            fast.say(vec![9; 1000]);
+            said += 1;
+        }
+    }
+    let dropped = over(&robots).1;
+    assert!(hears_fast.drain().len() as u64 + dropped <= said + 100);
+    let drops = cloud.status()["drops"].clone();
+    assert!(drops["over_rate"].as_u64().unwrap() >= dropped, "{drops}");
+    assert!(drops[format!("over_rate from {}", &robots[..8])].as_u64().unwrap() >= dropped, "{drops}");
+    assert_eq!(over(&desks), (0, 0));
+}
+
+/// A path to a router that carries so many bits a second towards it, and holds a tenth of a second's worth.
+fn narrow(router: u16, bits_per_second: u64) -> u16 {
+    let (near, far) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+    far.connect(("127.0.0.1", router)).unwrap();
+    let port = near.local_addr().unwrap().port();
+    let (near_too, far_too) = (near.try_clone().unwrap(), far.try_clone().unwrap());
+    let (queue, queued) = channel::<Vec<u8>>();
+    let waiting = Arc::new(AtomicUsize::new(0));
+    let (client, left) = (Arc::new(OnceLock::new()), waiting.clone());
+    let client_too = client.clone();
+    std::thread::spawn(move || {
+        let mut buffer = [0; 65_536];
+        while let Ok((n, from)) = near.recv_from(&mut buffer) {
+            let _ = client.set(from);
+            if waiting.load(SeqCst) as u64 <= bits_per_second / 80 {
+                waiting.fetch_add(n, SeqCst);
+                let _ = queue.send(buffer[..n].to_vec());
+            }
+        }
+    });
+    std::thread::spawn(move || {
+        let mut free = Instant::now();
+        for datagram in queued {
+            free = free.max(Instant::now())
+                + Duration::from_nanos(datagram.len() as u64 * 8_000_000_000 / bits_per_second);
+            std::thread::sleep(free.saturating_duration_since(Instant::now()));
+            left.fetch_sub(datagram.len(), SeqCst);
+            let _ = far.send(&datagram);
+        }
+    });
+    std::thread::spawn(move || {
+        let mut buffer = [0; 65_536];
+        while let Ok(n) = far_too.recv(&mut buffer) {
+            let _ = near_too.send_to(&buffer[..n], client_too.get().unwrap());
+        }
+    });
+    port
+}
+
+struct Ends<'a>(&'a AtomicBool);
+
+impl Drop for Ends<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, SeqCst);
+    }
+}
+
+#[test]
+fn commands_overtake_images_on_a_full_link() {
+    const IMAGE_BYTES: usize = 1_000_000;
+    /// Images that the link was given and has not delivered when the first command goes.
+    const BACKLOG: u64 = 5;
+    let mut trio = Trio::new();
+    let _cloud = trio.cloud();
+    let desk = trio.desk(&["/image", "/video", "/cmd_vel"]);
+    trio.port = narrow(trio.port, 40_000_000);
+    let share = |(topic, priority): (&str, Class)| ShareConfig {
+        topic: topic.into(),
+        type_name: None,
+        to: vec![Recipient::Node("desk".parse().unwrap())],
+        publish: vec![],
+        priority,
+        suite: Suite::Group,
+        metadata: ShareMetadata::default(),
+    };
+    let shares = [("/image", Class::Bulk), ("/video", Class::Bulk), ("/cmd_vel", Class::Realtime)];
+    let config = Config { shares: shares.into_iter().map(share).collect(), ..trio.config() };
+    let robot = Node::start(config, identity("robot", false), Some(&trio.robot_net));
+    let begin = |topic, qos: fn() -> Qos| {
+        let talker = Talker::new(&trio.robot_net, topic, qos());
+        let listener = Listener::new(&trio.desk_net, topic, qos());
+        talker.wait_for_readers(1);
+        listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+        (talker, listener)
+    };
+    let (images, hears_images) = begin("/image", all);
+    let (videos, hears_videos) = begin("/video", best_effort);
+    let (commands, hears_commands) = begin("/cmd_vel", all);
+
+    let numbered = |n: u64| {
+        let mut image = vec![0; IMAGE_BYTES];
+        image[..8].copy_from_slice(&n.to_be_bytes());
+        image
+    };
+    let (said, heard) = (AtomicU64::new(0), AtomicU64::new(0));
+    let is_over = AtomicBool::new(false);
+    let (said, heard, is_over) = (&said, &heard, &is_over);
+    std::thread::scope(|scope| {
+        // Also if something fails: the scope waits for its threads.
+        let end = Ends(is_over);
+        // Reliable ones: as many as are taken.
+        scope.spawn(|| {
+            while !is_over.load(SeqCst) {
+                let n = said.load(SeqCst);
+                images.say(numbered(n));
+                said.store(n + 1, SeqCst);
+            }
+        });
+        // Best effort: four times what the link carries.
+        scope.spawn(|| {
+            while !is_over.load(SeqCst) {
+                videos.say(numbered(0));
+                std::thread::sleep(Duration::from_millis(50));
+            }
+        });
+        // Every image arrives, in order.
+        scope.spawn(move || {
+            while !is_over.load(SeqCst) || heard.load(SeqCst) < said.load(SeqCst) {
+                match hears_images.samples.recv_timeout(PATIENCE) {
+                    Ok(image) if image.len() == IMAGE_BYTES => {
+                        let n = u64::from_be_bytes(image[..8].try_into().unwrap());
+                        assert_eq!(n, heard.fetch_add(1, SeqCst));
+                    }
+                    Ok(_) => {}
+                    Err(_) => panic!("{} of {} images", heard.load(SeqCst), said.load(SeqCst)),
+                }
+            }
+        });
+        wait("a backlog", || said.load(SeqCst) >= heard.load(SeqCst) + BACKLOG && heard.load(SeqCst) > 0);
+        let (mut overtaken, mut waited, mut times) = (0, 0, vec![]);
+        const COMMANDS: u64 = 30;
+        for n in 0..COMMANDS {
+            let (before, given) = (heard.load(SeqCst), said.load(SeqCst));
+            let begun = Instant::now();
+            commands.say(format!("command {n}"));
+            loop {
+                let command = hears_commands.samples.recv_timeout(PATIENCE).expect("each command arrives");
+                if command == format!("command {n}").as_bytes() {
+                    break;
+                }
+                assert!(n == 0 && command.starts_with(b"warm"), "{command:?} instead of {n}");
+            }
+            times.push(begun.elapsed());
+            let after = heard.load(SeqCst);
+            waited += after - before;
+            overtaken += given.saturating_sub(after);
+        }
+        times.sort();
+        let (median, longest) = (times[times.len() / 2], times[times.len() - 1]);
+        eprintln!("overtook {overtaken}, meanwhile {waited}; median {median:?}, longest {longest:?}");
+        drop(end);
+        // Meanwhile the network's own queue is emptied, half an image at most, and what two images share.
+        assert!(waited <= COMMANDS, "{waited} images arrived while {COMMANDS} commands were under way");
+        assert!(overtaken >= 2 * COMMANDS, "{COMMANDS} commands overtook {overtaken} images");
+    });
+    eprintln!("videos {} images {}", hears_videos.drain().len(), heard.load(SeqCst));
+    drop((robot, desk));
+}
