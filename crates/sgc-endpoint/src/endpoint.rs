@@ -437,6 +437,14 @@ impl Endpoint {
         }
     }
 
+    /// This node advertised with that number in an earlier run, and is not believed below it.
+    pub(crate) fn overtake(&mut self, seq: u64) {
+        if seq > self.advert_seq {
+            self.advert_seq = seq;
+            self.advertise_all();
+        }
+    }
+
     pub(crate) fn drop_frame(&mut self, why: Dropped) {
         self.outputs.push_back(Output::Dropped(why));
     }

@@ -206,6 +206,9 @@ impl Endpoint {
             Ok(advert) => advert,
             Err(why) => return self.drop_frame(Dropped::NotVerified { what: "advertisement", why }),
         };
+        if advert.owner.node_id == self.config.identity.node_id() {
+            return self.overtake(advert.body.seq);
+        }
         for name in advert.names {
             let Some(join) = self.joins.get_mut(&name).filter(|j| j.owner == advert.owner.node_id) else {
                 continue; // another name of the same batch

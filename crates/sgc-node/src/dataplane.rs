@@ -129,7 +129,8 @@ impl DataPlane {
     /// Counts a drop of something of `name` that came over `ingress`.
     pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
         debug!(%ingress, name = %name.short(), ?reason, "dropped");
-        let suspicious = matches!(reason, DataDrop::WrongWay | DataDrop::HopLimit | DataDrop::Malformed);
+        // What comes the wrong way may still have been under way when the way changed.
+        let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
         if self.drops.count_from(reason.key(), ingress) && suspicious {
             warn!(%ingress, ?reason, "a peer sends what it should not; dropped and counted from here on");
         }

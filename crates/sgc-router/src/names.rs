@@ -195,6 +195,10 @@ impl Router {
         if !from_router && owner != neighbour {
             return self.drop_frame(link, DropReason::NotOwner { owner });
         }
+        if owner == self.config.node && link != LinkId::LOCAL {
+            // What this node itself said, perhaps in a run whose clock was ahead: its endpoint has to go on from there.
+            return self.send(LinkId::LOCAL, Control::Advert { cost, signed });
+        }
         let (seq, withdraw) = (advert.body.seq, advert.body.withdraw);
         if let Some(floor) = self.topology.node(&owner).map(|n| n.floor).filter(|floor| seq < *floor) {
             return self.drop_frame(link, DropReason::Stale { seq, known: floor });
@@ -209,6 +213,9 @@ impl Router {
             .filter(|n| self.config.transit || link == LinkId::LOCAL || self.names.watchers.contains_key(n))
             .collect();
         if let Some(known) = known.filter(|known| *known >= seq && news.is_empty()) {
+            if owner == neighbour && seq < known {
+                self.tell_newer(link, &advert.names);
+            }
             return self.drop_frame(link, DropReason::Stale { seq, known });
         }
         if withdraw {
@@ -241,6 +248,19 @@ impl Router {
         let frames = [Control::Advert { cost: 0, signed }];
         self.tell_routers(link, &owner, &news, &frames);
         self.routes_changed(&news);
+    }
+
+    /// An owner says what is older than what it said before: it should hear of that.
+    fn tell_newer(&mut self, link: LinkId, names: &[Name]) {
+        let newest = names.iter().filter_map(|name| {
+            let live = self.names.record(name).map(|r| (r.seq, &r.signed));
+            let withdrawn = self.names.tombstones.get(name).map(|t| (t.seq, &t.withdrawal));
+            live.into_iter().chain(withdrawn).max_by_key(|(seq, _)| *seq)
+        });
+        if let Some((_, signed)) = newest.max_by_key(|(seq, _)| *seq) {
+            let signed = signed.clone();
+            self.send(link, Control::Advert { cost: 0, signed });
+        }
     }
 
     /// The bound that these names would exceed.

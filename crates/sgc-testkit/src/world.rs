@@ -10,7 +10,7 @@ use sgc_router::{LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, LinkStateBody, Metadata,
-    Name, Packet, SinkId, SourceOffer,
+    Name, Packet, SinkId, SourceId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -43,6 +43,8 @@ pub struct WorldConfig {
     pub jitter: RangeInclusive<Duration>,
     /// How many of a hundred best-effort packets each link loses.
     pub loss_percent: usize,
+    /// How many of a hundred best-effort packets come twice, and how many are overtaken by later ones.
+    pub repeat_percent: usize,
     /// How routers come to know where names are, drawn for each.
     pub mappings: Vec<MappingKind>,
     /// Bounds of the routers.
@@ -59,6 +61,7 @@ impl WorldConfig {
             latency: Duration::from_millis(1)..=Duration::from_millis(40),
             jitter: Duration::ZERO..=Duration::from_millis(3),
             loss_percent: 0,
+            repeat_percent: 0,
             mappings: vec![MappingKind::Flood],
             router_limits: sgc_router::Limits::default(),
             endpoint_limits: sgc_endpoint::Limits::default(),
@@ -101,10 +104,15 @@ pub struct World {
     published: Vec<Published>,
     pub(crate) captured: Option<Vec<Captured>>,
     pub(crate) captured_packets: Vec<CapturedPacket>,
+    /// How often each packet went over each wire in each direction, if that is counted.
+    copies: Option<BTreeMap<Carried, usize>>,
     trace: Vec<String>,
     tracing: Tracing,
     steps: usize,
 }
+
+/// A packet on a wire: wire, sending side, source, message, fragment, addressee.
+type Carried = (usize, usize, SourceId, u64, u16, Option<SinkId>);
 
 impl World {
     /// A world of [`WorldConfig::new`].
@@ -130,6 +138,7 @@ impl World {
             published: Vec::new(),
             captured: None,
             captured_packets: Vec::new(),
+            copies: None,
             trace: Vec::new(),
             tracing: match std::env::var("SGC_TRACE").as_deref() {
                 Err(_) => Tracing::Transitions,
@@ -260,6 +269,30 @@ impl World {
         for (wire, side) in links {
             self.queue(self.clock.instant() + after, Pending::Quality { wire, to: 1 - side, suspect });
         }
+    }
+
+    /// Takes from a node that does not run what it keeps over restarts: whom it has heard to be revoked.
+    pub fn wipe(&mut self, node: NodeKey) {
+        assert!(!self.is_running(node), "a running node keeps what it knows");
+        self.note(format!("wipe {node:?}"));
+        self.nodes[node.0].anchors = None;
+    }
+
+    /// Counts from here on how often each packet goes over each wire.
+    pub fn count_copies(&mut self) {
+        self.copies = Some(BTreeMap::new());
+    }
+
+    /// The packets that went over a wire in one direction more than once since [`Self::count_copies`], which ends.
+    pub fn copied(&mut self) -> Vec<String> {
+        let copies = self.copies.take().unwrap_or_default();
+        let name = |wire: usize, side: usize| {
+            let ends = &self.wires[wire].ends;
+            format!("{:?} to {:?}", ends[side].node, ends[1 - side].node)
+        };
+        let many = copies.iter().filter(|(_, n)| **n > 1);
+        many.map(|((wire, side, _, seq, ..), n)| format!("{seq} from {} {n} times", name(*wire, *side)))
+            .collect()
     }
 
     // ---- Cables.
@@ -884,6 +917,16 @@ impl World {
             let (name, ingress) = (packet.header.name, self.wires[wire].ends[side].link);
             let node = self.wires[wire].ends[side].node;
             return self.write_log(node, What::DataDrop { name, ingress, why: DataDrop::Lost });
+        }
+        if let Some(copies) = &mut self.copies {
+            let header = &packet.header;
+            *copies.entry((wire, side, header.source, header.seq, header.index, header.to)).or_default() += 1;
+        }
+        if !packet.header.reliable && self.dice.chance(self.config.repeat_percent) {
+            // As datagrams are: once more, later, and past the order.
+            let late = self.cables[self.wires[wire].cable].latency * self.dice.below(4) as u32;
+            let at = self.clock.instant() + late;
+            self.queue(at, Pending::Packet { wire, to: 1 - side, packet: packet.clone() });
         }
         let Wire { cable, ends, .. } = &mut self.wires[wire];
         let takes = self.cables[*cable].latency + self.dice.time(&self.config.jitter);

@@ -9,7 +9,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
 use sgc_endpoint::SinkDrop;
-use sgc_router::DropReason;
+use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
     DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig, revocation_list,
 };
@@ -21,9 +21,9 @@ const COMMITTED: &[u64] = &[
     1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31,
     32, 33, 35, 36, 37, 38, 39, 40,
 ];
-/// Longest time from the last transition until all is as it should be: a lease for owners that vanished, a
-/// renewal for routes that wait for one, the longest wait between attempts to join, and idle time-outs.
-const QUIET_MAX: Duration = Duration::from_secs(120);
+/// Longest time from the last transition until all is as it should be: a lease, for what was not believed while a clock
+/// was wrong or not heard of during a partition. All else takes seconds.
+const QUIET_MAX: Duration = Duration::from_secs(330);
 const IDLE_MAX: Duration = Duration::from_secs(10);
 /// How long the word that a right has ended may take to the farthest router.
 const LAPSE_MAX: Duration = Duration::from_secs(2);
@@ -36,6 +36,8 @@ const fn ms(n: u64) -> Duration {
 /// Everything that can happen to a network of honest nodes.
 #[derive(Clone, Debug)]
 enum Transition {
+    /// A wall clock is off by so many seconds, until all is quiet.
+    Clock(NodeKey, i64),
     Crash(NodeKey),
     CrashUnseen(NodeKey, Duration),
     Cut(NodeKey, NodeKey),
@@ -44,7 +46,11 @@ enum Transition {
     Rejoin(NodeKey, NodeKey),
     Reshare(NodeKey, &'static str, Sharing),
     Restart(NodeKey),
+    /// With nothing that it had on disk.
+    RestartWiped(NodeKey),
     Revoke(NodeKey, NodeKey),
+    /// A proxy leaves one router for another.
+    Roam(NodeKey, NodeKey, NodeKey),
     Rotate(NodeKey, &'static str),
     Share(NodeKey, &'static str, Sharing),
     ShutDown(NodeKey),
@@ -77,6 +83,11 @@ struct Run {
     /// overtake the word of it.
     lapsing: Vec<(NodeKey, &'static str, BTreeSet<NodeKey>, Duration)>,
     revoked: Vec<NodeKey>,
+    routers: Vec<NodeKey>,
+    /// Nodes whose clocks are wrong.
+    wrong_clocks: BTreeSet<NodeKey>,
+    /// True once any was.
+    clocks: bool,
     slowest: Duration,
 }
 
@@ -86,10 +97,18 @@ impl Run {
         let mut config = WorldConfig::new(dice.number());
         config.seed = seed;
         config.jitter = Duration::ZERO..=ms([0, 3, 50][dice.below(3)]);
+        let (flood, query) = (MappingKind::Flood, MappingKind::Query);
+        config.mappings = [vec![flood], vec![query], vec![flood, query]][dice.below(3)].clone();
+        config.repeat_percent = [0, 10][dice.below(2)];
         let mut world = World::with(config);
         let mut members = Vec::new();
         let mut routers = Vec::new();
-        for n in 0..dice.within(1..=6) {
+        let many = match dice.below(40) {
+            0 => 21..=50,
+            1..4 => 7..=20,
+            _ => 1..=6,
+        };
+        for n in 0..dice.within(many) {
             routers.push(if dice.chance(20) {
                 let both = world.node(Member::new(&format!("both-{n}")), true);
                 members.push(both);
@@ -134,6 +153,9 @@ impl Run {
             permitted: BTreeMap::new(),
             lapsing: Vec::new(),
             revoked: Vec::new(),
+            routers,
+            wrong_clocks: BTreeSet::new(),
+            clocks: false,
             slowest: Duration::ZERO,
         }
     }
@@ -152,7 +174,20 @@ impl Run {
         let topic = TOPICS[dice.below(TOPICS.len())];
         let idle = Duration::ZERO..=IDLE_MAX;
         let mine: Vec<_> = self.shared.keys().copied().collect();
-        Some(match dice.below(112) {
+        Some(match dice.below(124) {
+            112..116 => {
+                let (router, proxy) = dice.pick(&whole).filter(|(r, p)| {
+                    self.routers.contains(r) && !self.routers.contains(p) && self.members.contains(p)
+                })?;
+                let linked = |r: &NodeKey| self.cables.contains(&(*r, proxy));
+                let free: Vec<_> = self.routers.iter().copied().filter(|r| !linked(r)).collect();
+                Transition::Roam(proxy, router, dice.pick(&free)?)
+            }
+            116..120 => {
+                let off = [5, 300, 590, 700, 5000][dice.below(5)] as i64;
+                Transition::Clock(dice.pick(&nodes)?, if dice.chance(50) { off } else { -off })
+            }
+            120..124 => Transition::RestartWiped(dice.pick(&up)?),
             100..104 => dice.pick(&mine).map(|(n, t)| Transition::Rotate(n, t))?,
             104..110 => {
                 let (n, t) = dice.pick(&mine)?;
@@ -198,6 +233,25 @@ impl Run {
     fn apply(&mut self, transition: Transition) {
         let world = &mut self.world;
         match transition {
+            Transition::Clock(n, seconds) => {
+                self.clocks = true;
+                self.wrong_clocks.insert(n);
+                let by = Duration::from_secs(seconds.unsigned_abs());
+                world.note(format!("clock of {n:?} is off by {seconds} s"));
+                if seconds > 0 { world.set_ahead(n, by) } else { world.set_behind(n, by) }
+            }
+            Transition::RestartWiped(n) => {
+                world.crash(n);
+                world.wipe(n);
+                world.run(ms(50));
+                world.start(n);
+            }
+            Transition::Roam(proxy, from, to) => {
+                world.cut(from, proxy);
+                self.cut.insert((from, proxy));
+                world.link(to, proxy);
+                self.cables.push((to, proxy));
+            }
             Transition::Crash(n) => world.crash(n),
             Transition::CrashUnseen(n, idle) => world.crash_unseen(n, idle),
             Transition::Cut(a, b) => {
@@ -297,6 +351,9 @@ impl Run {
 
     /// Waits until all is as the model says, then checks that messages go where they should.
     fn quiet(&mut self) {
+        for node in std::mem::take(&mut self.wrong_clocks) {
+            self.world.set_ahead(node, Duration::ZERO);
+        }
         let begin = self.world.elapsed();
         // What nobody noticed yet may look as it should.
         self.pass(IDLE_MAX + ms(500));
@@ -313,6 +370,7 @@ impl Run {
         // A sink holds what it was granted a moment before the data path and its history follow.
         self.pass(ms(2500));
         let mut expected = BTreeMap::new();
+        self.world.count_copies();
         for (owner, topic) in self.shared.keys().copied().collect::<Vec<_>>() {
             if !self.world.is_running(owner) {
                 continue;
@@ -325,6 +383,8 @@ impl Run {
             }
         }
         self.pass(ms(1500));
+        let copied = self.world.copied();
+        assert!(copied.is_empty(), "more than one copy over a link: {copied:?}");
         for (id, nodes) in expected {
             let received: Vec<_> =
                 self.world.all_received().iter().filter(|r| r.id == id).map(|r| r.node).collect();
@@ -393,22 +453,25 @@ impl Run {
         }
     }
 
-    /// Honest nodes give each other no reason for suspicion.
+    /// Honest nodes give each other no reason for suspicion, unless their clocks are wrong.
     fn check_log(&self) {
+        let clock = |why: &SignedError| self.clocks && matches!(why, SignedError::Clock { .. });
         for logged in self.world.log() {
             let fine = match &logged.what {
-                What::RouterDrop(dropped) => matches!(
-                    dropped.reason,
-                    DropReason::Unknown { .. }
+                What::RouterDrop(dropped) => {
+                    matches!(
+                        dropped.reason,
+                        DropReason::Unknown { .. }
                         | DropReason::WrongWay { .. }
                         | DropReason::Stale { .. }
                         // Passed on by those who have not heard of it.
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
-                ),
+                    ) || matches!(&dropped.reason, DropReason::NotVerified { why, .. } if clock(why))
+                }
                 What::EndpointDrop(dropped) => match dropped {
                     sgc_endpoint::Dropped::Unexpected { .. } => true,
                     sgc_endpoint::Dropped::NotVerified { why, .. } => {
-                        matches!(why, SignedError::Cert(CertError::Revoked { .. }))
+                        matches!(why, SignedError::Cert(CertError::Revoked { .. })) || clock(why)
                     }
                     _ => false,
                 },
