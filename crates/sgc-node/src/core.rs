@@ -27,6 +27,7 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::publish::{Offer, Publishing};
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
+use crate::finding::Board;
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
@@ -194,6 +195,7 @@ pub(crate) struct Core<N: RosNetwork> {
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
+    board: Board,
 }
 
 /// What a [`Core`] is made of.
@@ -228,6 +230,8 @@ pub(crate) struct CoreParts<N> {
     pub transport: Arc<sgc_transport::TransportMetrics>,
     /// Where is kept who was granted what.
     pub audit: Audit,
+    /// How routers are being found.
+    pub(crate) board: Board,
 }
 
 /// The present, by both clocks.
@@ -276,6 +280,7 @@ impl<N: RosNetwork> Core<N> {
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
+            board: parts.board,
         };
         (core, requested)
     }
@@ -495,6 +500,7 @@ impl<N: RosNetwork> Core<N> {
             self.trust(anchors);
             self.drain();
         }
+        self.close_not_admitted();
     }
 
     /// Stops taking in; what is queued still leaves.
@@ -545,6 +551,7 @@ impl<N: RosNetwork> Core<N> {
         let mut drops = self.control_drops.snapshot();
         drops.extend(self.data.drops().snapshot());
         drops.extend(self.ros_failures.snapshot());
+        drops.extend(self.board.drops().snapshot());
         drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
         let router = self.router.stats();
         Status {
@@ -552,6 +559,7 @@ impl<N: RosNetwork> Core<N> {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),
+            routers: self.board.snapshot(),
             routes: self
                 .routes
                 .iter()
