@@ -312,14 +312,40 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
 
 #[test]
 fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() {
-    let a = Lab::new(&["spy"]);
-    let b = a.beside("b");
+    let (ops, b) = shared_router();
+    let a = ops.beside("a");
+    a.enroll("spy", |_| {});
+    // The owner does not even believe the spy's CA.
+    spy_gets_nothing(&ops, &a, &b, |robot, _| {
+        let status = robot.status();
+        status["drops"].as_object().unwrap().iter().any(|(key, n)| key.contains("not_verified") && n != 0)
+    });
+}
+
+#[test]
+fn a_node_of_the_routers_own_fleet_cannot_join_a_name_of_another() {
+    let (ops, b) = shared_router();
+    ops.enroll("spy", |_| {});
+    // The owner believes that CA, since the router is of it; "*" is its own fleet alone.
+    spy_gets_nothing(&ops, &ops, &b, |_, spy| {
+        spy.route_state() == "refused: the owner does not share it with this node"
+    });
+}
+
+/// A fleet with a router, and one with a robot and a desk.
+fn shared_router() -> (Lab, Lab) {
+    let ops = Lab::new(&[]);
+    let b = ops.beside("b");
     b.enroll("robot", |_| {});
     b.enroll("desk", |_| {});
-    let ca_of = |lab: &Lab| lab.ca().0;
-    let accept = vec![ca_of(&a), ca_of(&b)];
-    let cloud = a.cloud_with(|config| config.accept = accept);
-    let trusting = |config: &mut Config| config.trust = vec![ca_of(&a)];
+    (ops, b)
+}
+
+/// A spy of fleet `a` asks for a topic that a robot shares with all of fleet `b`, over the router of `ops`.
+fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Node) -> bool) {
+    let accept = vec![a.ca().0, b.ca().0];
+    let cloud = ops.cloud_with(|config| config.accept = accept);
+    let trusting = |config: &mut Config| config.trust = vec![ops.ca().0];
     let mut shared = share("/chatter", &["*"]);
     shared.type_name = Some("std_msgs/msg/String".into());
     let robot = b.start("robot", |config| {
@@ -335,8 +361,8 @@ fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() 
     talker.wait_for_readers(1);
     warm_up(&talker, &[&listener]);
 
-    // The spy knows even what only the fleet knows: the secret of this topic. No token was given, so the owner has
-    // nobody of that CA in its policy.
+    // The spy knows even what only the fleet knows: the secret of this topic. No token was given, so nobody of its CA is
+    // in the owner's policy.
     let owner = b.identity("robot");
     let metadata = sgc_node::policy::metadata(&shared, "robot");
     let token = ShareToken {
@@ -349,28 +375,24 @@ fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() 
         metadata,
     };
     let name = token.name().to_string();
-    assert!(robot.status()["routes"].as_array().unwrap().iter().any(|route| route["name"] == name.as_str()));
-    let spy = a.start("spy", |config| config.tokens = vec![TokenSource::Text(Box::new(token))]);
+    assert_eq!(robot.status()["routes"][0]["name"], name.as_str());
+    let branches = || cloud.status()["router"]["branches"].as_u64();
+    let before = branches();
+    let spy = a.start("spy", |config| {
+        trusting(config);
+        config.tokens = vec![TokenSource::Text(Box::new(token))];
+    });
     let stolen = a.listener("spy", "/chatter");
-    // Its request reaches the owner, which does not believe its CA at all.
-    let not_verified = || {
-        robot.status()["drops"]
-            .as_object()
-            .unwrap()
-            .keys()
-            .any(|key| key.contains("not_verified") || key.contains("join"))
-    };
-    wait("the owner refuses it", not_verified);
+    wait("its request passes the router and not the owner", || is_refused(&robot, &spy));
     talker.say("not for spies");
     wait("the desk hears it", || listener.drain().iter().any(|heard| heard == "not for spies"));
     stolen.hears_nothing();
     assert_eq!(writers(&a.net("spy"), "/chatter"), 0);
     assert!(links(&spy) == 1 && cloud.peers().len() == 3);
-    // Nor does a branch of the tree lead to it: data does not even come near.
-    let names = spy.status()["names"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .any(|n| n["name"] == name.as_str() && n["packets"] != 0);
-    assert!(!names);
+    // No packet came near it, and no branch is left that would bring one.
+    let status = spy.status();
+    assert!(
+        status["names"].as_array().unwrap().iter().all(|n| n["name"] != name.as_str() || n["packets"] == 0)
+    );
+    wait("no branch leads to it", || branches() == before);
 }

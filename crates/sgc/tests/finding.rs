@@ -130,7 +130,9 @@ impl Place {
             if Instant::now() >= deadline {
                 for entry in std::fs::read_dir(self.dir.path()).unwrap().flatten() {
                     let name = entry.file_name().to_string_lossy().into_owned();
-                    name.strip_suffix(".log").map(|node| say(&format!("{node}:\n{}", self.log(node))));
+                    if let Some(node) = name.strip_suffix(".log") {
+                        say(&format!("{node}:\n{}", self.log(node)));
+                    }
                 }
                 panic!("never: {what}");
             }
