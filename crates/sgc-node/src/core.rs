@@ -18,7 +18,7 @@ use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{DiscoveryEvent, EndpointSpec, RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
-use sgc_transport::{AnyLink, CredentialStore, Link};
+use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
 use sgc_trust::{CrlError, Identity, TrustAnchors};
 use sgc_wire::{Control, Credentials, Name, Now, RefuseReason, SinkId, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
@@ -29,6 +29,7 @@ use crate::core::publish::{Offer, Publishing};
 use crate::core::quality::Pulse;
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
+use crate::finding::Board;
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
@@ -205,6 +206,7 @@ pub(crate) struct Core<N: RosNetwork> {
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
+    board: Board,
 }
 
 /// What a [`Core`] is made of.
@@ -241,6 +243,8 @@ pub(crate) struct CoreParts<N> {
     pub transport: Arc<sgc_transport::TransportMetrics>,
     /// Where is kept who was granted what.
     pub audit: Audit,
+    /// How routers are being found.
+    pub(crate) board: Board,
 }
 
 /// The present, by both clocks.
@@ -291,6 +295,7 @@ impl<N: RosNetwork> Core<N> {
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
+            board: parts.board,
         };
         (core, requested)
     }
@@ -340,7 +345,10 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkUp { link, url, control, reply } => {
                 let id = LinkId(self.next_link);
                 self.next_link += 1;
-                let neighbour = Neighbour::from(link.peer());
+                let set =
+                    url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
+                let cost = set.map(|ms| ms.saturating_mul(1000));
+                let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
                 let remote = link.remote();
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
@@ -516,6 +524,7 @@ impl<N: RosNetwork> Core<N> {
             self.trust(anchors);
             self.drain();
         }
+        self.close_not_admitted();
     }
 
     /// Stops taking in; what is queued still leaves.
@@ -574,6 +583,7 @@ impl<N: RosNetwork> Core<N> {
         drops.extend(self.data.drops().snapshot());
         drops.extend(self.data.rates().drops());
         drops.extend(self.ros_failures.snapshot());
+        drops.extend(self.board.drops().snapshot());
         drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
         let router = self.router.stats();
         Status {
@@ -581,6 +591,7 @@ impl<N: RosNetwork> Core<N> {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),
+            routers: self.board.snapshot(),
             routes: self
                 .routes
                 .iter()

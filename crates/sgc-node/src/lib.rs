@@ -12,6 +12,7 @@ pub mod config;
 mod core;
 mod credentials;
 mod dataplane;
+mod finding;
 mod fleet_file;
 mod labels;
 mod links;
@@ -32,6 +33,7 @@ mod stats;
 mod status;
 mod tell;
 
+pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,

@@ -2,14 +2,17 @@
 //!
 //! Control frames go to the control task; packets go straight to the data path, on the task that read them.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use rand_core::{OsRng, TryRngCore};
+use rand_chacha::ChaCha20Rng;
+use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
-    AnyLink, CloseReason, Dialer, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
+    AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, Listener, Refusal,
 };
+use sgc_trust::CertError;
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
@@ -18,14 +21,13 @@ use tracing::{debug, info, warn};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
+use crate::finding::{Aim, BACKOFF_MAX, Claim, Claims, Failure, Holder, Line, wait};
 use crate::labels::{LabelBook, NameLabel, Progress};
 use crate::peer_rate::PeerRate;
 use crate::stats::DataDrop;
 
 /// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
 const CONTROL_FRAMES_MAX: usize = 8192;
-const BACKOFF_MIN: Duration = Duration::from_millis(250);
-const BACKOFF_MAX: Duration = Duration::from_secs(10);
 /// How long a link that replaces another may take until the other goes.
 const SETTLE_MAX: Duration = Duration::from_secs(5);
 /// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
@@ -58,78 +60,46 @@ impl ControlTx {
     }
 }
 
-/// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
+/// Serves a link, and in its place each one that is made because the credentials changed (`redial`), or because it is
+/// to lead elsewhere (`aim`); returns when the last of them has ended.
 ///
-/// Each change of `redial` says that the credentials changed: a second link is made with what they are by then, and
-/// the first one taken down only when both sides have told each other what they know on the second. As long as that fails, the first stays.
-pub(crate) async fn keep_dialled(
-    url: LinkUrl,
-    dialer: Arc<Dialer>,
-    core: mpsc::Sender<CoreEvent>,
-    mut redial: watch::Receiver<()>,
-) {
-    let mut failures = 0u32;
-    loop {
-        // What changes from here on may come too late for this attempt.
-        redial.mark_unchanged();
-        match dialer.dial(&url).await {
-            Ok(link) => {
-                failures = 0;
-                let end = keep_renewed(link, &url, &dialer, &core, &mut redial).await;
-                info!(%url, "link ended: {end}");
-            }
-            Err(error) => {
-                // The first failure is news, the tenth is not.
-                if failures == 0 {
-                    warn!("cannot connect: {error}; trying again until it works");
-                } else {
-                    debug!("cannot connect: {error}");
-                }
-                failures = failures.saturating_add(1);
-            }
-        }
-        if core.is_closed() {
-            return;
-        }
-        tokio::time::sleep(backoff(failures)).await;
-    }
-}
-
-/// How long to wait after so many failures in a row.
-fn backoff(failures: u32) -> Duration {
-    let wait = (BACKOFF_MIN * 2u32.saturating_pow(failures.saturating_sub(1).min(10))).min(BACKOFF_MAX);
-    let jitter = f64::from(OsRng.try_next_u32().unwrap_or(0) % 1000) / 1000.0;
-    wait.mul_f64(0.5 + jitter / 2.0)
-}
-
-/// Serves a link, and in its place each one that is made on request; returns when the last of them has ended.
-async fn keep_renewed(
+/// The new link is made while the old one is up, which is taken down only when both sides have told each other what they
+/// know on the new one. As long as that fails, the old one stays.
+pub(crate) async fn keep_renewed(
     link: AnyLink,
-    url: &LinkUrl,
-    dialer: &Dialer,
-    core: &mpsc::Sender<CoreEvent>,
-    redial: &mut watch::Receiver<()>,
+    mut aim: watch::Receiver<Aim>,
+    mut redial: watch::Receiver<()>,
+    holder: &Holder,
+    mut claim: Claim,
+    line: &Line,
 ) -> LinkError {
-    let mut current = Served::start(link, Some(url.to_string()), core).await;
+    let core = &holder.core;
+    let url = aim.borrow().url.to_string();
+    let mut current = Served::start(link, Some(url), core).await;
+    // For jitter alone.
+    let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
     let mut failures = None;
     loop {
         let next = async {
             match failures {
-                None => {
-                    if redial.changed().await.is_err() {
-                        std::future::pending::<()>().await;
-                    }
-                }
-                Some(failures) => tokio::time::sleep(backoff(failures)).await,
+                None => tokio::select! {
+                    () = changed(&mut redial) => {}
+                    () = changed(&mut aim) => {}
+                },
+                Some(failures) => tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await,
             }
             redial.mark_unchanged();
-            dialer.dial(url).await
+            let aim = aim.borrow_and_update().clone();
+            let link = holder.dial(&aim).await?;
+            let claim = holder.claim_again(&link, &claim)?;
+            Ok::<_, Failure>((link, aim, claim))
         };
         tokio::select! {
             end = current.end(core) => return end,
             dialled = next => match dialled {
-                Ok(link) => {
-                    let next = Served::start(link, Some(url.to_string()), core).await;
+                Ok((link, aim, other)) => {
+                    let node = link.peer().node_id;
+                    let next = Served::start(link, Some(aim.url.to_string()), core).await;
                     tokio::select! {
                         () = next.settled() => {
                             failures = None;
@@ -137,19 +107,25 @@ async fn keep_renewed(
                             tokio::spawn(old.retire(core.clone()));
                         }
                         end = next.end(core) => {
-                            warn!("the link with the new credentials ended: {end}; the old one stays and it is tried again");
+                            warn!("the link that was to take over ended: {end}; the old one stays and it is tried again");
                             failures = Some(failures.unwrap_or(0).saturating_add(1));
+                            continue;
                         }
                         end = current.end(core) => {
-                            info!(%url, "link ended: {end}");
+                            info!(url = %aim.url, "link ended: {end}");
                             (current, failures) = (next, None);
                         }
                     }
-                }
-                Err(error) => {
-                    if failures.is_none() {
-                        warn!("cannot connect with the new credentials: {error}; the old link stays and it is tried again");
+                    line.linked(&aim, &node);
+                    if let Some(other) = other {
+                        claim = other;
                     }
+                }
+                Err(why) => {
+                    if failures.is_none() {
+                        warn!("cannot connect anew: {why}; the old link stays and it is tried again");
+                    }
+                    line.noted(&why.to_string());
                     failures = Some(failures.unwrap_or(0).saturating_add(1));
                 }
             }
@@ -157,13 +133,26 @@ async fn keep_renewed(
     }
 }
 
+/// Waits for a change; for ever if there can be none any more.
+async fn changed<T>(watched: &mut watch::Receiver<T>) {
+    if watched.changed().await.is_err() {
+        std::future::pending().await
+    }
+}
+
+/// What those who come are let in by.
+pub(crate) struct Door {
+    pub(crate) core: mpsc::Sender<CoreEvent>,
+    pub(crate) credentials: CredentialStore,
+    pub(crate) claims: Claims,
+    pub(crate) audit: Audit,
+}
+
 /// Accepts links until the node ends.
-pub(crate) async fn keep_accepting(
-    mut listener: Listener,
-    core: mpsc::Sender<CoreEvent>,
-    mut stop: oneshot::Receiver<()>,
-    audit: Audit,
-) {
+pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop: oneshot::Receiver<()>) {
+    let Door { core, credentials, claims, audit } = door;
+    // At most one for each CA that is trusted.
+    let mut strangers = BTreeSet::new();
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
@@ -171,15 +160,27 @@ pub(crate) async fn keep_accepting(
         };
         match accepted {
             Some(Ok(link)) => {
-                let core = core.clone();
+                let (core, credentials, claims) = (core.clone(), credentials.clone(), claims.clone());
                 tokio::spawn(async move {
+                    let _arrival = claims.note_arrival(link.peer().node_id);
                     let remote = link.remote();
-                    let end = Served::start(link, None, &core).await.end(&core).await;
+                    let served = Served::start(link.clone(), None, &core).await;
+                    // What changed since the handshake; the control task knows of the link from here on.
+                    if !credentials.admits(link.peer()) {
+                        link.close(CloseReason::not_admitted());
+                    }
+                    let end = served.end(&core).await;
                     info!(%remote, "link ended: {end}");
                 });
             }
             Some(Err(refused)) => {
-                warn!("{refused}");
+                match &refused.reason {
+                    // It is said once what to do about it.
+                    Refusal::Certificate(CertError::NotAdmitted { ca }) if !strangers.insert(*ca) => {
+                        debug!("{refused}");
+                    }
+                    _ => warn!("{refused}"),
+                }
                 let record = AuditRecord::new(AuditEvent::LinkRefused).remote(refused.remote);
                 audit.write(record.reason(&refused.reason));
             }
@@ -451,12 +452,13 @@ mod tests {
     use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
     use rand_core::OsRng;
-    use sgc_transport::{CredentialStore, LinkOptions, RefusalKind, TransportMetrics};
+    use sgc_transport::{CredentialStore, Dialer, LinkOptions, RefusalKind, TransportMetrics};
     use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
     use sgc_wire::{Hello, Label};
 
     use super::*;
     use crate::core::now;
+    use crate::finding::{Board, Dns, keep_at};
 
     /// What a control task was told, as far as links go.
     #[derive(Debug, PartialEq)]
@@ -546,16 +548,27 @@ mod tests {
             let options = LinkOptions::default();
             let doors = Arc::<TransportMetrics>::default();
             let listener = Listener::bind(&addr, router.clone(), options.clone(), doors.clone()).unwrap();
-            let url = listener.local().to_string().parse().unwrap();
+            let url: sgc_transport::LinkUrl = listener.local().to_string().parse().unwrap();
             let (far_closes, mute) = (Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
             let (close_far, closing) = mpsc::channel(1);
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            tokio::spawn(keep_accepting(listener, far_core, stopped, Audit::default()));
+            let door = Door {
+                core: far_core,
+                credentials: router.clone(),
+                claims: Claims::default(),
+                audit: Audit::default(),
+            };
+            tokio::spawn(keep_accepting(listener, door, stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
-            tokio::spawn(keep_dialled(url, dialer, near_core, on_redial));
+            let me = arm.identity().node_id();
+            let (dns, claims) = (Dns::default(), Claims::default());
+            let holder = Holder { me, dialer, dns, core: near_core, redial: on_redial, claims };
+            let line = Board::default().line(&url, "static");
+            let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
+            tokio::spawn(keep_at(url, holder, line, rng));
             Self { fleet, arm, router, redial, near, far, doors, far_closes, mute, close_far, _stop: stop }
         }
 
@@ -579,11 +592,13 @@ mod tests {
         let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
         let addr = "quic://127.0.0.1:0".parse().unwrap();
         let (router, arm) = (CredentialStore::new(enroll(&fleet, "router")), enroll(&fleet, "arm"));
-        let listener = Listener::bind(&addr, router, LinkOptions::default(), Arc::default()).unwrap();
+        let options = LinkOptions::default();
+        let listener = Listener::bind(&addr, router.clone(), options, Arc::default()).unwrap();
         let url = listener.local().to_string().parse().unwrap();
         let (core, _told) = control_task(Arc::default(), Arc::default(), mpsc::channel(1).1);
         let (_stop, stopped) = oneshot::channel();
-        tokio::spawn(keep_accepting(listener, core, stopped, Audit::default()));
+        let door = Door { core, credentials: router, claims: Claims::default(), audit: Audit::default() };
+        tokio::spawn(keep_accepting(listener, door, stopped));
         let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
         let hello = Hello { minor: 0, incarnation: 9, transit: false };

@@ -1,6 +1,7 @@
 //! A node from configuration to clean shutdown: wires machines, sockets and the local network, and takes them
 //! apart again.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -23,10 +24,11 @@ use tracing::{info, warn};
 
 use crate::admin;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
-use crate::config::{Config, DiscoveryRange, RosConfig};
+use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
-use crate::links::{keep_accepting, keep_dialled};
+use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted};
+use crate::links::{Door, keep_accepting};
 use crate::message_keys;
 use crate::peer_rate::PeerRates;
 use crate::reload::{ConfigSource, Reloader, Running};
@@ -90,6 +92,14 @@ pub enum NodeError {
         "this identity is a router's and holds no fleet secret: it can neither share nor use. Enroll the node without --router"
     )]
     RouterIdentity,
+    /// A router's identity cannot tell nodes by their names.
+    #[error(
+        "`routers` names \"mdns://{node}\", but this identity is a router's and cannot tell nodes by their names: write \"mdns://\""
+    )]
+    NamelessIdentity {
+        /// The router that is wanted.
+        node: String,
+    },
     /// A node that uses a topic of its own.
     #[error("[[use]] from {node:?}: that is this node itself")]
     UseOfOwn {
@@ -141,6 +151,8 @@ pub struct RunOptions {
     pub source: Option<ConfigSource>,
     /// Each message has the configuration read again, as SIGHUP does.
     pub reload: Option<mpsc::Receiver<()>>,
+    /// The port of mDNS, if not its own: so that tests have a local network each.
+    pub mdns_port: Option<u16>,
 }
 
 /// Reads an identity file, which must be its owner's alone.
@@ -174,7 +186,27 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     if let Some(own) = config.uses.iter().find(|u| u.from.as_str() == certified) {
         return Err(NodeError::UseOfOwn { node: own.from.to_string() });
     }
+    wanted_nearby(&config.routers, &identity)?;
     Ok(identity)
+}
+
+/// Which routers of the local network are wanted, if any are.
+fn wanted_nearby(routers: &[RouterUrl], identity: &Identity) -> Result<Option<Wanted>, NodeError> {
+    let mut any = false;
+    let (mut written, mut nodes) = (Vec::new(), BTreeSet::new());
+    for url in routers {
+        let RouterUrl::Mdns(node) = url else { continue };
+        written.push(url.to_string());
+        match node {
+            None => any = true,
+            Some(node) => {
+                let id = identity.node_id_of(node.as_str());
+                nodes.insert(id.ok_or_else(|| NodeError::NamelessIdentity { node: node.to_string() })?);
+            }
+        }
+    }
+    let nodes = (!any).then(|| Arc::new(nodes));
+    Ok((!written.is_empty()).then(|| Wanted { written: written.join(", "), nodes }))
 }
 
 /// Where a node's status socket is: as configured, or in the user's runtime directory.
@@ -229,6 +261,7 @@ pub async fn run_on<N: RosNetwork>(
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let credentials = CredentialStore::new(identity.clone());
     credentials.set_anchors(anchors.clone());
+    credentials.set_admitted(rules.partners.admitted.clone());
     let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
     let listeners = config
         .listen
@@ -249,7 +282,7 @@ pub async fn run_on<N: RosNetwork>(
         transit: !config.listen.is_empty() && identity.as_peer().may_route,
         incarnation: rand_core::RngCore::next_u64(&mut rng),
         started: started.unix,
-        mapping: sgc_router::MappingKind::Flood,
+        mapping: config.mapping,
         anchors: Arc::new(anchors.clone()),
         limits: sgc_router::Limits::default(),
     };
@@ -284,7 +317,10 @@ pub async fn run_on<N: RosNetwork>(
     let made = tokio::task::spawn_blocking(move || message_keys::make_for(&wanted, |_| false)).await;
     let message_keys = made.map_err(|_| NodeError::Panicked)?;
     let suites = message_keys.keys().copied().collect();
+    let board = Board::default();
+    let claims = Claims::default();
     let (core, requested) = Core::new(CoreParts {
+        board: board.clone(),
         message_keys,
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
@@ -293,7 +329,7 @@ pub async fn run_on<N: RosNetwork>(
         redial,
         alive,
         identity: identity.clone(),
-        credentials,
+        credentials: credentials.clone(),
         router,
         endpoint,
         routes,
@@ -313,26 +349,42 @@ pub async fn run_on<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
-    for url in config.routers.iter().chain(&rules.routers) {
-        tasks.push(tokio::spawn(keep_dialled(
-            url.clone(),
-            dialer.clone(),
-            events.clone(),
-            on_redial.clone(),
-        )));
-    }
+    let nearby = wanted_nearby(&config.routers, &identity)?;
+    let announced = if config.announce { &listening[..] } else { &[] };
+    let local = (nearby.is_some() || config.announce)
+        .then(|| LocalNetwork::open(options.mdns_port, announced, &mut rng))
+        .and_then(|opened| {
+            let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
+            opened.map(Arc::new).map_err(failed).ok()
+        });
+    let holder = Holder {
+        me: identity.node_id(),
+        dialer: dialer.clone(),
+        dns: Dns::new(config.resolver),
+        core: events.clone(),
+        redial: on_redial,
+        claims: claims.clone(),
+    };
+    let heard = local.clone().zip(nearby);
+    tasks.extend(finding::start(&config.routers, &rules.routers, &holder, &board, heard, &mut rng));
+    drop(holder);
     let mut accepting = Vec::new();
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        accepting
-            .push((tokio::spawn(keep_accepting(listener, events.clone(), stopped, audit.clone())), stop));
+        let door = Door {
+            core: events.clone(),
+            credentials: credentials.clone(),
+            claims: claims.clone(),
+            audit: audit.clone(),
+        };
+        accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     let reloader = Arc::new(Reloader {
         source: options.source,
         identity: identity.clone(),
-
+        credentials,
         state,
         audit: audit.clone(),
         events: events.clone(),
@@ -362,6 +414,9 @@ pub async fn run_on<N: RosNetwork>(
 
     shutdown.await;
     info!("stopping");
+    if let Some(local) = &local {
+        local.say_goodbye().await;
+    }
     let stop = async {
         let (reply, flows) = oneshot::channel();
         let _ = events.send(CoreEvent::Quiesce(reply)).await;

@@ -2,7 +2,7 @@
 //!
 //! It reads and keeps; what follows for a share is the business of `policy`.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -84,6 +84,8 @@ pub struct Partners {
     pub tokens: Vec<TokenGrant>,
     /// CAs that are to be trusted besides the fleet's own, each once.
     pub certificates: Vec<CertificateDer<'static>>,
+    /// The CAs whose nodes may attach; all that are trusted if there is nothing.
+    pub admitted: Option<BTreeSet<CaFingerprint>>,
     /// When the first token ends.
     pub next_expiry: Option<UnixMillis>,
 }
@@ -122,6 +124,13 @@ impl Partners {
         }
         for path in &config.trust {
             partners.trust(read(path)?);
+        }
+        for path in &config.accept {
+            let certificates = read(path)?;
+            let anchors = TrustAnchors::new(certificates.iter().cloned())
+                .map_err(|e| PartnerError::Ca { path: path.clone(), source: CaFileError::Certificates(e) })?;
+            partners.admitted.get_or_insert_default().extend(anchors.fingerprints());
+            partners.trust(certificates);
         }
         let records = state.map(TokenRecords::load).transpose()?.unwrap_or_default();
         for record in &records.tokens {

@@ -10,6 +10,7 @@ use std::time::Duration;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_ros::{ShareRule, UseRule};
+use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_wire::UnixMillis;
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
@@ -44,6 +45,7 @@ pub struct ReloadReport {
 pub(crate) struct Reloader {
     pub(crate) source: Option<ConfigSource>,
     pub(crate) identity: Arc<Identity>,
+    pub(crate) credentials: CredentialStore,
     pub(crate) state: Option<PathBuf>,
     pub(crate) audit: Audit,
     pub(crate) events: mpsc::Sender<CoreEvent>,
@@ -142,6 +144,8 @@ impl Reloader {
             needs_restart: needs_restart(running, &config, &rules),
             warnings: rules.warnings.clone(),
         };
+        // Before the control task looks at the links that are up.
+        self.credentials.set_admitted(rules.partners.admitted.clone());
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let event = CoreEvent::Reload { shares, uses, anchors, message_keys, reply };
@@ -150,8 +154,8 @@ impl Reloader {
         done.await.map_err(|_| stopping())?;
         self.audit.set_names(rules.names.clone());
         // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
-        let Config { shares, uses, tokens, partners, trust, .. } = config;
-        running.config = Config { shares, uses, tokens, partners, trust, ..running.config.clone() };
+        let Config { shares, uses, tokens, partners, trust, accept, .. } = config;
+        running.config = Config { shares, uses, tokens, partners, trust, accept, ..running.config.clone() };
         running.rules = rules;
         report.changed.dedup();
         self.changed.notify_one();
@@ -235,6 +239,9 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     if before.iter().any(|ca| !after.contains(ca)) {
         lines.push("nodes of a CA may no longer link to this one".to_owned());
     }
+    if old.partners.admitted != new.partners.admitted {
+        lines.push("whose nodes may attach changed".to_owned());
+    }
     lines
 }
 
@@ -272,8 +279,11 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.node_name != config.node_name, "`name`"),
         (now.identity != config.identity, "`identity`"),
         (now.routers != config.routers, "`routers`"),
+        (now.resolver != config.resolver, "`resolver`"),
         (now.listen != config.listen, "`listen` in [router]"),
         (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
+        (now.mapping != config.mapping, "`mapping` in [router]"),
+        (now.announce != config.announce, "`announce` in [router]"),
         // Shares and uses join the default network where the file says nothing of it.
         (now.ros != config.ros, "[ros]"),
         (now.state != config.state, "`state`"),

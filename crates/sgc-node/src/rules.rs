@@ -7,12 +7,11 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use sgc_ros::{Direction, ShareRule, UseRule};
-use sgc_transport::LinkUrl;
 use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{NodeId, UnixMillis};
 
 use crate::audit::PeerNames;
-use crate::config::{Config, Recipient, TokenSource, UseConfig};
+use crate::config::{Config, Recipient, RouterUrl, TokenSource, UseConfig};
 use crate::partners::{PartnerError, Partners};
 use crate::{policy, state};
 
@@ -26,7 +25,7 @@ pub(crate) struct Rules {
     pub(crate) uses: Vec<UseRule>,
     pub(crate) partners: Partners,
     /// Routers of tokens that the configuration does not name.
-    pub(crate) routers: Vec<LinkUrl>,
+    pub(crate) routers: Vec<RouterUrl>,
     pub(crate) names: PeerNames,
     /// What is wrong and stops nothing.
     pub(crate) warnings: Vec<String>,
@@ -92,7 +91,9 @@ impl Rules {
             return Ok(());
         }
         for url in &token.routers {
-            match url.parse::<LinkUrl>() {
+            match url.parse::<RouterUrl>() {
+                // Of the owner's local network this node is no part.
+                Ok(RouterUrl::Mdns(_)) => {}
                 Ok(url) if config.routers.contains(&url) || self.routers.contains(&url) => {}
                 Ok(url) if self.routers.len() < TOKEN_ROUTERS_MAX => self.routers.push(url),
                 Ok(_) => {}

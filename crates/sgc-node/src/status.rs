@@ -7,6 +7,7 @@ use serde::Serialize;
 use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
+use crate::finding::RouterStatus;
 use crate::stats::NameStats;
 
 /// Everything.
@@ -20,6 +21,8 @@ pub struct Status {
     pub uptime_s: u64,
     /// Links that are up.
     pub links: Vec<LinkStatus>,
+    /// Routers that are looked for, how, and how that goes.
+    pub routers: Vec<RouterStatus>,
     /// Shares and uses, and where each stands.
     pub routes: Vec<RouteLine>,
     /// Names that carry data through this node.

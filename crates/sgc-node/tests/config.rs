@@ -390,7 +390,21 @@ fn addresses_are_checked() {
         ("quic://::1", "\"::1\" is neither a host name nor an IP address (IPv6 is written in brackets)"),
         ("quic://0.0.0.0:7447", "0.0.0.0 can be listened at but not dialled: name the router's host"),
         ("dtls://router:1", "this transport is planned but not in this version: use quic://"),
-        ("http://router/x", "http:// is not known: quic:// is"),
+        ("http://router/x", "http:// is not known: it takes quic://HOST:PORT, srv://DOMAIN and mdns://"),
+        (
+            "srv://",
+            "after srv:// comes the domain whose _sgc._udp records name routers: \"srv://lab.example\"",
+        ),
+        ("srv://lab.example:7447", "the SRV records say the port: write \"srv://lab.example\""),
+        (
+            "srv://10.0.0.1",
+            "10.0.0.1 is an address, which DNS has no SRV records of: write \"quic://10.0.0.1\"",
+        ),
+        ("srv://_sgc._udp.lab.example", "_sgc._udp is put in front by itself: write \"srv://lab.example\""),
+        (
+            "mdns://Cloud",
+            "after mdns:// comes nothing, for any router that this node trusts, or a router's name: \"mdns://cloud\"",
+        ),
     ] {
         let said = format!("node.toml:1: `routers` is {url:?}; {said}");
         assert_eq!(said_of_whole(&format!("node = {{ name = 'a', routers = ['{url}'] }}")), [said]);
@@ -406,6 +420,69 @@ fn addresses_are_checked() {
         said_of_whole("node = { name = 'a', routers = ['quic://r:7447', 'quic://r'] }"),
         ["node.toml:1: `routers` names \"quic://r\" twice; once is enough"]
     );
+    for server in ["dns.lab.example", "10.0.0.53:0", "0.0.0.0", "::1:53:x", ""] {
+        let said = format!(
+            "node.toml:1: `resolver` is {server:?}; it takes the IP address of a DNS server, with its port unless that is \
+             53: \"10.0.0.53\", \"127.0.0.1:5353\" or \"[::1]:5353\""
+        );
+        let text = format!("node = {{ name = 'a', routers = ['srv://a'], resolver = '{server}' }}");
+        assert_eq!(said_of_whole(&text), [said]);
+    }
+}
+
+#[test]
+fn routers_are_found_in_three_ways() {
+    let config = good(
+        "[node]\nidentity = 'a'\nrouters = ['quic://r', 'srv://Lab.Example.', 'mdns://', 'mdns://cloud']\n\
+         resolver = '10.0.0.53'",
+    );
+    let expected = ["quic://r:7447", "srv://lab.example", "mdns://", "mdns://cloud"];
+    assert_eq!(texts(&config.routers), expected);
+    assert_eq!(config.resolver, Some("10.0.0.53:53".parse().unwrap()));
+    for (text, addr) in [("127.0.0.1:5353", "127.0.0.1:5353"), ("::1", "[::1]:53"), ("[::1]:5", "[::1]:5")] {
+        let config = good(&format!("{NODE}node.resolver = '{text}'"));
+        assert_eq!(config.resolver, Some(addr.parse().unwrap()), "{text}");
+    }
+}
+
+#[test]
+fn a_router_says_who_may_attach_and_whether_it_is_told_of() {
+    let text = "identity = 'r'\n[router]\nlisten = ['quic://0.0.0.0:7447']\nannounce = true\n\
+                accept = ['a-ca.pem', 'b-ca.pem']";
+    let config = good(text);
+    assert!(config.announce && config.is_pure_router());
+    assert_eq!(config.accept, [Path::new("/etc/sgc/a-ca.pem"), Path::new("/etc/sgc/b-ca.pem")]);
+    assert!(!good(NODE).announce && good(NODE).accept.is_empty());
+    check_all(&[
+        (
+            "[router]\nannounce = true\naccept = ['a.pem']",
+            &[
+                "node.toml:4: `announce` is on, but `listen` in [router] is not given, so nobody could connect: add an \
+                 address, such as \"quic://0.0.0.0:7447\"",
+                "node.toml:5: `accept` says whose nodes may attach, but `listen` in [router] is not given, so nobody can: \
+                 take it out, or listen",
+            ],
+        ),
+        (
+            "[router]\nlisten = ['mdns://']",
+            &["node.toml:4: `listen` is \"mdns://\", which finds routers: listen at an address \
+                 (\"quic://0.0.0.0:7447\"), and be found on the local network with `announce`"],
+        ),
+        (
+            "[router]\nlisten = ['quic://0.0.0.0:1']\naccept = []",
+            &[
+                "node.toml:5: `accept` is empty; give it a value, such as accept = [\"lab-ca.pem\"], or leave it out to \
+                 accept every CA that is trusted here",
+            ],
+        ),
+        (
+            "[router]\nlisten = ['quic://0.0.0.0:1']\naccept = ['a.pem', 'a.pem']\nannounce = 'yes'",
+            &[
+                "node.toml:5: `accept` names \"a.pem\" twice; once is enough",
+                "node.toml:6: `announce` is a string ('yes'); it takes true or false",
+            ],
+        ),
+    ]);
 }
 
 #[test]
@@ -953,6 +1030,9 @@ fn args(args: &[(&str, &str)]) -> ArgsConfig {
         to: all("to"),
         uses: all("use"),
         listen: all("listen"),
+        peers: all("peer"),
+        announce: !all("announce").is_empty(),
+        accept: all("accept").iter().map(PathBuf::from).collect(),
     }
 }
 
@@ -980,6 +1060,19 @@ fn arguments_say_the_same_as_a_file() {
     assert_eq!(from_args, from_file);
     let router = args(&[("identity", "r"), ("listen", "quic://0.0.0.0:7447")]);
     assert!(Config::from_args(&router, &no_env).unwrap().is_pure_router());
+    let mesh = args(&[
+        ("identity", "/etc/sgc/r"),
+        ("listen", "quic://0.0.0.0:7447"),
+        ("peer", "quic://r2"),
+        ("peer", "srv://lab.example"),
+        ("announce", ""),
+        ("accept", "/etc/sgc/a.pem"),
+    ]);
+    let from_file = good(
+        "identity = 'r'\nnode.routers = ['quic://r2', 'srv://lab.example']\n[router]\nannounce = true\n\
+         accept = ['a.pem']\nlisten = ['quic://0.0.0.0:7447']",
+    );
+    assert_eq!(Config::from_args(&mesh, &no_env).unwrap(), from_file);
     let env = |name: &str| (name == "ROS_DOMAIN_ID").then(|| "5".to_owned());
     let robot = args(&[("identity", "r"), ("router", "quic://r:1"), ("use", "b:/a")]);
     assert_eq!(Config::from_args(&robot, &env).unwrap().ros.unwrap().domain_id, 5);
@@ -1019,6 +1112,9 @@ fn mistakes_in_arguments_name_the_argument() {
             ],
         ),
     ];
+    let said =
+        Config::from_args(&args(&[("identity", "x"), ("peer", "cloud")]), &no_env).unwrap_err().to_string();
+    assert!(said.starts_with("command line: `--peer` is \"cloud\"; "), "{said}");
     for (extra, expected) in cases {
         let mut all = vec![("identity", "x"), ("listen", "quic://0.0.0.0:7447")];
         all.extend_from_slice(extra);

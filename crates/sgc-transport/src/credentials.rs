@@ -5,11 +5,12 @@
 //! are not touched: which of them have to go, and when to ask, is for the node that holds them
 //! ([`CredentialStore::objection`]).
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
-use arc_swap::ArcSwap;
-use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
+use arc_swap::{ArcSwap, ArcSwapOption};
+use sgc_trust::{CaFingerprint, Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::UnixMillis;
 
 use crate::error::CloseReason;
@@ -23,13 +24,21 @@ pub struct CredentialStore {
 struct Shared {
     identity: ArcSwap<Identity>,
     anchors: ArcSwap<TrustAnchors>,
+    /// The CAs whose nodes may attach; all that are believed if there is nothing.
+    admitted: ArcSwapOption<BTreeSet<CaFingerprint>>,
 }
 
 impl CredentialStore {
     /// With this identity and the CAs that it brings.
     pub fn new(identity: Arc<Identity>) -> Self {
         let anchors = ArcSwap::from_pointee(identity.anchors().clone());
-        Self { shared: Arc::new(Shared { identity: ArcSwap::new(identity), anchors }) }
+        Self {
+            shared: Arc::new(Shared {
+                identity: ArcSwap::new(identity),
+                anchors,
+                admitted: ArcSwapOption::empty(),
+            }),
+        }
     }
 
     /// Shows another certificate from the next handshake on. Whom this node believes stays as it is: an identity file
@@ -42,6 +51,17 @@ impl CredentialStore {
     /// check just before: ask [`CredentialStore::objection`] of every link afterwards, and of each new one.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
         self.shared.anchors.store(Arc::new(anchors));
+    }
+
+    /// Lets only nodes of these CAs attach to listeners from the next certificate on; `None` is every CA that is
+    /// believed. Whom this node dials is not restricted by it. For links that are up: [`CredentialStore::admits`].
+    pub fn set_admitted(&self, admitted: Option<BTreeSet<CaFingerprint>>) {
+        self.shared.admitted.store(admitted.map(Arc::new));
+    }
+
+    /// Whether this peer may attach to a listener of this node.
+    pub fn admits(&self, peer: &VerifiedPeer) -> bool {
+        self.shared.admitted.load().as_ref().is_none_or(|admitted| admitted.contains(&peer.ca))
     }
 
     /// What is shown now.

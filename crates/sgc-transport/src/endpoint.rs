@@ -100,6 +100,13 @@ impl Dialer {
         }
     }
 
+    /// Makes a link to these addresses, at most 8 of them, which the caller knows to be those of `url`.
+    pub async fn dial_at(&self, url: &LinkUrl, addresses: Vec<SocketAddr>) -> Result<AnyLink, DialError> {
+        match url.scheme {
+            Scheme::Quic => self.quic.dial_at(url, addresses).await.map(AnyLink::Quic),
+        }
+    }
+
     /// Closes every link that it dialled, and gives their peers up to a second to hear of it.
     pub async fn close(&self, reason: CloseReason) {
         self.quic.close(&reason).await;

@@ -54,6 +54,11 @@ pub enum CloseReason {
 }
 
 impl CloseReason {
+    /// What a node is told whose CA is not among those that may attach.
+    pub fn not_admitted() -> Self {
+        Self::Denied("nodes of its CA may not attach here".into())
+    }
+
     pub(crate) fn to_wire(&self) -> (u32, String) {
         let (code, text) = match self {
             Self::Goodbye => (0, ""),
@@ -140,6 +145,9 @@ pub enum PeerRefusal {
     /// Our CA is not one that it trusts.
     #[error("it does not trust our CA: are the two nodes of different fleets?")]
     OtherCa,
+    /// It serves other CAs.
+    #[error("it serves other fleets only: its keeper has to add our CA to `accept` in [router]")]
+    NotAdmitted,
     /// To it our certificate is over, or has not begun.
     #[error("to it our certificate is expired or not yet valid: enroll again, or compare the clocks")]
     Expired,
@@ -181,7 +189,8 @@ impl PeerRefusal {
                 48 => Self::OtherCa,
                 45 => Self::Expired,
                 44 => Self::Revoked,
-                alert @ (42 | 43 | 46 | 49 | 51) => Self::BadCertificate(alert),
+                49 => Self::NotAdmitted,
+                alert @ (42 | 43 | 46 | 51) => Self::BadCertificate(alert),
                 70 | 120 => Self::Version,
                 40 => Self::KeyExchange,
                 alert => Self::Other(format!("TLS alert {alert}")),
@@ -404,6 +413,7 @@ impl Refusal {
             Self::Certificate(CertError::UnknownIssuer) | Self::ByPeer(PeerRefusal::OtherCa) => {
                 RefusalKind::OtherCa
             }
+            Self::Certificate(CertError::NotAdmitted { .. }) => RefusalKind::NotAdmitted,
             Self::Certificate(CertError::Expired { .. } | CertError::CaExpired { .. }) => {
                 RefusalKind::Expired
             }
@@ -443,6 +453,19 @@ pub enum DialError {
         /// What was tried, and what came of it.
         attempts: Vec<(SocketAddr, LinkError)>,
     },
+}
+
+impl DialError {
+    /// True if somebody answered there and either certificate or the version was refused: trying again soon is of no
+    /// use.
+    pub fn is_refusal(&self) -> bool {
+        let refused = |error: &LinkError| match error {
+            LinkError::RefusedHere(_) => true,
+            LinkError::RefusedByPeer(why) => !matches!(why, PeerRefusal::Overloaded | PeerRefusal::GaveUp),
+            _ => false,
+        };
+        matches!(self, Self::Failed { attempts, .. } if attempts.iter().any(|(_, error)| refused(error)))
+    }
 }
 
 struct Attempts<'a>(&'a [(SocketAddr, LinkError)]);

@@ -31,4 +31,4 @@ pub use link::{AnyLink, KeyExchange, Link, LinkStats};
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;
-pub use url::{DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};
+pub use url::{COST_MS_MAX, DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};

@@ -9,6 +9,8 @@ pub enum RefusalKind {
     NoCertificate,
     /// The certificate is from a CA that is not trusted, there or here.
     OtherCa,
+    /// The certificate is from a CA whose nodes may not attach here.
+    NotAdmitted,
     /// The certificate, or its CA, is over.
     Expired,
     /// The certificate has not begun.
@@ -35,9 +37,10 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// Every kind, in the order of the counters.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::NoCertificate,
         Self::OtherCa,
+        Self::NotAdmitted,
         Self::Expired,
         Self::NotYetValid,
         Self::Revoked,
@@ -56,6 +59,7 @@ impl RefusalKind {
         match self {
             Self::NoCertificate => "no_certificate",
             Self::OtherCa => "other_ca",
+            Self::NotAdmitted => "not_admitted",
             Self::Expired => "expired",
             Self::NotYetValid => "not_yet_valid",
             Self::Revoked => "revoked",

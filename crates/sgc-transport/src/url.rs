@@ -9,6 +9,9 @@ use std::str::FromStr;
 /// The port where none is given.
 pub const DEFAULT_PORT: u16 = 7447;
 
+/// The greatest cost that can be set, milliseconds of round trip.
+pub const COST_MS_MAX: u32 = 100_000;
+
 const HOST_BYTES_MAX: usize = 253;
 
 /// A transport, by the scheme of its URLs.
@@ -45,12 +48,18 @@ pub struct LinkUrl {
     pub host: String,
     /// Port.
     pub port: u16,
+    /// What the link is to cost where ways are weighed, milliseconds of round trip; measured if not given.
+    pub cost_ms: Option<u32>,
 }
 
 impl FromStr for LinkUrl {
     type Err = UrlError;
 
     fn from_str(text: &str) -> Result<Self, UrlError> {
+        let (text, cost_ms) = match text.split_once("?cost=") {
+            Some((text, cost)) => (text, Some(cost_ms(cost)?)),
+            None => (text, None),
+        };
         let (scheme, host, port) = split(text)?;
         if port == 0 {
             return Err(UrlError::Port("0".into()));
@@ -60,17 +69,18 @@ impl FromStr for LinkUrl {
         if !is_host || host.len() > HOST_BYTES_MAX {
             return Err(UrlError::Host(host.chars().take(80).collect()));
         }
-        Ok(Self { scheme, host: host.to_owned(), port })
+        Ok(Self { scheme, host: host.to_owned(), port, cost_ms })
     }
 }
 
 impl fmt::Display for LinkUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.host.contains(':') {
-            write!(f, "{}://[{}]:{}", self.scheme, self.host, self.port)
+            write!(f, "{}://[{}]:{}", self.scheme, self.host, self.port)?;
         } else {
-            write!(f, "{}://{}:{}", self.scheme, self.host, self.port)
+            write!(f, "{}://{}:{}", self.scheme, self.host, self.port)?;
         }
+        self.cost_ms.map_or(Ok(()), |cost| write!(f, "?cost={cost}ms"))
     }
 }
 
@@ -123,9 +133,20 @@ pub enum UrlError {
     /// The port is none.
     #[error("{0:?} is not a port number")]
     Port(String),
+    /// A cost that is not one.
+    #[error("{0:?} is no cost of a link: write ?cost=20ms, 1 to {COST_MS_MAX} ms")]
+    Cost(String),
     /// Something follows.
     #[error("{0:?} does not belong into the address of a link")]
     Trailing(String),
+}
+
+/// Milliseconds, as in `20ms`.
+fn cost_ms(text: &str) -> Result<u32, UrlError> {
+    let number = text.strip_suffix("ms").and_then(|number| number.parse().ok());
+    number
+        .filter(|cost| (1..=COST_MS_MAX).contains(cost))
+        .ok_or_else(|| UrlError::Cost(text.chars().take(80).collect()))
 }
 
 fn split(text: &str) -> Result<(Scheme, &str, u16), UrlError> {
@@ -176,6 +197,7 @@ mod tests {
             ("quic://10.0.0.1/", "quic://10.0.0.1:7447"),
             ("quic://[fe80::1]:9", "quic://[fe80::1]:9"),
             ("quic://[::1]", "quic://[::1]:7447"),
+            ("quic://lte.example?cost=120ms", "quic://lte.example:7447?cost=120ms"),
         ] {
             let url: LinkUrl = text.parse().unwrap();
             assert_eq!(url.to_string(), shown);
@@ -200,6 +222,9 @@ mod tests {
             assert!(error.to_string().contains("not in this version"));
         }
         assert!(matches!(refused("http://router"), UrlError::SchemeUnknown(_)));
+        for cost in ["", "20", "0ms", "100001ms", "-1ms", "1sms"] {
+            assert_eq!(refused(&format!("quic://router?cost={cost}")), UrlError::Cost(cost.into()));
+        }
         for text in
             ["quic://", "quic://a b", "quic://fe80::1", "quic://[fe80::1", "quic://[router]", "quic://:1"]
         {

@@ -173,6 +173,40 @@ async fn a_ca_that_is_no_longer_trusted_takes_its_links_along() {
     assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::OtherCa)), "{error}");
 }
 
+#[tokio::test]
+async fn only_nodes_of_admitted_cas_attach_and_both_logs_name_it() {
+    let (own, first, second) = (fleet(1), fleet(2), fleet(3));
+    let router = enroll(&own, "router");
+    let both = first.anchors().certificates().chain(second.anchors().certificates());
+    let store = CredentialStore::new(router);
+    store.set_anchors(store.anchors().with_anchors(both.cloned()).unwrap());
+    store.set_admitted(Some(first.anchors().fingerprints().collect()));
+    let mut server = Server::start(store.clone(), LinkOptions::default());
+    let of = |fleet: &Fleet| Arc::new(enroll(fleet, "arm-1").with_anchors(own.anchors().clone()));
+
+    let _near = dial(of(&first), &server.url).await.unwrap();
+    let far = server.link().await;
+    assert!(store.admits(far.peer()));
+    // Of a CA that is believed, and of the router's own.
+    for stranger in [of(&second), enroll(&own, "arm-2")] {
+        let error = dial(stranger, &server.url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::NotAdmitted)), "{error}");
+        let refused = server.refusal().await;
+        let text = refused.to_string();
+        assert!(matches!(refused.reason, Refusal::Certificate(CertError::NotAdmitted { .. })), "{text}");
+        assert!(text.contains("`accept` in [router]"), "{text}");
+    }
+    assert_eq!(server.metrics.refused(RefusalKind::NotAdmitted), 2);
+
+    // Whom this node dials is not restricted, and the next handshake goes by what holds then.
+    let other = Server::start(of(&second), LinkOptions::default());
+    dial(store.clone(), &other.url).await.unwrap();
+    store.set_admitted(None);
+    dial(of(&second), &server.url).await.unwrap();
+    store.set_admitted(Some(second.anchors().fingerprints().collect()));
+    assert!(!store.admits(far.peer()));
+}
+
 // Key exchange.
 
 fn with(post_quantum: bool) -> LinkOptions {

@@ -433,6 +433,15 @@ pub enum CertError {
     /// No CA that is trusted here made it.
     #[error("the certificate is from a CA that is not trusted here: is the peer of another fleet?")]
     UnknownIssuer,
+    /// Its CA is believed here, but its nodes may not attach.
+    #[error(
+        "the certificate is from CA {ca}, which is not among those whose nodes may attach here: add that CA's file to \
+         `accept` in [router], or leave it out if this is as it should be"
+    )]
+    NotAdmitted {
+        /// The CA.
+        ca: CaFingerprint,
+    },
     /// It says that a trusted CA made it, and none did.
     #[error("the certificate's signature is wrong: it was altered or forged")]
     BadSignature,

@@ -6,7 +6,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use sgc_node::config::{self, Config, DiscoveryRange, ShareConfig, TokenSource};
+use sgc_node::config::{self, Config, DiscoveryRange, RouterUrl, ShareConfig, TokenSource};
 use sgc_trust::Identity;
 
 use crate::error::CliError;
@@ -43,10 +43,32 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     row("node", format!("{} of fleet {}", identity.node_name(), identity.fleet_name()));
     row("identity", format!("{}, holds until {}", config.identity.display(), identity.not_after()));
     for url in &config.routers {
-        row("dials", url.to_string());
+        match url {
+            RouterUrl::At(url) => row("dials", url.to_string()),
+            RouterUrl::Srv(domain) => {
+                let query = domain.query();
+                row(
+                    "finds",
+                    format!("{url}, one of those that {} names in DNS", query.trim_end_matches('.')),
+                );
+            }
+            RouterUrl::Mdns(None) => {
+                row("finds", format!("{url}, routers of the local network that are trusted"))
+            }
+            RouterUrl::Mdns(Some(node)) => row("finds", format!("{url}, router {node} on the local network")),
+        }
+    }
+    if let Some(server) = &config.resolver {
+        row("", format!("looked up at {server}"));
     }
     for addr in &config.listen {
         row("listens", addr.to_string());
+    }
+    if config.announce {
+        row("", "announced on the local network by mDNS".to_owned());
+    }
+    for path in &config.accept {
+        row("accepts", format!("nodes of the CAs in {} only", path.display()));
     }
     match &config.ros {
         Some(ros) => {

@@ -34,12 +34,13 @@ const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 pub(crate) struct RunArgs {
     /// The configuration
     #[arg(short, long, value_name = "FILE",
-          conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen"])]
+          conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen", "announce"])]
     config: Option<PathBuf>,
     /// The identity that `sgc fleet enroll` made
     #[arg(long, value_name = "FILE")]
     identity: Option<PathBuf>,
-    /// A router to connect to, such as quic://router.lab.example:7447; may be repeated
+    /// A router to connect to: where it is (quic://router.lab.example:7447), the domain whose DNS names it
+    /// (srv://lab.example), or any on the local network (mdns://); may be repeated
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
     /// A topic to share, /TOPIC or /TOPIC=NODE,group:GROUP; may be repeated
@@ -55,11 +56,16 @@ pub(crate) struct RunArgs {
     /// Listen as a router, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL")]
     listen: Vec<String>,
+    /// Tell the local network by mDNS that a router is here
+    #[arg(long, requires = "listen")]
+    announce: bool,
     #[command(flatten)]
     process: ProcessArgs,
 }
 
 /// Run a router, which passes packets on and can read none of them: short for `sgc run` with `--listen` alone.
+///
+/// With `--peer` it joins other routers in a mesh; with `--accept` it serves the fleets that are named, and no other.
 #[derive(Debug, Args)]
 pub(crate) struct RouterArgs {
     /// The identity that `sgc fleet enroll --router` made
@@ -68,9 +74,16 @@ pub(crate) struct RouterArgs {
     /// Where to listen, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL", required = true)]
     listen: Vec<String>,
-    /// Another router to connect to; may be repeated
+    /// Another router to connect to, so that both are one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be
+    /// repeated
     #[arg(long, value_name = "URL")]
     peer: Vec<String>,
+    /// Tell the local network by mDNS that a router is here
+    #[arg(long)]
+    announce: bool,
+    /// A file with CA certificates, PEM: only nodes of the CAs so named may connect, of whichever fleet; may be repeated
+    #[arg(long, value_name = "FILE")]
+    accept: Vec<PathBuf>,
     #[command(flatten)]
     process: ProcessArgs,
 }
@@ -107,6 +120,8 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
         to: args.to,
         uses: args.uses,
         listen: args.listen,
+        announce: args.announce,
+        ..ArgsConfig::default()
     };
     let what = args.config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());
     let source: ConfigSource = match args.config {
@@ -124,8 +139,10 @@ pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
     start_log(args.process.log.as_deref())?;
     let arguments = ArgsConfig {
         identity: Some(args.identity),
-        routers: args.peer,
+        peers: args.peer,
         listen: args.listen,
+        announce: args.announce,
+        accept: args.accept,
         ..ArgsConfig::default()
     };
     let source: ConfigSource = Arc::new(move || config::load_args(&arguments, &environment));

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use sgc_node::config::{self, Config, ShareConfig};
+use sgc_node::config::{self, Config, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
 use sgc_transport::LinkUrl;
@@ -195,7 +195,9 @@ fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
 
 fn routers(args: &ShareTokenArgs, config: &Config) -> Result<Vec<String>, CliError> {
     if args.router.is_empty() {
-        return Ok(config.routers.iter().take(TOKEN_ROUTERS_MAX).map(ToString::to_string).collect());
+        // The partner is on another local network.
+        let routers = config.routers.iter().filter(|url| !matches!(url, RouterUrl::Mdns(_)));
+        return Ok(routers.take(TOKEN_ROUTERS_MAX).map(ToString::to_string).collect());
     }
     let valid = |url: &String| match url.parse::<LinkUrl>() {
         Ok(url) => Ok(url.to_string()),

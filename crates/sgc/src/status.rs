@@ -45,6 +45,7 @@ pub(crate) struct Status {
     version: String,
     uptime_s: u64,
     pub(crate) links: Vec<Link>,
+    routers: Vec<Router>,
     pub(crate) routes: Vec<Route>,
     names: Vec<NameTraffic>,
     pub(crate) drops: BTreeMap<String, u64>,
@@ -64,6 +65,18 @@ pub(crate) struct Link {
     received_bytes: u64,
     peer_slowed: u64,
     peer_dropped: u64,
+}
+
+/// A router that a node looks for.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Router {
+    router: String,
+    found_by: String,
+    at: Option<String>,
+    state: String,
+    last_failure: Option<String>,
+    again_in_s: Option<u64>,
 }
 
 /// A share or use of a node.
@@ -223,6 +236,11 @@ impl Status {
             );
         }
         section(
+            "Routers",
+            &["router", "found by", "at", "state", "last failure"],
+            self.routers.iter().map(Router::row).collect(),
+        );
+        section(
             "Topics",
             &["", "topic", "type", "owner", "messages", "state"],
             self.routes.iter().map(Route::row).collect(),
@@ -264,6 +282,21 @@ impl Link {
     }
 }
 
+impl Router {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.router.clone(),
+            self.found_by.clone(),
+            self.at.clone().unwrap_or_default(),
+            match self.again_in_s {
+                Some(s) => format!("{} in {}", self.state, duration(s)),
+                None => self.state.clone(),
+            },
+            self.last_failure.clone().unwrap_or_default(),
+        ]
+    }
+}
+
 impl Route {
     fn row(&self) -> Vec<String> {
         vec![
@@ -301,6 +334,8 @@ mod tests {
         let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
             "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
                       "rtt_us":420,"sent_bytes":1500,"received_bytes":7}],
+            "routers":[{"router":"srv://lab.example","found_by":"srv","at":"quic://r1.lab.example:7447",
+                        "state":"trying again","failures":2,"last_failure":"no answer","again_in_s":3}],
             "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
                        "state":"waiting for a publisher"}],
             "names":[],"drops":{"no_tree":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
@@ -311,6 +346,10 @@ mod tests {
             "Links:",
             "  peer      remote          round trip  sent    received  dialled",
             "  01234567  127.0.0.1:7447  0.42 ms     1.5 kB  7 B       quic://localhost:7447",
+            "",
+            "Routers:",
+            "  router             found by  at                          state                last failure",
+            "  srv://lab.example  srv       quic://r1.lab.example:7447  trying again in 3 s  no answer",
             "",
             "Topics:",
             "         topic     type  owner  messages  state",

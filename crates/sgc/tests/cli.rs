@@ -288,6 +288,31 @@ fn a_good_configuration_is_summed_up() {
 }
 
 #[test]
+fn how_routers_are_found_and_who_may_attach_is_summed_up() {
+    let place = Place::with_fleet();
+    let ca = place.good(&["fleet", "ca"]);
+    place.write("lab-ca.pem", &ca);
+    place.write(
+        "node.toml",
+        "[node]\nname = 'arm-1'\nrouters = ['srv://lab.example', 'mdns://', 'mdns://cloud']\nresolver = '10.0.0.53'\n\
+         [router]\nlisten = ['quic://0.0.0.0:7447']\nannounce = true\naccept = ['lab-ca.pem']\n",
+    );
+    let said = place.good(&["check", "-c", "node.toml"]);
+    let expected = "finds     srv://lab.example, one of those that _sgc._udp.lab.example names in DNS\n\
+                    finds     mdns://, routers of the local network that are trusted\n\
+                    finds     mdns://cloud, router cloud on the local network\n          \
+                    looked up at 10.0.0.53:53\n\
+                    listens   quic://0.0.0.0:7447\n          \
+                    announced on the local network by mDNS\n\
+                    accepts   nodes of the CAs in lab-ca.pem only\n";
+    assert!(said.contains(expected), "{said}");
+    let text = "identity = 'cloud.identity'\n[node]\nrouters = ['mdns://cloud']\n";
+    place.write("router.toml", text);
+    let said = place.bad(2, &["check", "-c", "router.toml"]);
+    assert!(said.contains("cannot tell nodes by their names: write \"mdns://\""), "{said}");
+}
+
+#[test]
 fn every_mistake_is_told_with_its_line() {
     let place = Place::with_fleet();
     place.write(

@@ -33,8 +33,14 @@ pub struct ArgsConfig {
     pub to: Vec<String>,
     /// `--use NODE:/TOPIC`, any number.
     pub uses: Vec<String>,
+    /// `--peer URL` of `sgc router`, any number: what `routers` is in a file.
+    pub peers: Vec<String>,
     /// `--listen URL`, any number.
     pub listen: Vec<String>,
+    /// `--announce`
+    pub announce: bool,
+    /// `--accept FILE`, any number.
+    pub accept: Vec<PathBuf>,
 }
 
 /// Takes the arguments apart.
@@ -86,9 +92,16 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         attempted: BTreeSet::new(),
         identity: args.identity.clone().map(|identity| located("--identity", identity)),
         name: None,
-        routers: all("--router", &args.routers),
+        routers: [all("--router", &args.routers), all("--peer", &args.peers)].concat(),
+        resolver: None,
         listen: all("--listen", &args.listen),
         peer_rate: None,
+        mapping: None,
+        announce: args.announce.then(|| located("--announce", true)),
+        accept: (!args.accept.is_empty()).then(|| {
+            let files = args.accept.iter().map(|file| file.to_string_lossy().into_owned());
+            located("--accept", files.map(|file| located("--accept", file)).collect())
+        }),
         ros: touches_ros.then(RosDraft::default),
         shares,
         uses,

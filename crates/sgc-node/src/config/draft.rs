@@ -49,8 +49,13 @@ pub(super) struct Draft {
     pub(super) identity: Option<Located<PathBuf>>,
     pub(super) name: Option<Located<String>>,
     pub(super) routers: Vec<Located<String>>,
+    pub(super) resolver: Option<Located<String>>,
     pub(super) listen: Vec<Located<String>>,
     pub(super) peer_rate: Option<Located<String>>,
+    pub(super) mapping: Option<Located<String>>,
+    pub(super) announce: Option<Located<bool>>,
+    /// The whole list is located too, since an empty one would be a mistake.
+    pub(super) accept: Option<Located<Vec<Located<String>>>>,
     pub(super) ros: Option<RosDraft>,
     pub(super) shares: Vec<ShareDraft>,
     pub(super) uses: Vec<UseDraft>,

@@ -12,6 +12,7 @@ use sgc_transport::UrlError;
 use sgc_trust::TokenError;
 
 use super::names::{duration_text, rate_text};
+use super::router_url::RouterUrlError;
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
 /// Everything that is wrong, in the order of the file; never empty.
@@ -433,6 +434,59 @@ pub enum Mistake {
         value: String,
         /// What is wrong with it.
         fault: UrlError,
+    },
+    /// Says of no router where it is.
+    #[error("`{key}` is {value:?}; {fault}")]
+    Router {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What is wrong with it.
+        fault: RouterUrlError,
+    },
+    /// Not the address of a DNS server.
+    #[error(
+        "`{key}` is {value:?}; it takes the IP address of a DNS server, with its port unless that is 53: \
+         \"10.0.0.53\", \"127.0.0.1:5353\" or \"[::1]:5353\""
+    )]
+    Resolver {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// To listen at what finds routers.
+    #[error(
+        "`{key}` is {value:?}, which finds routers: listen at an address (\"quic://0.0.0.0:7447\"), and be found on \
+         the local network with `announce`"
+    )]
+    ListenFinds {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
+    /// To tell others of a router that is none.
+    #[error(
+        "`{key}` is on, but {listen} is not given, so nobody could connect: add an address, such as \
+         \"quic://0.0.0.0:7447\""
+    )]
+    AnnouncesNothing {
+        /// The key.
+        key: &'static str,
+        /// How listening is asked for.
+        listen: &'static str,
+    },
+    /// To say who may attach where nobody can.
+    #[error(
+        "`{key}` says whose nodes may attach, but {listen} is not given, so nobody can: take it out, or listen"
+    )]
+    AcceptsNobody {
+        /// The key.
+        key: &'static str,
+        /// How listening is asked for.
+        listen: &'static str,
     },
     /// To dial an address that means "all of mine".
     #[error("`{key}` is {value:?}; {host} can be listened at but not dialled: name the router's host")]

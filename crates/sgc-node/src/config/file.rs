@@ -95,12 +95,20 @@ impl FileReader<'_> {
                 "routers",
                 "an array of strings, such as [\"quic://router.lab.example:7447\"]",
             ),
+            resolver: self.string(node.as_ref(), "resolver", "a string, such as \"10.0.0.53\""),
             listen: self.flat_strings(
                 router.as_ref(),
                 "listen",
                 "an array of strings, such as [\"quic://0.0.0.0:7447\"]",
             ),
             peer_rate: self.string(router.as_ref(), "peer_rate", "a string, such as \"50Mbps\""),
+            mapping: self.string(router.as_ref(), "mapping", "\"flood\" or \"query\""),
+            announce: self.boolean(router.as_ref(), "announce", "true or false"),
+            accept: self.strings(
+                router.as_ref(),
+                "accept",
+                "an array of strings, such as [\"lab-ca.pem\", \"acme-ca.pem\"]",
+            ),
             ros: ros.map(|ros| self.ros(&ros)),
             shares: self
                 .repeated(&top, "share", Table::Share)

@@ -16,15 +16,18 @@ mod files;
 mod names;
 mod resolve;
 mod ros_env;
+mod router_url;
 mod schema;
 
 use std::fs;
 use std::io::{self, Read};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use sgc_transport::{LinkUrl, ListenAddr};
+use sgc_router::MappingKind;
+use sgc_transport::ListenAddr;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
 use sgc_wire::{Class, NodeId};
 
@@ -32,10 +35,11 @@ pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
 pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration, parse_rate};
 pub use resolve::{
-    LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES,
-    TRUST_MAX, USES_MAX,
+    ACCEPT_MAX, LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX,
+    SUITES, TRUST_MAX, USES_MAX,
 };
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
+pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain};
 pub use schema::Table;
 
 /// The largest file that is read as a configuration: 1024 shares with all their metadata fit.
@@ -56,12 +60,20 @@ pub struct Config {
     pub node_name: Option<NodeName>,
     /// The identity file. Where only a name is given, it is `NAME.identity` beside the configuration.
     pub identity: PathBuf,
-    /// Where to dial, in order of preference.
-    pub routers: Vec<LinkUrl>,
+    /// Routers to connect to, and how each is found.
+    pub routers: Vec<RouterUrl>,
+    /// The DNS server that host names and SRV records of routers are looked up at; none is the system's way.
+    pub resolver: Option<SocketAddr>,
     /// Where to listen; port 0 lets the system choose. Not empty: this node is a router.
     pub listen: Vec<ListenAddr>,
     /// What one peer may send into this node, bits a second; [`PEER_RATE_MIN`] to [`PEER_RATE_MAX`].
     pub peer_rate: Option<u64>,
+    /// How this router comes to know where names are.
+    pub mapping: MappingKind,
+    /// Tells the local network that a router is here.
+    pub announce: bool,
+    /// Files with the CAs whose nodes may attach; with none of them, every CA that is trusted here.
+    pub accept: Vec<PathBuf>,
     /// The local ROS 2 network; none for a node that is only a router.
     pub ros: Option<RosConfig>,
     /// What this node offers, each topic once.

@@ -3,14 +3,15 @@
 //! Each function takes a text and gives the valid thing or the mistake; where the text comes from and what it
 //! has to do with other settings is the business of `resolve`.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
-use sgc_transport::{LinkUrl, ListenAddr, UrlError};
+use sgc_transport::{ListenAddr, UrlError};
 use sgc_trust::{FleetName, GroupName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
 
 use super::error::{Mistake, TopicRule};
+use super::router_url::{RouterUrl, RouterUrlError};
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
 /// The longest topic: 256 bytes of DDS less a terminator and 8 for the prefix that rmw adds.
@@ -21,6 +22,7 @@ pub const TYPE_BYTES_MAX: usize = 240;
 pub const PEER_BYTES_MAX: usize = 255;
 
 const HOST_BYTES_MAX: usize = 253;
+const DNS_PORT: u16 = 53;
 
 /// Who may subscribe to a share, or publish on it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -258,21 +260,39 @@ fn is_host(value: &str) -> bool {
         || (!numeric && value.len() <= HOST_BYTES_MAX && value.split('.').all(is_label))
 }
 
-/// Checks where to dial, `quic://HOST[:PORT]`.
-pub(super) fn router(key: &'static str, value: &str) -> Result<LinkUrl, Mistake> {
-    let url: LinkUrl = value.parse().map_err(|fault| url_mistake(key, value, fault))?;
-    let host = url.host.clone();
-    if !is_host(&host) {
-        return Err(url_mistake(key, value, UrlError::Host(host)));
+/// Checks where a router is to be found: `quic://HOST[:PORT]`, `srv://DOMAIN`, `mdns://[NODE]`.
+pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistake> {
+    let router = match value.parse() {
+        Ok(router) => router,
+        Err(RouterUrlError::Link(fault)) => return Err(url_mistake(key, value, fault)),
+        Err(fault) => return Err(Mistake::Router { key, value: value.to_owned(), fault }),
+    };
+    if let RouterUrl::At(url) = &router {
+        let host = url.host.clone();
+        if !is_host(&host) {
+            return Err(url_mistake(key, value, UrlError::Host(host)));
+        }
+        if host.parse::<IpAddr>().is_ok_and(|address| address.is_unspecified()) {
+            return Err(Mistake::UrlUnspecified { key, value: value.to_owned(), host });
+        }
     }
-    if host.parse::<IpAddr>().is_ok_and(|address| address.is_unspecified()) {
-        return Err(Mistake::UrlUnspecified { key, value: value.to_owned(), host });
-    }
-    Ok(url)
+    Ok(router)
+}
+
+/// Checks a DNS server, `ADDRESS[:PORT]`.
+pub(super) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mistake> {
+    let bare = || value.parse().ok().map(|address| SocketAddr::new(address, DNS_PORT));
+    let server = value.parse().ok().or_else(bare);
+    server
+        .filter(|server: &SocketAddr| server.port() != 0 && !server.ip().is_unspecified())
+        .ok_or_else(|| Mistake::Resolver { key, value: value.to_owned() })
 }
 
 /// Checks where to listen, `quic://ADDRESS[:PORT]`.
 pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
+    if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {
+        return Err(Mistake::ListenFinds { key, value: value.to_owned() });
+    }
     value.parse().map_err(|fault| url_mistake(key, value, fault))
 }
 

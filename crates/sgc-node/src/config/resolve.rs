@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use sgc_router::MappingKind;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
 use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX};
 
@@ -26,6 +27,8 @@ pub const USES_MAX: usize = 1024;
 pub const RECIPIENTS_MAX: usize = 1024;
 /// Routers that one node dials.
 pub const ROUTERS_MAX: usize = 16;
+/// Files with CAs whose nodes may attach to one router.
+pub const ACCEPT_MAX: usize = 16;
 /// Addresses that one node listens at.
 pub const LISTEN_MAX: usize = 16;
 /// Partners of one node.
@@ -77,8 +80,12 @@ pub(super) fn resolve(
     let node_name = draft.name.as_ref().and_then(|name| resolver.keep(name, names::node));
     let identity = resolver.identity(draft, node_name.as_ref());
     let routers = resolver.addresses(&draft.routers, names::router, ROUTERS_MAX);
+    let dns = draft.resolver.as_ref().and_then(|server| resolver.keep(server, names::resolver));
     let listen = resolver.addresses(&draft.listen, names::listen, LISTEN_MAX);
+    let announce = resolver.announce(draft);
+    let accept = resolver.accept(draft);
     let attempted = |key| draft.attempted.contains(key);
+    let mapping = draft.mapping.as_ref().and_then(|kind| resolver.keep(kind, mapping)).unwrap_or_default();
     let peer_rate = draft.peer_rate.as_ref().and_then(|rate| resolver.keep(rate, names::rate));
     let connects = !draft.routers.is_empty() || !draft.listen.is_empty();
     if !connects && !["routers", "listen", "node", "router"].into_iter().any(attempted) {
@@ -94,7 +101,7 @@ pub(super) fn resolve(
     let shares = resolver.shares(draft, node_name.as_ref());
     let uses = resolver.uses(draft, node_name.as_ref());
     let tokens = resolver.tokens(draft);
-    let trust = resolver.trust(&draft.trust);
+    let trust = resolver.ca_files(&draft.trust, TRUST_MAX);
     let authority = draft.authority.as_ref().and_then(|fleet| resolver.fleet(fleet));
     let state = draft.state.as_ref().and_then(|state| resolver.path(state, "\"/var/lib/sgc/arm-1\""));
     let rotation = resolver.rotation(draft);
@@ -105,8 +112,12 @@ pub(super) fn resolve(
             node_name,
             identity,
             routers,
+            resolver: dns,
             listen,
             peer_rate,
+            mapping,
+            announce,
+            accept,
             ros,
             shares,
             uses,
@@ -340,13 +351,36 @@ impl Resolver<'_> {
         valid
     }
 
-    fn trust(&mut self, written: &[Located<String>]) -> Vec<PathBuf> {
-        if let Some(first) = written.get(TRUST_MAX) {
+    fn announce(&mut self, draft: &Draft) -> bool {
+        let Some(announce) = draft.announce.as_ref().filter(|announce| announce.value) else { return false };
+        if draft.listen.is_empty() && !draft.attempted.contains("listen") {
+            let (key, listen) = (announce.key, self.words.listen);
+            self.record(&announce.origin, Mistake::AnnouncesNothing { key, listen });
+        }
+        true
+    }
+
+    fn accept(&mut self, draft: &Draft) -> Vec<PathBuf> {
+        let Some(accept) = &draft.accept else { return Vec::new() };
+        let key = accept.key;
+        if accept.value.is_empty() {
+            // Read as a list it would let nobody in, read as the default everybody.
+            let example =
+                "accept = [\"lab-ca.pem\"], or leave it out to accept every CA that is trusted here";
+            self.record(&accept.origin, Mistake::Empty { key, example });
+        } else if draft.listen.is_empty() && !draft.attempted.contains("listen") {
+            self.record(&accept.origin, Mistake::AcceptsNobody { key, listen: self.words.listen });
+        }
+        self.ca_files(&accept.value, ACCEPT_MAX)
+    }
+
+    fn ca_files(&mut self, written: &[Located<String>], max: usize) -> Vec<PathBuf> {
+        if let Some(first) = written.get(max) {
             let (key, count) = (first.key, written.len());
-            self.record(&first.origin, Mistake::TooManyEntries { key, count, max: TRUST_MAX });
+            self.record(&first.origin, Mistake::TooManyEntries { key, count, max });
         }
         let mut valid: Vec<PathBuf> = Vec::new();
-        for one in written.iter().take(TRUST_MAX) {
+        for one in written.iter().take(max) {
             let Some(path) = self.ca_file(&one.clone().map(PathBuf::from)) else { continue };
             if valid.contains(&path) {
                 self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
@@ -534,6 +568,14 @@ fn priority_class(key: &'static str, value: &str) -> Result<Class, Mistake> {
         "default" => Ok(Class::Default),
         "bulk" => Ok(Class::Bulk),
         _ => Err(unknown_word(key, value, &PRIORITIES)),
+    }
+}
+
+fn mapping(key: &'static str, value: &str) -> Result<MappingKind, Mistake> {
+    match value {
+        "flood" => Ok(MappingKind::Flood),
+        "query" => Ok(MappingKind::Query),
+        _ => Err(unknown_word(key, value, &["flood", "query"])),
     }
 }
 

@@ -79,7 +79,7 @@ impl Table {
                 "audit",
                 "admin",
             ],
-            Self::Node => &["name", "routers", "identity", "state", "trust"],
+            Self::Node => &["name", "routers", "resolver", "identity", "state", "trust"],
             Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers"],
             Self::Share => &[
                 "topic",
@@ -96,7 +96,7 @@ impl Table {
                 "node",
             ],
             Self::Use => &["from", "topic", "type", "publish", "token"],
-            Self::Router => &["listen", "peer_rate"],
+            Self::Router => &["listen", "peer_rate", "announce", "accept", "mapping"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use sgc_ros::RosNetwork;
+use sgc_transport::{CloseReason, Link as _};
 use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, RefuseReason, SinkId};
 use tracing::{info, warn};
@@ -78,6 +79,19 @@ impl<N: RosNetwork> Core<N> {
             }
         }
         self.endpoint.answer_renewal(now(), sink, answer);
+    }
+
+    /// Closes the links of nodes that came and may attach no more.
+    pub(super) fn close_not_admitted(&mut self) {
+        for (link, entry) in &mut self.links {
+            let peer = entry.link.peer();
+            if entry.url.is_none() && !self.credentials.admits(peer) {
+                let why = CloseReason::not_admitted();
+                info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                entry.closed_for = Some(why.to_string());
+                entry.link.close(why);
+            }
+        }
     }
 
     /// Answers every member once more: the fleet's file may have changed.

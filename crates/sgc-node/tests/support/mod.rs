@@ -56,6 +56,16 @@ pub struct Node {
 
 impl Node {
     pub fn start(config: Config, identity: Arc<Identity>, domain: Option<&FakeDomain>) -> Self {
+        Self::start_near(config, identity, domain, None)
+    }
+
+    /// With its local network, as mDNS sees it, on a port of its own.
+    pub fn start_near(
+        config: Config,
+        identity: Arc<Identity>,
+        domain: Option<&FakeDomain>,
+        mdns_port: Option<u16>,
+    ) -> Self {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let (stop, stopped) = oneshot::channel::<()>();
@@ -67,7 +77,8 @@ impl Node {
         let read = file.clone();
         let source: ConfigSource = Arc::new(move || Ok(read.lock().unwrap().clone()));
         runtime.spawn(async move {
-            let options = RunOptions { ready: Some(ready), source: Some(source), ..RunOptions::default() };
+            let options =
+                RunOptions { ready: Some(ready), source: Some(source), mdns_port, ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };

@@ -203,6 +203,19 @@ impl QuicDialer {
 
     pub(crate) async fn dial(&self, url: &LinkUrl) -> Result<QuicLink, DialError> {
         let addresses = self.resolve(url).await?;
+        self.dial_at(url, addresses).await
+    }
+
+    /// Dials these addresses in this order, and says `url` of them.
+    pub(crate) async fn dial_at(
+        &self,
+        url: &LinkUrl,
+        mut addresses: Vec<SocketAddr>,
+    ) -> Result<QuicLink, DialError> {
+        addresses.truncate(ADDRESSES_MAX);
+        if addresses.is_empty() {
+            return Err(DialError::NoAddress(url.clone()));
+        }
         let failed = |attempts| DialError::Failed { url: url.clone(), attempts };
         let (remote, connection, findings) = self.connect(addresses).await.map_err(failed)?;
         let link = self.greet(connection, findings).await.map_err(|e| failed(vec![(remote, e)]))?;

@@ -63,16 +63,24 @@ impl PeerVerifier {
         (Arc::new(Self { credentials, algorithms, findings: Arc::clone(&findings) }), findings)
     }
 
+    /// `attaches`: the peer came to a listener of this node.
     fn judge(
         &self,
         leaf: &CertificateDer<'_>,
         intermediates: &[CertificateDer<'_>],
         now: UnixTime,
+        attaches: bool,
     ) -> Result<(), Error> {
         let chain: Vec<CertificateDer<'_>> = std::iter::once(leaf).chain(intermediates).cloned().collect();
         // Read here and not when the handshake began: what was revoked since counts.
         let anchors = self.credentials.anchors();
-        let result = anchors.verify(&chain, UnixMillis(now.as_secs().saturating_mul(1000)));
+        let mut result = anchors.verify(&chain, UnixMillis(now.as_secs().saturating_mul(1000)));
+        if let Ok(peer) = &result
+            && attaches
+            && !self.credentials.admits(peer)
+        {
+            result = Err(CertError::NotAdmitted { ca: peer.ca });
+        }
         let answer = result.as_ref().map(drop).map_err(|e| Error::InvalidCertificate(alert(e)));
         // The first verdict stands: a handshake asks once.
         let _ = self.findings.verdict.set(result);
@@ -139,7 +147,7 @@ impl ServerCertVerifier for PeerVerifier {
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        self.judge(end_entity, intermediates, now).map(|()| ServerCertVerified::assertion())
+        self.judge(end_entity, intermediates, now, false).map(|()| ServerCertVerified::assertion())
     }
 
     handshake_signatures!();
@@ -157,7 +165,7 @@ impl ClientCertVerifier for PeerVerifier {
         intermediates: &[CertificateDer<'_>],
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
-        self.judge(end_entity, intermediates, now).map(|()| ClientCertVerified::assertion())
+        self.judge(end_entity, intermediates, now, true).map(|()| ClientCertVerified::assertion())
     }
 
     handshake_signatures!();
@@ -167,6 +175,7 @@ impl ClientCertVerifier for PeerVerifier {
 fn alert(error: &CertError) -> CertificateError {
     match error {
         CertError::UnknownIssuer => CertificateError::UnknownIssuer,
+        CertError::NotAdmitted { .. } => CertificateError::ApplicationVerificationFailure,
         CertError::Revoked { .. } => CertificateError::Revoked,
         CertError::BadSignature => CertificateError::BadSignature,
         CertError::Expired { .. } | CertError::CaExpired { .. } => CertificateError::Expired,

@@ -1,0 +1,183 @@
+//! Where a router is to be found: `quic://HOST:PORT`, `srv://DOMAIN`, `mdns://`.
+//!
+//! It parses and prints; looking up and dialling is the business of `crate::finding`.
+
+use std::fmt;
+use std::net::IpAddr;
+use std::str::FromStr;
+
+use sgc_transport::{LinkUrl, UrlError};
+use sgc_trust::NodeName;
+
+/// The longest name in DNS, in text.
+const NAME_BYTES_MAX: usize = 253;
+/// What DNS knows the routers of a domain by (RFC 2782): service and protocol.
+pub const SRV_SERVICE: &str = "_sgc._udp";
+
+/// How a router is found.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum RouterUrl {
+    /// `quic://HOST:PORT`: it is there.
+    At(LinkUrl),
+    /// `srv://DOMAIN`: DNS names those of the domain, of which one is wanted.
+    Srv(SrvDomain),
+    /// `mdns://`, any on the local network that this node trusts, or `mdns://NODE`, the one of that name.
+    Mdns(Option<NodeName>),
+}
+
+/// A domain whose SRV records name routers; absolute, in small letters, without its last dot.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct SrvDomain(Box<str>);
+
+impl SrvDomain {
+    /// What DNS is asked for: `_sgc._udp.DOMAIN.`, absolute, so that no search list counts.
+    pub fn query(&self) -> String {
+        format!("{SRV_SERVICE}.{}.", self.0)
+    }
+}
+
+impl fmt::Display for SrvDomain {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Why a text says of no router where it is.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RouterUrlError {
+    /// It is no URL of a link either.
+    #[error(transparent)]
+    Link(#[from] UrlError),
+    /// No way of finding routers has that name.
+    #[error("{0}:// is not known: it takes quic://HOST:PORT, srv://DOMAIN and mdns://")]
+    Scheme(String),
+    /// Not a domain.
+    #[error("after srv:// comes the domain whose {SRV_SERVICE} records name routers: \"srv://lab.example\"")]
+    Domain,
+    /// An address, which has no SRV records.
+    #[error("{0} is an address, which DNS has no SRV records of: write \"quic://{0}\"")]
+    DomainIsAddress(IpAddr),
+    /// The labels of the query are in front already.
+    #[error("{SRV_SERVICE} is put in front by itself: write \"srv://{0}\"")]
+    DomainIsQuery(String),
+    /// A port, which the record says.
+    #[error("the SRV records say the port: write \"srv://{0}\"")]
+    DomainPort(String),
+    /// Not the name of a node.
+    #[error(
+        "after mdns:// comes nothing, for any router that this node trusts, or a router's name: \"mdns://cloud\""
+    )]
+    Node,
+}
+
+impl FromStr for RouterUrl {
+    type Err = RouterUrlError;
+
+    fn from_str(text: &str) -> Result<Self, RouterUrlError> {
+        match text.split_once("://") {
+            Some(("srv", rest)) => domain(rest.strip_suffix('/').unwrap_or(rest)).map(Self::Srv),
+            Some(("mdns", rest)) => match rest.strip_suffix('/').unwrap_or(rest) {
+                "" => Ok(Self::Mdns(None)),
+                name => name.parse().map(|name| Self::Mdns(Some(name))).map_err(|_| RouterUrlError::Node),
+            },
+            _ => match text.parse() {
+                Ok(url) => Ok(Self::At(url)),
+                Err(UrlError::SchemeUnknown(scheme)) => Err(RouterUrlError::Scheme(scheme)),
+                Err(fault) => Err(fault.into()),
+            },
+        }
+    }
+}
+
+fn domain(text: &str) -> Result<SrvDomain, RouterUrlError> {
+    let bare = text.strip_prefix('[').and_then(|t| t.strip_suffix(']')).unwrap_or(text);
+    if let Ok(address) = bare.parse() {
+        return Err(RouterUrlError::DomainIsAddress(address));
+    }
+    let text = text.strip_suffix('.').unwrap_or(text).to_ascii_lowercase();
+    if let Some((host, port)) = text.rsplit_once(':')
+        && is_domain(host)
+        && port.bytes().all(|b| b.is_ascii_digit())
+    {
+        return Err(RouterUrlError::DomainPort(host.to_owned()));
+    }
+    if let Some(rest) = text.strip_prefix(SRV_SERVICE).and_then(|rest| rest.strip_prefix('.'))
+        && is_domain(rest)
+    {
+        return Err(RouterUrlError::DomainIsQuery(rest.to_owned()));
+    }
+    // The labels in front count.
+    let fits = text.len() + SRV_SERVICE.len() < NAME_BYTES_MAX;
+    if fits && is_domain(&text) { Ok(SrvDomain(text.into())) } else { Err(RouterUrlError::Domain) }
+}
+
+fn is_domain(text: &str) -> bool {
+    text.split('.').all(|label| {
+        (1..=63).contains(&label.len())
+            && label.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'-' | b'_'))
+            && !label.starts_with('-')
+            && !label.ends_with('-')
+    })
+}
+
+impl From<LinkUrl> for RouterUrl {
+    fn from(url: LinkUrl) -> Self {
+        Self::At(url)
+    }
+}
+
+impl fmt::Display for RouterUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::At(url) => write!(f, "{url}"),
+            Self::Srv(domain) => write!(f, "srv://{domain}"),
+            Self::Mdns(None) => f.write_str("mdns://"),
+            Self::Mdns(Some(node)) => write!(f, "mdns://{node}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    #[test]
+    fn each_way_round_trips() {
+        for (text, shown) in [
+            ("quic://router", "quic://router:7447"),
+            ("srv://lab.example", "srv://lab.example"),
+            ("srv://Lab.Example./", "srv://lab.example"),
+            ("mdns://", "mdns://"),
+            ("mdns:///", "mdns://"),
+            ("mdns://cloud", "mdns://cloud"),
+        ] {
+            let url: RouterUrl = text.parse().unwrap();
+            assert_eq!(url.to_string(), shown);
+            assert_eq!(shown.parse(), Ok(url));
+        }
+        let RouterUrl::Srv(domain) = "srv://lab.example".parse().unwrap() else { panic!() };
+        assert_eq!(domain.query(), "_sgc._udp.lab.example.");
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let refused = |text: &str| text.parse::<RouterUrl>().unwrap_err();
+        assert!(matches!(refused("router:7447"), RouterUrlError::Link(UrlError::SchemeMissing(_))));
+        assert!(matches!(refused("tcp://router"), RouterUrlError::Link(UrlError::SchemePlanned(_))));
+        assert_eq!(refused("http://router"), RouterUrlError::Scheme("http".into()));
+        for text in ["srv://", "srv://a..b", "srv://-a", "srv://a b", "srv://a/b", "srv://.", "srv://a:b"] {
+            assert_eq!(refused(text), RouterUrlError::Domain, "{text}");
+        }
+        assert_eq!(refused(&format!("srv://{}a", "abcdefg.".repeat(31))), RouterUrlError::Domain);
+        for text in ["srv://10.0.0.1", "srv://[::1]", "srv://::1"] {
+            assert!(matches!(refused(text), RouterUrlError::DomainIsAddress(_)), "{text}");
+        }
+        assert_eq!(refused("srv://lab.example:53"), RouterUrlError::DomainPort("lab.example".into()));
+        assert_eq!(refused("srv://_sgc._udp.lab"), RouterUrlError::DomainIsQuery("lab".into()));
+        for text in ["mdns://A", "mdns://a:1", "mdns://a b"] {
+            assert_eq!(refused(text), RouterUrlError::Node, "{text}");
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! When to try again: after failures with growing patience, always with jitter, so that many nodes which lost one router
+//! do not come back at one moment.
+
+use std::time::Duration;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::RngCore;
+use tokio::time::Instant;
+
+/// The shortest wait, before jitter.
+const BACKOFF_MIN: Duration = Duration::from_millis(250);
+/// The longest wait for a router that the user, or his DNS, named.
+pub(crate) const BACKOFF_MAX: Duration = Duration::from_secs(10);
+/// How long nothing is tried where trying again soon is of no use.
+pub(crate) const STAND_BACK: Duration = Duration::from_secs(300);
+
+/// The attempts at one target.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Backoff {
+    max: Duration,
+    failures: u32,
+    due: Option<Instant>,
+}
+
+impl Backoff {
+    /// Nothing was tried yet, so now is the time. No wait is longer than `max`, standing back excepted.
+    pub(crate) fn new(max: Duration) -> Self {
+        Self { max, failures: 0, due: None }
+    }
+
+    /// It worked, and is over.
+    pub(crate) fn ended(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
+        self.failures = 0;
+        self.due = Some(now + wait(1, self.max, rng));
+    }
+
+    /// It did not work.
+    pub(crate) fn failed(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
+        self.failures = self.failures.saturating_add(1);
+        self.due = Some(now + wait(self.failures, self.max, rng));
+    }
+
+    /// There is no use in trying soon.
+    pub(crate) fn stand_back(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
+        self.due = Some(now + jittered(STAND_BACK, rng));
+    }
+
+    /// Failures in a row.
+    pub(crate) fn failures(&self) -> u32 {
+        self.failures
+    }
+
+    /// When it may be tried; `None` is at once.
+    pub(crate) fn due(&self) -> Option<Instant> {
+        self.due
+    }
+
+    /// Whether it may be tried.
+    pub(crate) fn is_due(&self, now: Instant) -> bool {
+        self.due.is_none_or(|due| due <= now)
+    }
+}
+
+/// How long to wait after so many failures in a row: `BACKOFF_MIN` doubled for each after the first, at most `max`, times
+/// a random factor in [0.5, 1).
+pub(crate) fn wait(failures: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
+    let doubled = BACKOFF_MIN.saturating_mul(2u32.saturating_pow(failures.saturating_sub(1).min(16)));
+    jittered(doubled.min(max), rng)
+}
+
+fn jittered(wait: Duration, rng: &mut ChaCha20Rng) -> Duration {
+    wait.mul_f64(0.5 + f64::from(rng.next_u32()) / f64::from(u32::MAX) / 2.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_core::SeedableRng as _;
+
+    use super::*;
+
+    #[test]
+    fn waits_grow_to_their_limit_and_differ() {
+        let mut rng = ChaCha20Rng::seed_from_u64(1);
+        for (failures, most) in
+            [(0, 250), (1, 250), (2, 500), (5, 4000), (6, 8000), (7, 10_000), (900, 10_000)]
+        {
+            let waits: Vec<_> = (0..100).map(|_| wait(failures, BACKOFF_MAX, &mut rng).as_millis()).collect();
+            assert!(waits.iter().all(|w| (most / 2..=most).contains(w)), "{failures}: {waits:?}");
+            assert!(waits.iter().max() > waits.iter().min());
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn success_makes_patience_short_again() {
+        let (mut rng, mut backoff) = (ChaCha20Rng::seed_from_u64(2), Backoff::new(BACKOFF_MAX));
+        let now = Instant::now();
+        assert!(backoff.is_due(now));
+        for _ in 0..20 {
+            backoff.failed(now, &mut rng);
+        }
+        assert!(!backoff.is_due(now + BACKOFF_MAX / 2 - Duration::from_millis(1)));
+        assert!(backoff.is_due(now + BACKOFF_MAX));
+        backoff.stand_back(now, &mut rng);
+        assert!(!backoff.is_due(now + BACKOFF_MAX) && backoff.is_due(now + STAND_BACK));
+        assert_eq!(backoff.failures(), 20);
+        backoff.ended(now, &mut rng);
+        assert!(!backoff.is_due(now) && backoff.is_due(now + BACKOFF_MIN));
+        assert_eq!(backoff.failures(), 0);
+    }
+}

@@ -1,0 +1,170 @@
+//! How each router is being found, for `sgc status`. It shows; it decides nothing.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use serde::Serialize;
+use sgc_wire::NodeId;
+use tokio::time::Instant;
+
+use super::Aim;
+use crate::stats::Drops;
+
+/// A router that this node looks for, or looks for routers at.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct RouterStatus {
+    /// As the user wrote it: `quic://…`, `srv://…`, `mdns://…`.
+    pub router: String,
+    /// `"static"`, `"token"`, `"srv"` or `"mdns"`.
+    pub found_by: &'static str,
+    /// What is dialled, or was last.
+    pub at: Option<String>,
+    /// What is going on: `"connecting"`, `"linked"`, `"trying again"`, `"standing back"`, `"looking up"`, `"looking"`.
+    pub state: &'static str,
+    /// Node id of the router that is linked.
+    pub peer: Option<String>,
+    /// Failures in a row.
+    pub failures: u32,
+    /// What went wrong last, if anything did.
+    pub last_failure: Option<String>,
+    /// Seconds until the next attempt.
+    pub again_in_s: Option<u64>,
+}
+
+/// Where a task says how it is doing.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Board {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    rows: Mutex<Rows>,
+    drops: Drops,
+}
+
+#[derive(Debug, Default)]
+struct Rows {
+    next: u64,
+    rows: BTreeMap<u64, (RouterStatus, Option<Instant>)>,
+}
+
+impl Board {
+    /// A line for a router; it is there until it is dropped.
+    pub(crate) fn line(&self, router: impl ToString, found_by: &'static str) -> Line {
+        let mut rows = self.rows();
+        let id = rows.next;
+        rows.next += 1;
+        let status = RouterStatus {
+            router: router.to_string(),
+            found_by,
+            at: None,
+            state: "looking",
+            peer: None,
+            failures: 0,
+            last_failure: None,
+            again_in_s: None,
+        };
+        rows.rows.insert(id, (status, None));
+        drop(rows);
+        Line { id, board: self.clone() }
+    }
+
+    /// Everything, in the order in which it began.
+    pub(crate) fn snapshot(&self) -> Vec<RouterStatus> {
+        let now = Instant::now();
+        let shown = |(status, due): &(RouterStatus, Option<Instant>)| RouterStatus {
+            again_in_s: due.map(|due| due.saturating_duration_since(now).as_secs()),
+            ..status.clone()
+        };
+        self.rows().rows.values().map(shown).collect()
+    }
+
+    /// What was left aside while looking.
+    pub(crate) fn drops(&self) -> &Drops {
+        &self.shared.drops
+    }
+
+    fn rows(&self) -> MutexGuard<'_, Rows> {
+        self.shared.rows.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What one task says.
+#[derive(Debug)]
+pub(crate) struct Line {
+    id: u64,
+    board: Board,
+}
+
+impl Line {
+    /// DNS is being asked.
+    pub(crate) fn looking_up(&self) {
+        self.change(|row, due| {
+            row.state = "looking up";
+            *due = None;
+        });
+    }
+
+    /// This is being dialled.
+    pub(crate) fn connecting(&self, aim: &Aim) {
+        self.change(|row, due| {
+            row.at = Some(aim.url.to_string());
+            row.state = "connecting";
+            *due = None;
+        });
+    }
+
+    /// A link is up.
+    pub(crate) fn linked(&self, aim: &Aim, node: &NodeId) {
+        self.change(|row, due| {
+            row.at = Some(aim.url.to_string());
+            row.state = "linked";
+            row.peer = Some(node.to_string());
+            row.failures = 0;
+            *due = None;
+        });
+    }
+
+    /// The link ended.
+    pub(crate) fn ended(&self, why: &str) {
+        self.change(|row, _| {
+            row.state = "trying again";
+            row.peer = None;
+            row.last_failure = Some(format!("link ended: {why}"));
+        });
+    }
+
+    /// Something went wrong.
+    pub(crate) fn failed(&self, why: &str) {
+        self.change(|row, _| {
+            row.failures = row.failures.saturating_add(1);
+            row.last_failure = Some(why.to_owned());
+        });
+    }
+
+    /// Something is amiss that is no failure of a link: DNS while a link is up.
+    pub(crate) fn noted(&self, why: &str) {
+        self.change(|row, _| row.last_failure = Some(why.to_owned()));
+    }
+
+    /// Nothing happens until then.
+    pub(crate) fn waits(&self, until: Option<Instant>, stands_back: bool) {
+        self.change(|row, due| {
+            row.state = if stands_back { "standing back" } else { "trying again" };
+            *due = until;
+        });
+    }
+
+    fn change(&self, change: impl FnOnce(&mut RouterStatus, &mut Option<Instant>)) {
+        if let Some((row, due)) = self.board.rows().rows.get_mut(&self.id) {
+            change(row, due);
+        }
+    }
+}
+
+impl Drop for Line {
+    fn drop(&mut self) {
+        self.board.rows().rows.remove(&self.id);
+    }
+}

@@ -1,0 +1,303 @@
+//! One link to one of the routers that the SRV records of a domain name, in the order of RFC 2782.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::RngCore;
+use sgc_transport::{LinkUrl, Scheme};
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep_until};
+use tracing::{info, warn};
+
+use super::{Aim, BACKOFF_MAX, Backoff, Failure, Hold, Line, Names, Outcome, Wish, pause, take_note};
+use crate::config::{RouterUrl, SrvDomain};
+
+/// Most targets of a domain that are taken, the best of them.
+pub(crate) const TARGETS_MAX: usize = 16;
+/// An answer holds as long as it says, within these bounds.
+pub(crate) const TTL_MIN: Duration = Duration::from_secs(10);
+pub(crate) const TTL_MAX: Duration = Duration::from_secs(3600);
+const HOST_BYTES_MAX: usize = 253;
+
+/// A record: a router of a domain.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct SrvTarget {
+    /// The least is tried first.
+    pub(crate) priority: u16,
+    /// Its share among those of one priority.
+    pub(crate) weight: u16,
+    /// A host name, without its last dot.
+    pub(crate) host: String,
+    pub(crate) port: u16,
+}
+
+impl SrvTarget {
+    /// Whether it can be dialled at all.
+    pub(crate) fn is_usable(&self) -> bool {
+        let is_name = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'.' | b'_');
+        self.port != 0 && (1..=HOST_BYTES_MAX).contains(&self.host.len()) && self.host.bytes().all(is_name)
+    }
+
+    fn url(&self) -> LinkUrl {
+        LinkUrl { scheme: Scheme::Quic, host: self.host.clone(), port: self.port, cost_ms: None }
+    }
+}
+
+/// What DNS said of a domain.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct SrvAnswer {
+    /// At least one, at most [`TARGETS_MAX`].
+    pub(crate) targets: Vec<SrvTarget>,
+    /// How long it holds, [`TTL_MIN`] to [`TTL_MAX`].
+    pub(crate) ttl: Duration,
+}
+
+/// The order in which to try them: by priority, and within one at random, each with a probability in proportion to its
+/// weight of coming before the rest (RFC 2782).
+pub(crate) fn in_order(targets: &[SrvTarget], rng: &mut impl RngCore) -> Vec<SrvTarget> {
+    let mut rest = targets.to_vec();
+    // Those of weight 0 first, which leaves them a small chance only.
+    rest.sort_by_key(|target| (target.priority, target.weight != 0));
+    let mut ordered = Vec::with_capacity(rest.len());
+    while let Some(first) = rest.first() {
+        let priority = first.priority;
+        let peers = || rest.iter().take_while(|target| target.priority == priority);
+        let total: u64 = peers().map(|target| u64::from(target.weight)).sum();
+        // At most 16 weights of 16 bits, so the bias of a remainder of 64 bits is nothing.
+        let drawn = rng.next_u64() % (total + 1);
+        let mut sum = 0;
+        let chosen = peers().position(|target| {
+            sum += u64::from(target.weight);
+            sum >= drawn
+        });
+        ordered.push(rest.remove(chosen.unwrap_or(0)));
+    }
+    ordered
+}
+
+/// What is known of a domain.
+struct Known {
+    /// The last good answer; an old one is better than none.
+    answer: Option<SrvAnswer>,
+    /// When to ask again.
+    expires: Instant,
+    asked: Option<Instant>,
+    asking: Backoff,
+}
+
+impl Known {
+    /// Asks DNS, and keeps what it says.
+    async fn ask<N: Names>(
+        &mut self,
+        domain: &SrvDomain,
+        names: &N,
+        line: &Line,
+        rng: &mut ChaCha20Rng,
+    ) -> bool {
+        let asked = names.routers(domain).await;
+        let now = Instant::now();
+        self.asked = Some(now);
+        match asked {
+            Ok(answer) => {
+                self.asking = Backoff::new(BACKOFF_MAX);
+                self.expires = now + answer.ttl;
+                self.answer = Some(answer);
+                true
+            }
+            Err(why) => {
+                if self.asking.failures() == 0 {
+                    warn!("cannot find a router: {why}; asking again until it works");
+                }
+                line.noted(&why.to_string());
+                if why.is_final() {
+                    self.answer = None;
+                }
+                self.asking.failed(now, rng);
+                self.expires = self.asking.due().unwrap_or(now);
+                false
+            }
+        }
+    }
+}
+
+/// Keeps one link to one of the routers of a domain: to the best that can be reached, and when that link ends, again to
+/// the best.
+pub(crate) async fn keep_one_of<N: Names, H: Hold>(
+    domain: SrvDomain,
+    names: N,
+    holder: H,
+    line: Line,
+    mut rng: ChaCha20Rng,
+) {
+    let mut known =
+        Known { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
+    let mut tried: BTreeMap<LinkUrl, Backoff> = BTreeMap::new();
+    loop {
+        if known.expires <= Instant::now() {
+            line.looking_up();
+            known.ask(&domain, &names, &line, &mut rng).await;
+        }
+        let targets = known.answer.as_ref().map(|answer| in_order(&answer.targets, &mut rng));
+        let targets = targets.unwrap_or_default();
+        tried.retain(|url, _| targets.iter().any(|target| target.url() == *url));
+        let mut has_failed = false;
+        for target in targets {
+            let backoff = tried.entry(target.url()).or_insert_with(|| Backoff::new(BACKOFF_MAX));
+            if !backoff.is_due(Instant::now()) {
+                continue;
+            }
+            let outcome = match aim(&target, &names).await {
+                Ok(aim) => hold(&domain, &mut known, aim, &names, &holder, &line, &mut rng).await,
+                Err(failure) => Outcome::Failed(failure),
+            };
+            if holder.is_over() {
+                return;
+            }
+            take_note(&outcome, backoff, &line, &mut rng);
+            match &outcome {
+                Outcome::Ended { .. } => break,
+                // The set has its link, by another way.
+                Outcome::Failed(Failure::Reached(_)) => {
+                    pause(&holder, &outcome, backoff.due()).await;
+                    *backoff = Backoff::new(BACKOFF_MAX);
+                    break;
+                }
+                Outcome::Failed(_) => has_failed = true,
+            }
+        }
+        if holder.is_over() {
+            return;
+        }
+        // What failed may stand in DNS no more.
+        if has_failed && let Some(asked) = known.asked {
+            known.expires = known.expires.min(asked + TTL_MIN);
+        }
+        let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(Instant::now)).min();
+        let next = next.map_or(known.expires, |next| next.min(known.expires));
+        line.waits(Some(next), false);
+        sleep_until(next).await;
+    }
+}
+
+/// Where a target is now.
+async fn aim<N: Names>(target: &SrvTarget, names: &N) -> Result<Aim, Failure> {
+    let addresses = names.addresses(&target.host, target.port).await?;
+    Ok(Aim { url: target.url(), addresses })
+}
+
+/// Keeps a link to a target, and asks DNS meanwhile whether it still is one. If not, the link moves to one that is; as
+/// long as that cannot be reached, it stays.
+async fn hold<N: Names, H: Hold>(
+    domain: &SrvDomain,
+    known: &mut Known,
+    first: Aim,
+    names: &N,
+    holder: &H,
+    line: &Line,
+    rng: &mut ChaCha20Rng,
+) -> Outcome {
+    let (move_to, at) = watch::channel(first);
+    let refresh = async {
+        loop {
+            sleep_until(known.expires).await;
+            if !known.ask(domain, names, line, rng).await {
+                continue;
+            }
+            let targets =
+                known.answer.as_ref().map(|answer| in_order(&answer.targets, rng)).unwrap_or_default();
+            let now = move_to.borrow().url.clone();
+            if targets.iter().any(|target| target.url() == now) {
+                continue;
+            }
+            for target in targets {
+                if let Ok(aim) = aim(&target, names).await {
+                    info!("{} names {now} no more; moving to {}", RouterUrl::Srv(domain.clone()), aim.url);
+                    move_to.send_replace(aim);
+                    break;
+                }
+            }
+        }
+    };
+    let wish = Wish::default();
+    tokio::select! {
+        outcome = holder.hold(at, &wish, line) => outcome,
+        never = refresh => never,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_core::SeedableRng as _;
+
+    use super::*;
+
+    fn target(priority: u16, weight: u16, host: &str) -> SrvTarget {
+        SrvTarget { priority, weight, host: host.into(), port: 7447 }
+    }
+
+    fn hosts(targets: &[SrvTarget]) -> String {
+        targets.iter().map(|target| target.host.as_str()).collect()
+    }
+
+    #[test]
+    fn lower_priorities_always_come_first() {
+        let mut rng = ChaCha20Rng::seed_from_u64(1);
+        let targets = [target(20, 9, "c"), target(10, 0, "a"), target(30, 65535, "d"), target(10, 60, "b")];
+        for _ in 0..200 {
+            let order = hosts(&in_order(&targets, &mut rng));
+            assert!(["abcd", "bacd"].contains(&order.as_str()), "{order}");
+        }
+        assert_eq!(in_order(&[], &mut rng), []);
+    }
+
+    #[test]
+    fn weights_are_shares_of_being_first_and_second() {
+        let mut rng = ChaCha20Rng::seed_from_u64(2);
+        let targets = [target(1, 10, "a"), target(1, 30, "b"), target(1, 60, "c"), target(1, 0, "z")];
+        const ROUNDS: u32 = 20_000;
+        let mut first: BTreeMap<String, u32> = BTreeMap::new();
+        let mut second_after_c: BTreeMap<String, u32> = BTreeMap::new();
+        for _ in 0..ROUNDS {
+            let order = in_order(&targets, &mut rng);
+            assert_eq!(order.len(), 4);
+            *first.entry(order[0].host.clone()).or_default() += 1;
+            if order[0].host == "c" {
+                *second_after_c.entry(order[1].host.clone()).or_default() += 1;
+            }
+        }
+        let share = |counts: &BTreeMap<String, u32>, host: &str| {
+            f64::from(counts.get(host).copied().unwrap_or(0)) / f64::from(counts.values().sum::<u32>())
+        };
+        for (host, expected) in [("a", 0.1), ("b", 0.3), ("c", 0.6)] {
+            let found = share(&first, host);
+            assert!((found - expected).abs() < 0.02, "{host} is first in {found} of all");
+        }
+        // Not never, as the RFC wants it.
+        assert!((0.001..0.03).contains(&share(&first, "z")), "{first:?}");
+        assert!((share(&second_after_c, "b") - 0.75).abs() < 0.03, "{second_after_c:?}");
+    }
+
+    #[test]
+    fn one_seed_is_one_order() {
+        let targets: Vec<_> = ["a", "b", "c", "d"].iter().map(|host| target(1, 10, host)).collect();
+        let order = |seed| hosts(&in_order(&targets, &mut ChaCha20Rng::seed_from_u64(seed)));
+        assert_eq!(order(7), order(7));
+        assert!((0..20).any(|seed| order(seed) != order(7)));
+    }
+
+    #[test]
+    fn greatest_weights_do_not_overflow() {
+        let targets: Vec<_> = (0..16).map(|n| target(1, u16::MAX, &format!("h{n}"))).collect();
+        assert_eq!(in_order(&targets, &mut ChaCha20Rng::seed_from_u64(3)).len(), 16);
+    }
+
+    #[test]
+    fn what_cannot_be_dialled_is_no_target() {
+        assert!(target(0, 0, "router.lab.example").is_usable());
+        assert!(!SrvTarget { port: 0, ..target(0, 0, "a") }.is_usable());
+        for host in ["", "a b", "a\\046b", "a/b", &"a".repeat(254)] {
+            assert!(!target(0, 0, host).is_usable(), "{host}");
+        }
+    }
+}
