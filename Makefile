@@ -4,13 +4,13 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long model-check clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
-	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
+	@echo 'not in it:       peers-check-long (images of 13 MB), model-check (larger bounds), advisories (needs the web), clean-tools'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -70,6 +70,10 @@ peers-check: peers
 
 peers-check-long: peers
 	.venv/bin/python -B tests/peers/check.py --long
+
+# The tree protocol within larger bounds than in `unit`: minutes, and some GB.
+model-check:
+	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
 
 clean-tools:
 	rm -rf .venv .tools .peers
