@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -12,6 +12,7 @@ help:
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
+	@echo '                 model-check (larger bounds)'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -76,6 +77,10 @@ peers-check-long: peers
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc --locked --test ring $(ARGS) -- --nocapture
+
+# The tree protocol within larger bounds than in `unit`: minutes, and some GB.
+model-check:
+	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
 
 clean-tools:
 	rm -rf .venv .tools .peers
