@@ -4,12 +4,13 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long bench-routing clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
+	@echo 'make bench-routing  what routing costs, beside a TCP relay and zenoh (bench/README.md; ARGS="--quick")'
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
 
 demo: build
@@ -70,6 +71,11 @@ peers-check: peers
 
 peers-check-long: peers
 	.venv/bin/python -B tests/peers/check.py --long
+
+# A workspace of its own, since zenoh is large: no part of `make test`.
+bench-routing: build
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml -- all \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
 clean-tools:
 	rm -rf .venv .tools .peers
