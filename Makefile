@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check bench-routing clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -13,6 +13,7 @@ help:
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 	@echo '                 model-check (larger bounds)'
+	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -81,6 +82,11 @@ ring: peers
 # The tree protocol within larger bounds than in `unit`: minutes, and some GB.
 model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
+
+# A workspace of its own, since zenoh is large: no part of `make test`.
+bench-routing: build
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml -- all \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
 clean-tools:
 	rm -rf .venv .tools .peers

@@ -38,7 +38,7 @@ impl TrustAnchors {
         }
         let mut lists = BTreeMap::clone(&self.lists);
         lists.insert(ca, list);
-        Ok(Some(Self { lists: Arc::new(lists), ..self.clone() }))
+        Ok(Some(self.with_lists(Arc::new(lists))))
     }
 
     /// The same CAs, with the lists in force elsewhere of those of them that are known there, where they are newer.
@@ -50,7 +50,7 @@ impl TrustAnchors {
                 lists.insert(*ca, list.clone());
             }
         }
-        Self { lists: Arc::new(lists), ..self.clone() }
+        self.with_lists(Arc::new(lists))
     }
 
     /// The lists in force, DER, to be passed on; one for each CA at most.

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod batch;
+mod chains;
 mod crl;
 mod enrol;
 mod fleet;

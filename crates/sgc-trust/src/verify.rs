@@ -13,6 +13,7 @@ use rustls_pki_types::{CertificateDer, SignatureVerificationAlgorithm, TrustAnch
 use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, GroupTag, NodeId, Pseudonym, UnixMillis};
 use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, aws_lc_rs as algs};
 
+use crate::chains::{ChainHash, KnownChains};
 use crate::crl::RevocationList;
 use crate::x509::{Validity, split_spki, without_zeros};
 
@@ -58,6 +59,8 @@ pub struct TrustAnchors {
     pub(crate) paths: Arc<[TrustAnchor<'static>]>,
     /// One list for each CA at most.
     pub(crate) lists: Arc<BTreeMap<CaFingerprint, RevocationList>>,
+    /// What was verified with these CAs and lists, and with no others.
+    pub(crate) chains: Arc<KnownChains>,
 }
 
 pub(crate) struct Anchor {
@@ -84,7 +87,8 @@ impl TrustAnchors {
         if anchors.is_empty() {
             return Err(AnchorError::None);
         }
-        Ok(Self { anchors: anchors.into(), paths: paths.into(), lists: Arc::default() })
+        let (lists, chains) = (Arc::default(), Arc::default());
+        Ok(Self { anchors: anchors.into(), paths: paths.into(), lists, chains })
     }
 
     /// With more CAs, such as a partner's; one that is trusted already is not taken twice. Revocation lists stay.
@@ -98,7 +102,13 @@ impl TrustAnchors {
                 certificates.push(certificate);
             }
         }
-        Ok(Self { lists: Arc::clone(&self.lists), ..Self::new(certificates)? })
+        Ok(Self::new(certificates)?.with_lists(Arc::clone(&self.lists)))
+    }
+
+    /// The same CAs with these lists.
+    pub(crate) fn with_lists(&self, lists: Arc<BTreeMap<CaFingerprint, RevocationList>>) -> Self {
+        let (anchors, paths) = (Arc::clone(&self.anchors), Arc::clone(&self.paths));
+        Self { anchors, paths, lists, chains: Arc::default() }
     }
 
     /// Verifies a chain, leaf first, at the time `now`: path to one of the CAs, signatures, validity, key usage,
@@ -110,6 +120,10 @@ impl TrustAnchors {
         }
         if let Some(long) = chain.iter().find(|c| c.len() > CERT_BYTES_MAX) {
             return Err(CertError::CertificateTooLong { bytes: long.len() });
+        }
+        let hash = ChainHash::of(chain);
+        if let Some(peer) = self.chains.find(&hash, now) {
+            return Ok(peer);
         }
         let leaf = EndEntityCert::try_from(leaf_der).map_err(CertError::from_webpki)?;
         let time = UnixTime::since_unix_epoch(std::time::Duration::from_secs(now.secs()));
@@ -136,7 +150,13 @@ impl TrustAnchors {
         if let Some(at) = certs.iter().find_map(|c| self.revoked_at(c)) {
             return Err(CertError::Revoked { at });
         }
-        VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)
+        // With certificates that its path does not need, one chain could be varied without end.
+        let is_minimal = certs.len() == chain.len();
+        let peer = VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)?;
+        if is_minimal && let Some(validity) = ca.validity_with(chain) {
+            self.chains.remember(hash, peer.clone(), validity);
+        }
+        Ok(peer)
     }
 
     /// The CA certificates, DER.
@@ -173,6 +193,11 @@ impl Anchor {
         let validity = Validity::of(&der).ok_or("its validity cannot be read")?;
         let fingerprint = CaFingerprint(sha256(&[&spki]));
         Ok((Self { der, spki, fingerprint, validity }, path))
+    }
+
+    /// While this CA and all of these hold.
+    fn validity_with(&self, chain: &[CertificateDer<'_>]) -> Option<Validity> {
+        chain.iter().try_fold(self.validity, |all, certificate| Some(all.overlap(Validity::of(certificate)?)))
     }
 
     /// Path validation takes a trusted CA as it is; an expired one is not trusted here.

@@ -49,6 +49,17 @@ impl Validity {
         let mut validity = tbs.enter(SEQUENCE)?;
         Some(Self { not_before: validity.time()?, not_after: validity.time()? })
     }
+
+    /// While both hold; that may be never.
+    pub(crate) fn overlap(self, other: Self) -> Self {
+        let not_before = self.not_before.max(other.not_before);
+        Self { not_before, not_after: self.not_after.min(other.not_after) }
+    }
+
+    /// True at that time; the last second counts as a whole, as in path validation.
+    pub(crate) fn contains(&self, now: UnixMillis) -> bool {
+        now >= self.not_before && now.secs() <= self.not_after.secs()
+    }
 }
 
 /// Algorithm identifier (without its outer tag) and bare key of a DER SubjectPublicKeyInfo.

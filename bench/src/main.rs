@@ -1,0 +1,93 @@
+//! Benchmarks of routing on real sockets; `README.md` says what each part measures and how to read it.
+//!
+//! This file knows the command line. The parts are [`forward`], [`rib`] and [`first_message`]; what they share is in
+//! [`fleet`], [`node`], [`process`] and [`report`].
+#![forbid(unsafe_code)]
+
+mod first_message;
+mod fleet;
+mod forward;
+mod node;
+mod process;
+mod report;
+mod rib;
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+
+/// Benchmarks of SGC on real sockets.
+#[derive(Parser)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Everything below, one after the other
+    All(RunArgs),
+    /// 1 KB through one router, beside a plain TCP relay and a zenoh router
+    Forward(RunArgs),
+    /// Publishing and subscribing at a router that knows many names
+    Rib(RunArgs),
+    /// From a publisher's link to the first message at a subscriber
+    FirstMessage(RunArgs),
+    /// The relay of `forward`, in a process of its own
+    #[command(hide = true)]
+    ServeTcp,
+    /// The zenoh router of `forward`, in a process of its own
+    #[command(hide = true)]
+    ServeZenoh,
+    /// One size of `rib`, in a process of its own so that its memory can be told
+    #[command(hide = true)]
+    MeasureRib {
+        /// Names that the router knows
+        names: usize,
+        /// Single operations that are timed at that size
+        samples: usize,
+    },
+}
+
+/// What every part is given.
+#[derive(Args, Clone)]
+struct RunArgs {
+    /// The program whose router is measured
+    #[arg(long, value_name = "FILE", default_value = "target/release/sgc")]
+    sgc: PathBuf,
+    /// Where the JSON goes
+    #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
+    out: PathBuf,
+    /// Names in the router, for `rib`
+    #[arg(long, value_name = "N,N,…", value_delimiter = ',', default_values_t = [10_000, 1_000_000, 10_000_000])]
+    names: Vec<usize>,
+    /// A short run that shows that all parts work; its figures mean little
+    #[arg(long)]
+    quick: bool,
+}
+
+fn main() -> Result<()> {
+    match Cli::parse().command {
+        Command::All(args) => {
+            part(&args, "rib", rib::run)?;
+            part(&args, "first-message", first_message::run)?;
+            part(&args, "forward", forward::run)
+        }
+        Command::Forward(args) => part(&args, "forward", forward::run),
+        Command::Rib(args) => part(&args, "rib", rib::run),
+        Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
+        Command::ServeTcp => forward::tcp::serve(),
+        Command::ServeZenoh => forward::zenoh::serve(),
+        Command::MeasureRib { names, samples } => rib::measure_here(names, samples),
+    }
+}
+
+fn part(args: &RunArgs, name: &str, run: fn(&RunArgs) -> Result<report::Report>) -> Result<()> {
+    let report = run(args).with_context(|| format!("benchmark {name}"))?;
+    report.print();
+    if args.quick {
+        return Ok(());
+    }
+    report.write(&args.out, name)
+}

@@ -1,0 +1,164 @@
+//! Processes that are measured: started, found by the address that they print, ended by closing their standard input.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+
+/// Longer than anything takes that works.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A process that serves until it is dropped.
+pub(crate) struct Server {
+    child: Child,
+    /// The first line that it printed.
+    pub(crate) greeting: String,
+}
+
+impl Server {
+    /// Starts it, and waits for its first line. It has to end when its standard input does.
+    pub(crate) fn start(command: &mut Command) -> Result<Self> {
+        let mut child = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .with_context(|| format!("{command:?}"))?;
+        let mut greeting = String::new();
+        let stdout = child.stdout.take().context("no standard output")?;
+        BufReader::new(stdout).read_line(&mut greeting)?;
+        if greeting.is_empty() {
+            bail!("{command:?} ends with {}", child.wait()?);
+        }
+        Ok(Self { child, greeting: greeting.trim().to_owned() })
+    }
+
+    /// This program once more, as `role`.
+    pub(crate) fn own(role: &str) -> Result<Self> {
+        Self::start(Command::new(std::env::current_exe()?).arg(role))
+    }
+
+    /// CPU time that its threads have taken, user and system, seconds.
+    pub(crate) fn cpu_seconds(&self) -> f64 {
+        let tasks = fs::read_dir(format!("/proc/{}/task", self.child.id()));
+        let spent = |task: fs::DirEntry| {
+            let text = fs::read_to_string(task.path().join("schedstat")).ok()?;
+            text.split(' ').next()?.parse::<f64>().ok()
+        };
+        tasks.into_iter().flatten().flatten().filter_map(spent).sum::<f64>() / 1e9
+    }
+
+    /// Its resident memory, bytes.
+    pub(crate) fn resident_bytes(&self) -> u64 {
+        resident_bytes(&format!("/proc/{}/status", self.child.id()))
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        drop(self.child.stdin.take());
+        let deadline = Instant::now() + PATIENCE;
+        while Instant::now() < deadline {
+            if !matches!(self.child.try_wait(), Ok(None)) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Blocks until standard input ends: what a [`Server`] of this program does when it is up.
+pub(crate) fn until_stdin_closes() {
+    let mut rest = Vec::new();
+    let _ = std::io::stdin().lock().read_to_end(&mut rest);
+}
+
+/// `sgc run` as a router.
+pub(crate) struct SgcRouter {
+    pub(crate) process: Server,
+    /// Where it listens.
+    pub(crate) url: String,
+    socket: PathBuf,
+}
+
+impl SgcRouter {
+    /// Starts it in `dir`, with the identity in `router.identity` there.
+    pub(crate) fn start(sgc: &Path, dir: &Path) -> Result<Self> {
+        let (config, socket) = (dir.join("router.toml"), dir.join("router.sock"));
+        let text = format!(
+            "identity = \"router.identity\"\n[node]\nstate = \"router.state\"\n\
+             [router]\nlisten = [\"quic://127.0.0.1:0\"]\n[admin]\nsocket = {:?}\n",
+            socket.display().to_string()
+        );
+        fs::write(&config, text)?;
+        let sgc = sgc.canonicalize().with_context(|| format!("{}: is it built?", sgc.display()))?;
+        let mut command = Command::new(sgc);
+        command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
+        let process = Server::start(command.arg(&config))?;
+        let ready: serde_json::Value = serde_json::from_str(&process.greeting)?;
+        let url = ready["ready"][0].as_str().context("it listens nowhere")?.to_owned();
+        Ok(Self { process, url, socket })
+    }
+
+    /// How many names it has a route for.
+    pub(crate) fn routed_names(&self) -> Result<u64> {
+        let status = status(&self.socket)?;
+        status["router"]["routed_names"].as_u64().context("a status without `routed_names`")
+    }
+
+    /// How many links it has.
+    pub(crate) fn links(&self) -> Result<usize> {
+        Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
+    }
+
+    /// Waits until it has a route for so many names; how long it took to find out is added to the time of others, so it
+    /// asks rarely if answers are slow.
+    pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let asked = Instant::now();
+            let routed = self.routed_names()?;
+            if routed == names {
+                return Ok(());
+            }
+            if asked > deadline {
+                bail!("the router has {routed} names with a route instead of {names}");
+            }
+            std::thread::sleep((asked.elapsed() * 4).max(Duration::from_millis(2)));
+        }
+    }
+}
+
+/// What a node says at its status socket.
+pub(crate) fn status(socket: &Path) -> Result<serde_json::Value> {
+    let mut stream = UnixStream::connect(socket).with_context(|| socket.display().to_string())?;
+    stream.write_all(sgc_node::admin::AdminRequest::Status.to_line().as_bytes())?;
+    let mut text = String::new();
+    stream.read_to_string(&mut text)?;
+    Ok(serde_json::from_str(&text)?)
+}
+
+/// Resident memory of this process, bytes.
+pub(crate) fn own_resident_bytes() -> u64 {
+    resident_bytes("/proc/self/status")
+}
+
+fn resident_bytes(status: &str) -> u64 {
+    field_kib(status, "VmRSS") * 1024
+}
+
+/// A line of /proc/meminfo.
+pub(crate) fn memory_kib(field: &str) -> u64 {
+    field_kib("/proc/meminfo", field)
+}
+
+fn field_kib(path: &str, field: &str) -> u64 {
+    let text = fs::read_to_string(path).unwrap_or_default();
+    let line = text.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    line.and_then(|l| l.trim().trim_end_matches(" kB").parse().ok()).unwrap_or(0)
+}

@@ -1,0 +1,117 @@
+//! What comes out: tables for people, JSON for programs, and which machine it was.
+
+use std::fs;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::{Deserialize, Serialize};
+
+/// The figures of one part.
+#[derive(Serialize)]
+pub(crate) struct Report {
+    machine: Machine,
+    figures: serde_json::Value,
+    #[serde(skip)]
+    tables: Vec<Table>,
+}
+
+/// A table, and the sentence above it.
+pub(crate) struct Table {
+    pub(crate) title: String,
+    pub(crate) columns: Vec<&'static str>,
+    pub(crate) rows: Vec<Vec<String>>,
+}
+
+/// Where it was measured: enough to compare by, nothing that tells whose machine it is.
+#[derive(Serialize)]
+struct Machine {
+    cpu: String,
+    cores: usize,
+    memory_gib: u64,
+    kernel: String,
+    /// Processes that wanted a core, mean of the last minute; the benchmark's own count too.
+    load: f64,
+}
+
+impl Report {
+    pub(crate) fn new(figures: &impl Serialize, tables: Vec<Table>) -> Result<Self> {
+        Ok(Self { machine: Machine::here(), figures: serde_json::to_value(figures)?, tables })
+    }
+
+    /// Prints the tables, Markdown.
+    pub(crate) fn print(&self) {
+        let Machine { cpu, cores, memory_gib, kernel, load } = &self.machine;
+        println!("Machine: {cpu}, {cores} cores, {memory_gib} GiB, Linux {kernel}, load {load}\n");
+        for table in &self.tables {
+            println!("{}\n", table.title);
+            println!("| {} |", table.columns.join(" | "));
+            println!("|{}", "---|".repeat(table.columns.len()));
+            for row in &table.rows {
+                println!("| {} |", row.join(" | "));
+            }
+            println!();
+        }
+    }
+
+    /// Writes `NAME.json`.
+    pub(crate) fn write(&self, dir: &Path, name: &str) -> Result<()> {
+        let path = dir.join(format!("{name}.json"));
+        fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
+        let text = serde_json::to_string_pretty(self)? + "\n";
+        fs::write(&path, text).with_context(|| path.display().to_string())
+    }
+}
+
+impl Machine {
+    fn here() -> Self {
+        let read = |path| fs::read_to_string(path).unwrap_or_default();
+        let cpu = read("/proc/cpuinfo");
+        let cpu = cpu.lines().find_map(|l| l.strip_prefix("model name")).unwrap_or_default();
+        let load = read("/proc/loadavg");
+        Self {
+            cpu: cpu.trim_start_matches(['\t', ' ', ':']).to_owned(),
+            cores: std::thread::available_parallelism().map_or(0, usize::from),
+            memory_gib: crate::process::memory_kib("MemTotal") / (1 << 20),
+            kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
+            load: load.split(' ').next().and_then(|l| l.parse().ok()).unwrap_or(0.0),
+        }
+    }
+}
+
+/// Middle and tail of a sample, in its unit.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Serialize)]
+pub(crate) struct Spread {
+    pub(crate) mean: f64,
+    pub(crate) p50: f64,
+    pub(crate) p99: f64,
+}
+
+impl Spread {
+    pub(crate) fn of(mut sample: Vec<f64>) -> Self {
+        if sample.is_empty() {
+            return Self::default();
+        }
+        sample.sort_unstable_by(f64::total_cmp);
+        let at = |part: f64| sample[((sample.len() - 1) as f64 * part) as usize];
+        Self { mean: sample.iter().sum::<f64>() / sample.len() as f64, p50: at(0.5), p99: at(0.99) }
+    }
+}
+
+/// The middle one of a few figures.
+pub(crate) fn median(figures: impl IntoIterator<Item = f64>) -> f64 {
+    Spread::of(figures.into_iter().collect()).p50
+}
+
+/// A figure with about three digits, which is what it is good for.
+pub(crate) fn digits(figure: f64) -> String {
+    match figure.abs() {
+        f if f >= 100.0 => format!("{figure:.0}"),
+        f if f >= 10.0 => format!("{figure:.1}"),
+        _ => format!("{figure:.2}"),
+    }
+}
+
+/// The same for thousands.
+pub(crate) fn thousands(figure: f64) -> String {
+    format!("{} k", digits(figure / 1000.0))
+}

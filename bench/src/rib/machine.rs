@@ -1,0 +1,115 @@
+//! The routing machine under the benchmark: the one place that knows its API.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, bail, ensure};
+use sgc_router::{Limits, LinkId, Neighbour, Output, Router, RouterConfig};
+use sgc_trust::{Identity, TrustAnchors, VerifiedPeer, verify_advert, verify_answer, verify_join};
+use sgc_wire::{Control, Decode, Hello, Now, UnixMillis};
+
+/// A router without sockets, whose clock stands still.
+pub(super) struct Machine {
+    router: Router,
+    anchors: Arc<TrustAnchors>,
+    now: Now,
+    links: u32,
+}
+
+/// A frame that was handled.
+pub(super) struct Timed {
+    took: Duration,
+    sent_to: Vec<LinkId>,
+}
+
+impl Timed {
+    /// Decoding, handling, and handing out what came of it, microseconds.
+    pub(super) fn micros(&self) -> f64 {
+        self.took.as_secs_f64() * 1e6
+    }
+
+    /// True if a frame was sent over that link.
+    pub(super) fn went_to(&self, link: LinkId) -> bool {
+        self.sent_to.contains(&link)
+    }
+}
+
+impl Machine {
+    pub(super) fn new(identity: &Identity, now: Now) -> Self {
+        let anchors = Arc::new(identity.anchors().clone());
+        // What guards against neighbours that ask too much is not what is measured.
+        let limits = Limits { joins_burst: u32::MAX, ..Limits::default() };
+        let router = Router::new(RouterConfig {
+            node: identity.node_id(),
+            transit: true,
+            incarnation: 1,
+            anchors: anchors.clone(),
+            limits,
+        });
+        Self { router, anchors, now, links: 0 }
+    }
+
+    /// A link to this node that has greeted.
+    pub(super) fn attach(&mut self, peer: &VerifiedPeer, transit: bool) -> Result<LinkId> {
+        self.links += 1;
+        let link = LinkId(self.links);
+        self.router.handle_link_up(self.now, link, Neighbour::from(peer));
+        let hello = Hello { minor: 0, incarnation: 1, transit };
+        self.router.handle_frame(self.now, link, Control::Hello(hello));
+        self.drain()?;
+        Ok(link)
+    }
+
+    /// Handles a frame as the driver does; an error if the router refuses it.
+    pub(super) fn feed(&mut self, link: LinkId, frame: &[u8]) -> Result<Timed> {
+        let begun = Instant::now();
+        let frame = Control::from_slice(frame)?;
+        self.router.handle_frame(self.now, link, frame);
+        let sent_to = self.drain()?;
+        Ok(Timed { took: begun.elapsed(), sent_to })
+    }
+
+    /// How long verifying what is signed in this frame takes by itself, microseconds.
+    pub(super) fn verify(&self, frame: &[u8]) -> Result<f64> {
+        let frame = Control::from_slice(frame)?;
+        let begun = Instant::now();
+        match &frame {
+            Control::Advert { signed, .. } => drop(verify_advert(&self.anchors, signed, self.now.unix)?),
+            Control::Join { signed } => drop(verify_join(&self.anchors, signed, self.now.unix)?),
+            other => bail!("nothing to verify: {other:?}"),
+        }
+        Ok(begun.elapsed().as_secs_f64() * 1e6)
+    }
+
+    /// The same for an answer of this owner.
+    pub(super) fn verify_answer(&self, owner: &VerifiedPeer, frame: &[u8]) -> Result<f64> {
+        let Control::Answer { signed } = Control::from_slice(frame)? else { bail!("no answer") };
+        let begun = Instant::now();
+        drop(verify_answer(owner, &signed)?);
+        Ok(begun.elapsed().as_secs_f64() * 1e6)
+    }
+
+    pub(super) fn routed_names(&self) -> usize {
+        self.router.stats().routed_names
+    }
+
+    pub(super) fn unix(&self) -> UnixMillis {
+        self.now.unix
+    }
+
+    fn drain(&mut self) -> Result<Vec<LinkId>> {
+        let mut sent_to = Vec::new();
+        loop {
+            match self.router.poll_output() {
+                Output::Send { link, .. } => sent_to.push(link),
+                Output::Dropped(dropped) => bail!("the router refuses a frame: {}", dropped.reason),
+                Output::Close { reason, .. } => bail!("the router closes a link: {reason}"),
+                Output::Timeout(at) => {
+                    ensure!(at.is_none_or(|at| at > self.now.instant), "the clock stands still");
+                    return Ok(sent_to);
+                }
+                _ => {}
+            }
+        }
+    }
+}
