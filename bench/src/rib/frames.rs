@@ -55,7 +55,7 @@ impl<L> Member<L> {
             withdraw: false,
             blinds,
         };
-        let frame = Control::Advert { hops: 0, signed: self.identity.sign_advert(&body) };
+        let frame = Control::Advert { cost: 0, signed: self.identity.sign_advert(&body) };
         Advert { names, bytes: frame.to_bytes() }
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
-use sgc_router::{Limits, LinkId, Neighbour, Output, Router, RouterConfig};
+use sgc_router::{Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterConfig};
 use sgc_trust::{Identity, TrustAnchors, VerifiedPeer, verify_advert, verify_answer, verify_join};
 use sgc_wire::{Control, Decode, Hello, Now, UnixMillis};
 
@@ -35,17 +35,27 @@ impl Timed {
 }
 
 impl Machine {
-    pub(super) fn new(identity: &Identity, now: Now) -> Self {
+    pub(super) fn new(identity: &Arc<Identity>, now: Now) -> Self {
         let anchors = Arc::new(identity.anchors().clone());
         // What guards against neighbours that ask too much is not what is measured.
-        let limits = Limits { joins_burst: u32::MAX, ..Limits::default() };
-        let router = Router::new(RouterConfig {
+        let limits = Limits {
+            joins_burst: u32::MAX,
+            announcements_burst: u32::MAX,
+            names_per_owner_max: usize::MAX,
+            names_per_router_max: usize::MAX,
+            ..Limits::default()
+        };
+        let config = RouterConfig {
             node: identity.node_id(),
+            identity: identity.clone(),
             transit: true,
             incarnation: 1,
+            started: now.unix,
+            mapping: MappingKind::Flood,
             anchors: anchors.clone(),
             limits,
-        });
+        };
+        let router = Router::new(config, now);
         Self { router, anchors, now, links: 0 }
     }
 

@@ -85,7 +85,7 @@ pub(crate) fn measure_here(names: usize, samples: usize) -> Result<()> {
 fn measure(names: usize, samples: usize) -> Result<InMachine> {
     let mut rng = ChaCha20Rng::seed_from_u64(1);
     let fleet = BenchFleet::new()?;
-    let mut machine = Machine::new(&*fleet.issue("router", true)?, now());
+    let mut machine = Machine::new(&fleet.issue("router", true)?, now());
     // Somebody to pass advertisements on to.
     let neighbour = fleet.issue("neighbour", true)?;
     machine.attach(neighbour.as_peer(), true)?;

@@ -35,8 +35,11 @@ pub struct Limits {
     /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which
     /// speaks for many, may bring sixteen times as many.
     pub joins_burst: u32,
-    /// Names that a router may ask for at once; refilled by an eighth of it a second.
+    /// Names that a neighbour may ask for at once; refilled by an eighth of it a second.
     pub queries_burst: u32,
+    /// Advertisements and link states that a node may sign at once, each of which goes to all routers; refilled by an
+    /// eighth of it a second.
+    pub announcements_burst: u32,
     /// Things that do not verify which a node may bring before its link is closed; one is forgiven a second.
     pub forgeries_max: u32,
 }
@@ -57,6 +60,7 @@ impl Default for Limits {
             links_per_node_max: 8,
             joins_burst: 1024,
             queries_burst: 65_536,
+            announcements_burst: 256,
             forgeries_max: 64,
         }
     }
@@ -67,6 +71,7 @@ impl Default for Limits {
 pub(crate) struct Allowance {
     joins: Budget,
     queries: Budget,
+    announcements: Budget,
     forgeries: Budget,
     /// Branches that it has here.
     pub(crate) branches: usize,
@@ -77,6 +82,7 @@ impl Allowance {
         Self {
             joins: Budget::new(limits.joins_burst, limits.joins_burst / 8),
             queries: Budget::new(limits.queries_burst, limits.queries_burst / 8),
+            announcements: Budget::new(limits.announcements_burst, limits.announcements_burst / 8),
             forgeries: Budget::new(limits.forgeries_max, 1),
             branches: 0,
         }
@@ -92,6 +98,11 @@ impl Allowance {
         self.queries.take(now, names.max(1).try_into().unwrap_or(u32::MAX), 1)
     }
 
+    /// Takes something that it signed for all; false if that is too much.
+    pub(crate) fn may_announce(&mut self, now: Instant) -> bool {
+        self.announcements.take(now, 1, 1)
+    }
+
     /// Takes one from what it may get wrong; false if there is none left.
     pub(crate) fn may_err(&mut self, now: Instant) -> bool {
         self.forgeries.take(now, 1, 1)
@@ -99,7 +110,7 @@ impl Allowance {
 
     /// True if nothing is used, so that forgetting it gives nothing back.
     pub(crate) fn is_whole(&self, now: Instant) -> bool {
-        let budgets = [&self.joins, &self.queries, &self.forgeries];
+        let budgets = [&self.joins, &self.queries, &self.announcements, &self.forgeries];
         self.branches == 0 && budgets.iter().all(|b| b.used_at(now, 1) <= 0.0)
     }
 }

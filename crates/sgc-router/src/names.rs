@@ -203,6 +203,9 @@ impl Router {
         if let Some(floor) = self.topology.node(&owner).map(|n| n.floor).filter(|floor| seq < *floor) {
             return self.drop_frame(link, DropReason::Stale { seq, known: floor });
         }
+        if link != LinkId::LOCAL && !self.allowance(&owner).may_announce(now.instant) {
+            return self.drop_frame(link, DropReason::Limit { what: "announcements of a node per second" });
+        }
         let known = advert.names.iter().filter_map(|n| self.names.known_seq(n)).max();
         let news: Vec<_> = advert
             .names
@@ -441,6 +444,10 @@ impl Router {
     }
 
     pub(crate) fn handle_interest(&mut self, now: Now, link: LinkId, names: &[Name]) {
+        let Some(node) = self.links.get(&link).map(|l| l.node) else { return };
+        if link != LinkId::LOCAL && !self.allowance(&node).may_query(now.instant, names.len()) {
+            return self.drop_frame(link, DropReason::Limit { what: "names asked for per second" });
+        }
         let mut news = Vec::new();
         for name in names {
             let Some(state) = self.links.get_mut(&link) else { return };

@@ -7,6 +7,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use sgc_trust::{CrlError, Identity, SignedError, TrustAnchors};
 use sgc_wire::{Control, Hello, Name, NodeId, Now, SinkId, UnixMillis};
 
@@ -35,6 +36,9 @@ impl fmt::Display for LinkId {
 
 /// Links of one node; each must fit into what it says of itself.
 const LINKS_MAX: usize = sgc_wire::ADJACENCIES_MAX + sgc_wire::ATTACHED_MAX;
+
+/// Allowances that are kept without looking whether they are of use.
+const ALLOWANCES_MIN: usize = 1024;
 
 /// What a router is made of.
 #[derive(Clone, Debug)]
@@ -242,11 +246,16 @@ pub struct Router {
     pub(crate) mapping: Box<dyn Mapping>,
     pub(crate) links: BTreeMap<LinkId, LinkState>,
     allowances: BTreeMap<NodeId, Allowance>,
+    /// With so many it is time to look which are of no use.
+    allowances_max: usize,
     pub(crate) topology: Topology,
     pub(crate) names: Names,
     pub(crate) trees: BTreeMap<Name, Tree>,
     /// Branches that wait for something, and until when.
     pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
+    /// Revocation lists that seemed to be from the future, and when to look at them again.
+    pub(crate) early_crls: Vec<Bytes>,
+    pub(crate) early_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
     /// As the driver said last.
     pub(crate) now: Now,
@@ -264,10 +273,13 @@ impl Router {
             config,
             links: BTreeMap::from([(LinkId::LOCAL, local)]),
             allowances: BTreeMap::new(),
+            allowances_max: 2 * ALLOWANCES_MIN,
             topology,
             names: Names::default(),
             trees: BTreeMap::new(),
             deadlines: BTreeSet::new(),
+            early_crls: Vec::new(),
+            early_at: None,
             outputs: VecDeque::new(),
             now,
         }
@@ -359,6 +371,7 @@ impl Router {
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
         self.close_expired(now);
+        self.retry_crls(now);
         self.expire_nodes(now);
         self.names_timeout(now);
         self.branches_timeout(now);
@@ -375,7 +388,13 @@ impl Router {
             let branch = self.deadlines.first().map(|(at, ..)| *at);
             let links = self.links.values().filter_map(|l| l.expires);
             let topology = [self.topology.search_at, self.topology.originate_at, self.topology.next_expiry()];
-            let all = topology.into_iter().flatten().chain(branch).chain(links).chain(self.names.deadlines());
+            let all = topology
+                .into_iter()
+                .flatten()
+                .chain(self.early_at)
+                .chain(branch)
+                .chain(links)
+                .chain(self.names.deadlines());
             Output::Timeout(all.min())
         })
     }
@@ -458,14 +477,16 @@ impl Router {
         if state.hello.is_some() {
             self.links_changed(self.now.instant);
         }
-        let now = self.now.instant;
-        let links = &self.links;
-        self.allowances
-            .retain(|node, allowance| !allowance.is_whole(now) || links.values().any(|l| l.node == *node));
     }
 
     /// What a node may still do here.
     pub(crate) fn allowance(&mut self, node: &NodeId) -> &mut Allowance {
+        if self.allowances.len() >= self.allowances_max {
+            // Those who have used nothing lately are given the same again when they come back.
+            let now = self.now.instant;
+            self.allowances.retain(|_, allowance| !allowance.is_whole(now));
+            self.allowances_max = 2 * self.allowances.len().max(ALLOWANCES_MIN);
+        }
         let limits = &self.config.limits;
         self.allowances.entry(*node).or_insert_with(|| Allowance::new(limits))
     }

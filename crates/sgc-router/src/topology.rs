@@ -173,6 +173,9 @@ impl Router {
             }
             return;
         }
+        if !self.allowance(&node).may_announce(now.instant) {
+            return self.drop_frame(link, DropReason::Limit { what: "announcements of a node per second" });
+        }
         match self.topology.node(&node) {
             Some(known) if known.seq >= body.seq => {
                 let (seq, known) = (body.seq, known.seq);

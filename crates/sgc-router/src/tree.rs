@@ -163,17 +163,20 @@ impl Router {
             Err(why) => return self.not_verified(now, link, "answer", SignedError::Decode(why)),
         };
         let (name, sink) = (body.name, body.sink);
-        let Some(branch) = self.branch(&name, &sink) else {
-            // The owner granted a sink that has left meanwhile: it must not keep it.
+        let branch = self.branch(&name, &sink).map(|b| (b.up, b.link));
+        let Some((_, down)) = branch.filter(|(up, _)| *up == link) else {
+            // The owner granted a sink that has left meanwhile, or a request that came here in a circle: neither it nor
+            // whoever is between must keep it.
             if matches!(body.answer, Answer::Grant { .. }) {
                 self.send(link, Control::Leave { name, sink });
             }
-            return self.drop_frame(link, DropReason::Unknown { what: "answer" });
+            let what = "answer";
+            let reason = match branch {
+                None => DropReason::Unknown { what },
+                Some(_) => DropReason::WrongWay { what },
+            };
+            return self.drop_frame(link, reason);
         };
-        if branch.up != link {
-            return self.drop_frame(link, DropReason::WrongWay { what: "answer" });
-        }
-        let down = branch.link;
         // Once the name is withdrawn, who owns it is not known here any more; the sink still knows.
         if let Some(record) = self.names.record(&name)
             && let Err(why) = verify_answer(&record.owner, &signed)

@@ -437,6 +437,23 @@ fn questions_are_bounded() {
 }
 
 #[test]
+fn what_a_node_signs_for_all_is_bounded_and_so_are_interests() {
+    let limits = Limits { announcements_burst: 8, queries_burst: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    bench.with_proxies();
+    for seq in 10..20 {
+        bench.advert(1, seq, &[A]);
+    }
+    assert_eq!(bench.dropped, ["limit"; 2]);
+    bench.pass(Duration::from_secs(10));
+    bench.advert(1, 20, &[A]);
+    assert_eq!(bench.dropped.len(), 2, "it comes back with time");
+    let names: Vec<_> = (0..9).map(|n| bench.name(&numbered(n))).collect();
+    bench.frame(4, Control::Interest { names });
+    assert_eq!((bench.dropped.len(), bench.told()), (3, vec![]));
+}
+
+#[test]
 fn what_an_owner_advertised_before_it_started_anew_is_void() {
     let mut bench = Bench::new();
     bench.with_owner_behind(5000, 9000);
@@ -577,6 +594,12 @@ fn a_grant_for_a_sink_that_left_is_given_back() {
     bench.with_owner_behind(5000, 9000);
     bench.grant(1, 1, &A);
     assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![(1, "leave")], ["unknown"].as_slice()));
+    // The same for one whose request is known here by another way.
+    bench.join(3, 2, &A);
+    bench.grant(2, 2, &A);
+    assert_eq!((bench.told(), bench.dropped.last()), (vec![(2, "leave")], Some(&"wrong_way")));
+    bench.grant(1, 2, &A);
+    assert_eq!(bench.told(), [(3, "answer")]);
 }
 
 #[test]
