@@ -3,11 +3,12 @@
 //! Reliable packets share one flow of the link; a best-effort message goes as a datagram if it fits one, else as a
 //! flow of its own. Of best-effort messages in several packets only the newest complete one waits.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
+use sgc_transport::{AnyLink, Delivery, FlowEnd, FlowTx, Link, LinkError};
 use sgc_wire::{Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
@@ -27,9 +28,15 @@ pub(crate) const OUTFLOW_BYTES_MAX: usize = 16 << 20;
 /// How long a best-effort packet may wait; then it is worth nothing.
 pub(crate) const OUTFLOW_AGE_MAX: Duration = Duration::from_secs(1);
 
+/// A packet, and since when it waits.
+type Waiting = (Packet, Instant);
+
+/// Best-effort messages in several packets that are sent beside each other: of several sources, or since they came so.
+const MESSAGES_MAX: usize = 4;
+
 /// The queue's end that the data path sees.
 pub(crate) struct OutFlow {
-    queue: Queue<(Packet, Instant)>,
+    queue: Queue<Waiting>,
     /// Complete best-effort messages of several packets in the queue.
     complete: AtomicUsize,
     ended: watch::Sender<bool>,
@@ -45,14 +52,19 @@ impl OutFlow {
         });
         let task = flow.clone();
         tokio::spawn(async move {
-            let mut sender = Sender { link, label, reliable: None, message: None };
-            while let Some((packet, since)) = task.queue.pop().await {
+            let mut sender = Sender { link, label, reliable: None, messages: VecDeque::new(), before: None };
+            // Of the message that is being sent, and what came between.
+            let mut taken = VecDeque::new();
+            while let Some((packet, since)) = task.next(&mut taken).await {
                 // Judged by its beginning: a large message that is under way goes on.
                 let begins = !packet.header.reliable && packet.header.index == 0;
                 let stale = begins && since.elapsed() > OUTFLOW_AGE_MAX;
                 if task.is_superseded(&packet) || stale {
                     sender.abandon(&packet);
                     continue;
+                }
+                if begins && !packet.header.is_last() {
+                    task.take_rest(&packet, &mut taken);
                 }
                 if let Err(error) = sender.send(packet).await {
                     debug!(name = %name.short(), %error, "no more is sent over this link");
@@ -123,6 +135,24 @@ impl OutFlow {
         let _ = self.ended.subscribe().wait_for(|ended| *ended).await;
     }
 
+    async fn next(&self, taken: &mut VecDeque<Waiting>) -> Option<Waiting> {
+        match taken.pop_front() {
+            Some(next) => Some(next),
+            None => self.queue.pop().await,
+        }
+    }
+
+    /// Takes what is queued of a message that begins, so that newer ones do not push out its end while it is sent: on a
+    /// link that is slow enough none would ever arrive whole.
+    fn take_rest(&self, first: &Packet, taken: &mut VecDeque<Waiting>) {
+        let id = |packet: &Packet| (packet.header.source, packet.header.seq);
+        let ends = |packet: &Packet| id(packet) == id(first) && packet.header.is_last();
+        while !taken.back().is_some_and(|(packet, _)| ends(packet)) {
+            let Some(next) = self.queue.try_pop() else { return };
+            taken.push_back(next);
+        }
+    }
+
     /// True if a packet begins or continues a best-effort message that a complete newer one overtakes.
     fn is_superseded(&self, packet: &Packet) -> bool {
         if packet.header.reliable || packet.header.fragments() == 1 {
@@ -141,14 +171,25 @@ fn ends_large_message(packet: &Packet) -> bool {
     !packet.header.reliable && packet.header.fragments() > 1 && packet.header.is_last()
 }
 
+/// A best-effort message in several packets that is being sent.
+struct Message {
+    id: (SourceId, u64),
+    /// The index of the packet that comes next.
+    next: u16,
+    flow: FlowTx,
+}
+
 /// The link's end.
 struct Sender {
     link: AnyLink,
     /// Of the one name that all packets are of.
     label: Option<NameLabel>,
     reliable: Option<FlowTx>,
-    /// The best-effort message in several packets that is being sent: source and number, the next index, its flow.
-    message: Option<((SourceId, u64), u16, FlowTx)>,
+    /// Best-effort messages in several packets that are being sent, the oldest first.
+    messages: VecDeque<Message>,
+    /// The last that was sent, which may still be under way. No other is: what the transport has, nothing newer takes
+    /// the place of, and many at once would all come late.
+    before: Option<Delivery>,
 }
 
 impl Sender {
@@ -181,29 +222,39 @@ impl Sender {
         if header.fragments() == 1 {
             return self.send_alone(&packet).await;
         }
+        let id = (header.source, header.seq);
         if header.index == 0 {
-            if let Some((.., old)) = self.message.take() {
-                old.reset(FlowEnd::Stale);
+            if self.messages.len() >= MESSAGES_MAX
+                && let Some(oldest) = self.messages.pop_front()
+            {
+                oldest.flow.reset(FlowEnd::Stale);
             }
-            self.message = Some(((header.source, header.seq), 0, self.link.open_flow(header.class).await?));
+            let flow = self.link.open_flow(header.class).await?;
+            self.messages.push_back(Message { id, next: 0, flow });
         }
-        match self.message.take() {
-            Some((id, next, mut flow)) if (id, next) == ((header.source, header.seq), header.index) => {
-                match flow.send_as(&packet, label).await {
-                    Ok(()) if header.is_last() => flow.finish().await,
-                    Ok(()) => {
-                        self.message = Some((id, next + 1, flow));
-                        Ok(())
-                    }
-                    Err(LinkError::FlowStopped(_)) => Ok(()),
-                    Err(error) => Err(error),
+        let at = self.messages.iter().position(|m| (m.id, m.next) == (id, header.index));
+        // Without one its beginning was dropped: the rest is of no use to anyone.
+        let Some(message) = at.and_then(|at| self.messages.get_mut(at)) else { return Ok(()) };
+        match message.flow.send_as(&packet, label).await {
+            Ok(()) if !header.is_last() => message.next += 1,
+            sent => {
+                let ended = at.and_then(|at| self.messages.remove(at));
+                match (sent, ended) {
+                    (Ok(()), Some(message)) => return self.await_delivery(message.flow).await,
+                    // The far side gave up this flow, not the link.
+                    (Ok(()) | Err(LinkError::FlowStopped(_)), _) => {}
+                    (Err(error), _) => return Err(error),
                 }
             }
-            // Its beginning was dropped: the rest is of no use to anyone.
-            other => {
-                self.message = other;
-                Ok(())
-            }
+        }
+        Ok(())
+    }
+
+    /// Ends the flow of a message, and waits for the one before.
+    async fn await_delivery(&mut self, flow: FlowTx) -> Result<(), LinkError> {
+        match self.before.replace(flow.finish_slowly().await?) {
+            Some(mut before) => before.done().await,
+            None => Ok(()),
         }
     }
 
@@ -219,10 +270,11 @@ impl Sender {
 
     /// A message that is not to be sent: its packets find no flow and go nowhere.
     fn abandon(&mut self, packet: &Packet) {
-        if let Some((.., old)) =
-            self.message.take_if(|(id, ..)| *id == (packet.header.source, packet.header.seq))
+        let id = (packet.header.source, packet.header.seq);
+        if let Some(at) = self.messages.iter().position(|m| m.id == id)
+            && let Some(message) = self.messages.remove(at)
         {
-            old.reset(FlowEnd::Stale);
+            message.flow.reset(FlowEnd::Stale);
         }
     }
 
@@ -230,8 +282,65 @@ impl Sender {
         if let Some(flow) = self.reliable {
             let _ = flow.finish().await;
         }
-        if let Some((.., flow)) = self.message {
-            flow.reset(FlowEnd::Stale);
+        for message in self.messages {
+            message.flow.reset(FlowEnd::Stale);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use sgc_wire::{Class, HOP_LIMIT, PacketHeader};
+
+    use super::*;
+
+    fn packet(seq: u64, index: u16) -> Packet {
+        let header = PacketHeader {
+            reliable: false,
+            class: Class::Bulk,
+            hops: HOP_LIMIT,
+            suite: 1,
+            epoch: 1,
+            name: Name([1; 32]),
+            source: SourceId([2; 16]),
+            seq,
+            total: 3 * 1000,
+            index,
+            grid: 1000,
+            to: None,
+        };
+        Packet::new(header, Bytes::from(vec![0; 1000]).into()).unwrap()
+    }
+
+    #[tokio::test]
+    async fn newer_messages_do_not_push_out_the_end_of_one_that_is_being_sent() {
+        let flow = OutFlow::idle();
+        for index in 0..3 {
+            assert!(flow.push(packet(1, index)).await.is_none());
+        }
+        let mut taken = VecDeque::new();
+        let (first, _) = flow.next(&mut taken).await.unwrap();
+        assert!(!flow.is_superseded(&first));
+        flow.take_rest(&first, &mut taken);
+        for seq in 2..1000 {
+            for index in 0..3 {
+                flow.push(packet(seq, index)).await;
+            }
+        }
+        for index in 1..3 {
+            let (next, _) = flow.next(&mut taken).await.unwrap();
+            assert_eq!((next.header.seq, next.header.index), (1, index));
+            assert!(!flow.is_superseded(&next));
+        }
+        // Of those that wait, only the newest is begun.
+        let mut begun = vec![];
+        while flow.queue.bytes() > 0 {
+            let (next, _) = flow.next(&mut taken).await.unwrap();
+            if !flow.is_superseded(&next) && next.header.index == 0 {
+                begun.push(next.header.seq);
+            }
+        }
+        assert_eq!(begun, [999]);
     }
 }

@@ -102,11 +102,22 @@ impl<T> Queue<T> {
         }
     }
 
+    /// Takes the oldest item, if there is one.
+    pub(crate) fn try_pop(&self) -> Option<T> {
+        self.take()
+    }
+
     /// Ends the queue: nothing more is accepted, what is in it can still be taken.
     pub(crate) fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.filled.notify_one();
         self.drained.notify_waiters();
+    }
+
+    /// Bytes that wait.
+    #[cfg(test)]
+    pub(crate) fn bytes(&self) -> usize {
+        self.bytes.load(Ordering::Acquire)
     }
 
     /// True once closed.

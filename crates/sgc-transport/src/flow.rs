@@ -64,10 +64,33 @@ impl FlowTx {
         }
     }
 
+    /// Ends the flow after what was sent; the result waits until the far side has all of it, or wants no more.
+    pub async fn finish_slowly(mut self) -> Result<Delivery, LinkError> {
+        match &mut self.outlet {
+            Outlet::Quic(outlet) => outlet.finish().await?,
+        }
+        Ok(Delivery { outlet: self.outlet })
+    }
+
     /// Ends the flow at once; what has not arrived will not.
     pub fn reset(mut self, end: FlowEnd) {
         match &mut self.outlet {
             Outlet::Quic(outlet) => outlet.reset(end),
+        }
+    }
+}
+
+/// A flow that was ended in good order and may still be under way. Dropped, it is nobody's concern any more, and arrives.
+#[derive(Debug)]
+pub struct Delivery {
+    outlet: Outlet,
+}
+
+impl Delivery {
+    /// Waits until the far side's transport has all of it, or refused the rest.
+    pub async fn done(&mut self) -> Result<(), LinkError> {
+        match &mut self.outlet {
+            Outlet::Quic(outlet) => outlet.delivered().await,
         }
     }
 }

@@ -25,7 +25,7 @@ pub use endpoint::{Dialer, Listener, RefusedPeer};
 pub use error::{
     CloseReason, DialError, FlowEnd, FlowError, LabelError, LinkError, PeerRefusal, ProtocolError, Refusal,
 };
-pub use flow::{FlowRx, FlowTx};
+pub use flow::{Delivery, FlowRx, FlowTx};
 pub use framing::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
 pub use link::{AnyLink, KeyExchange, Link, LinkStats};
 pub use metrics::{RefusalKind, TransportMetrics};

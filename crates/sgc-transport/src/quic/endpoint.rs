@@ -16,6 +16,7 @@ use sgc_wire::{Decode, DecodeError, Encode};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
+use super::reserve::Reserve;
 use super::verifier::Findings;
 use super::{
     ControlRx, Fate, Inlet, Outlet, PRIORITY_CONTROL, QuicLink, Shared, canonical, close, config, send_frame,
@@ -161,9 +162,10 @@ impl Acceptor {
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         let fate = Fate::new(self.options.idle_timeout);
+        let reserve = Arc::new(Reserve::new(&connection, self.options.send_window_bytes.into()));
         let greeted = async {
             let (tx, rx) = connection.accept_bi().await.map_err(|e| fate.explain(&e))?;
-            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate);
+            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate, &reserve);
             let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
             hear_greeting(&mut rx).await?;
             send_frame(&mut tx, Greeting.to_bytes()).await?;
@@ -306,10 +308,11 @@ impl QuicDialer {
 
     async fn greet(&self, connection: Connection, findings: Arc<Findings>) -> Result<QuicLink, LinkError> {
         let fate = Fate::new(self.options.idle_timeout);
+        let reserve = Arc::new(Reserve::new(&connection, self.options.send_window_bytes.into()));
         let after = self.options.handshake_timeout;
         let greeted = async {
             let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
-            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate);
+            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate, &reserve);
             let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
             // At once: the listener learns of the stream from what is sent on it.
             send_frame(&mut tx, Greeting.to_bytes()).await?;
@@ -361,9 +364,11 @@ fn link(
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
     let key_exchange = key_exchange(&connection);
+    let reserve = Arc::clone(&control_tx.reserve);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
     let labels = Arc::default();
-    let shared = Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, labels, fate };
+    let shared =
+        Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, labels, fate, reserve };
     Ok(QuicLink { shared: Arc::new(shared) })
 }
 

@@ -5,18 +5,24 @@
 
 mod config;
 mod endpoint;
+mod reserve;
 mod verifier;
 
 pub(crate) use endpoint::{QuicDialer, QuicListener};
+use reserve::Reserve;
 
 use std::fmt;
+use std::future::{Future as _, poll_fn};
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::{Arc, OnceLock};
+use std::task::Poll;
 use std::time::Duration;
 
 use bytes::Bytes;
 use quinn::{
-    Connection, ConnectionError, ReadError, RecvStream, SendDatagramError, SendStream, VarInt, WriteError,
+    Connection, ConnectionError, ReadError, RecvStream, SendDatagramError, SendStream, StoppedError, VarInt,
+    WriteError, Written,
 };
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Class, DecodeError, Label, Name, Packet};
@@ -47,6 +53,7 @@ struct Shared {
     control_rx: Mutex<ControlRx>,
     labels: Arc<Labels>,
     fate: Arc<Fate>,
+    reserve: Arc<Reserve>,
 }
 
 /// How the connection came to end, where this side knows better than QUIC.
@@ -73,15 +80,18 @@ impl Fate {
 #[derive(Debug)]
 pub(crate) struct Outlet {
     stream: SendStream,
+    priority: i32,
     pending: Chunks,
     fate: Arc<Fate>,
+    reserve: Arc<Reserve>,
 }
 
 impl Outlet {
-    fn new(stream: SendStream, priority: i32, fate: &Arc<Fate>) -> Self {
+    fn new(stream: SendStream, priority: i32, fate: &Arc<Fate>, reserve: &Arc<Reserve>) -> Self {
         // Fails only on a stream that is closed already, which the first write then says.
         let _ = stream.set_priority(priority);
-        Self { stream, pending: Vec::new(), fate: Arc::clone(fate) }
+        let (fate, reserve) = (Arc::clone(fate), Arc::clone(reserve));
+        Self { stream, priority, pending: Vec::new(), fate, reserve }
     }
 
     pub(crate) fn queue(&mut self, chunks: impl Iterator<Item = Bytes>) {
@@ -90,7 +100,7 @@ impl Outlet {
 
     pub(crate) async fn flush(&mut self) -> Result<(), LinkError> {
         while !self.pending.is_empty() {
-            let written = self.stream.write_chunks(&mut self.pending).await;
+            let written = self.write().await;
             match written {
                 Ok(written) => drop(self.pending.drain(..written.chunks)),
                 Err(error) => {
@@ -102,11 +112,37 @@ impl Outlet {
         Ok(())
     }
 
+    /// Writes some of what is pending: into the send window if it has room, else into the reserve, else later.
+    async fn write(&mut self) -> Result<Written, WriteError> {
+        let Self { stream, priority, pending, reserve, .. } = self;
+        let at_once = poll_fn(|cx| {
+            let mut attempt = || match pin!(stream.write_chunks(pending)).poll(cx) {
+                Poll::Ready(written) => Some(written),
+                Poll::Pending => None,
+            };
+            let written = attempt();
+            let opens = written.is_none() && *priority > 0;
+            Poll::Ready(if opens { reserve.open(*priority, attempt) } else { written })
+        });
+        match at_once.await {
+            Some(written) => written,
+            None => self.stream.write_chunks(&mut self.pending).await,
+        }
+    }
+
     pub(crate) async fn finish(&mut self) -> Result<(), LinkError> {
         self.flush().await?;
         // It fails only where the stream has ended already.
         let _ = self.stream.finish();
         Ok(())
+    }
+
+    pub(crate) async fn delivered(&mut self) -> Result<(), LinkError> {
+        match self.stream.stopped().await {
+            Ok(_) => Ok(()),
+            Err(StoppedError::ConnectionLost(e)) => Err(self.fate.explain(&e)),
+            Err(e) => Err(LinkError::Transport(e.to_string())),
+        }
     }
 
     pub(crate) fn reset(&mut self, end: FlowEnd) {
@@ -227,9 +263,9 @@ impl Link for QuicLink {
     }
 
     async fn open_flow(&self, class: Class) -> Result<FlowTx, LinkError> {
-        let Shared { connection, fate, .. } = &*self.shared;
+        let Shared { connection, fate, reserve, .. } = &*self.shared;
         let stream = connection.open_uni().await.map_err(|e| fate.explain(&e))?;
-        Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, class as i32, fate))))
+        Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, class as i32, fate, reserve))))
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
