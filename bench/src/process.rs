@@ -116,8 +116,8 @@ impl SgcRouter {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
 
-    /// Waits until it has a route for so many names; how long it took to find out is added to the time of others, so it
-    /// asks rarely if answers are slow.
+    /// Waits until it has a route for so many names. Counting them takes the router's time, so it is asked rarely when
+    /// answers are slow.
     pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         loop {
