@@ -258,7 +258,7 @@ impl Router {
         let mut local = LinkState::local(config.node);
         local.hello = Some(Hello { minor: 0, incarnation: config.incarnation, transit: false });
         let mut topology = Topology::default();
-        topology.touch_own(now.instant);
+        topology.begin(now.instant, config.transit);
         Self {
             mapping: config.mapping.build(),
             config,

@@ -100,6 +100,13 @@ impl Topology {
         self.search_at.get_or_insert(at);
     }
 
+    /// This node begins. A router waits a moment, in which its links come up, so that it speaks of all of them at once;
+    /// a node that only has something to share or to ask is in more of a hurry.
+    pub(crate) fn begin(&mut self, now: Instant, transit: bool) {
+        self.originated = transit.then_some(now);
+        self.touch_own(now);
+    }
+
     /// This node's own links changed.
     pub(crate) fn touch_own(&mut self, now: Instant) {
         let at = self.originated.map_or(now, |at| now.max(at + ORIGINATE_EVERY));
