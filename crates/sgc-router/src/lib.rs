@@ -25,3 +25,4 @@ pub use limits::Limits;
 pub use links::Neighbour;
 pub use mapping::MappingKind;
 pub use router::{DropReason, Dropped, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats};
+pub use topology::Ways;

@@ -58,6 +58,15 @@ struct Heard {
     selected: Option<LinkId>,
 }
 
+/// What one owner advertises.
+#[derive(Debug, Default)]
+struct OfOwner {
+    /// Its records, by sequence number.
+    records: BTreeSet<(u64, RecordId)>,
+    /// Names that they speak for.
+    names: usize,
+}
+
 /// Everything that is known of names.
 #[derive(Debug, Default)]
 pub(crate) struct Names {
@@ -65,8 +74,7 @@ pub(crate) struct Names {
     records: BTreeMap<RecordId, Record>,
     expiries: BTreeSet<(Instant, RecordId)>,
     seen: BTreeMap<[u8; 32], RecordId>,
-    /// Records of each owner.
-    owners: BTreeMap<NodeId, BTreeSet<RecordId>>,
+    owners: BTreeMap<NodeId, OfOwner>,
     next_id: RecordId,
     tombstones: BTreeMap<Name, Tombstone>,
     forgets: BTreeSet<(Instant, Name)>,
@@ -270,14 +278,7 @@ impl Router {
     fn names_over_limit(&self, link: LinkId, owner: &NodeId, news: &[Name]) -> Option<&'static str> {
         let (names, limits) = (&self.names, &self.config.limits);
         let more = news.iter().filter(|n| !names.names.contains_key(*n)).count();
-        let of_owner: usize = names
-            .owners
-            .get(owner)
-            .into_iter()
-            .flatten()
-            .filter_map(|id| names.records.get(id))
-            .map(|r| r.live)
-            .sum();
+        let of_owner = names.owners.get(owner).map_or(0, |o| o.names);
         let over_link = self.links.get(&link).map_or(0, |l| l.names);
         if link == LinkId::LOCAL || more == 0 {
             None
@@ -297,7 +298,7 @@ impl Router {
         self.names.next_id += 1;
         self.names.seen.insert(record.digest, id);
         self.names.expiries.insert((record.expires, id));
-        self.names.owners.entry(record.owner.node_id).or_default().insert(id);
+        self.names.owners.entry(record.owner.node_id).or_default().records.insert((record.seq, id));
         self.names.records.insert(id, record);
         for name in names {
             self.names.remove_tombstone(name);
@@ -313,6 +314,7 @@ impl Router {
     fn hold(&mut self, id: RecordId, names: usize) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
         record.live += names;
+        self.names.owners.entry(record.owner.node_id).or_default().names += names;
         if let Some(link) = self.links.get_mut(&record.from) {
             link.names += names;
         }
@@ -326,6 +328,9 @@ impl Router {
         if let Some(link) = self.links.get_mut(&record.from) {
             link.names = link.names.saturating_sub(names);
         }
+        if let Some(of_owner) = self.names.owners.get_mut(&record.owner.node_id) {
+            of_owner.names -= names;
+        }
         if record.live > 0 {
             return;
         }
@@ -333,8 +338,8 @@ impl Router {
             self.names.seen.remove(&record.digest);
             self.names.expiries.remove(&(record.expires, id));
             if let Some(of_owner) = self.names.owners.get_mut(&record.owner.node_id) {
-                of_owner.remove(&id);
-                if of_owner.is_empty() {
+                of_owner.records.remove(&(record.seq, id));
+                if of_owner.records.is_empty() {
                     self.names.owners.remove(&record.owner.node_id);
                 }
             }
@@ -356,9 +361,8 @@ impl Router {
 
     /// Forgets what an owner advertised in a run before this one.
     pub(crate) fn void_names(&mut self, owner: &NodeId, floor: u64) {
-        let records = self.names.owners.get(owner).into_iter().flatten();
-        let old = |id: &&RecordId| self.names.records.get(id).is_some_and(|r| r.seq < floor);
-        for id in records.filter(old).copied().collect::<Vec<_>>() {
+        let old = self.names.owners.get(owner).into_iter().flat_map(|o| o.records.range(..(floor, 0)));
+        for id in old.map(|(_, id)| *id).collect::<Vec<_>>() {
             let names = self.forget_record(id);
             self.routes_changed(&names);
         }

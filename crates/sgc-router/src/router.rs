@@ -16,7 +16,7 @@ use crate::limits::{Allowance, Limits};
 use crate::links::{LinkState, Neighbour};
 use crate::mapping::{Mapping, MappingKind};
 use crate::names::Names;
-use crate::topology::Topology;
+use crate::topology::{Topology, Ways};
 use crate::tree::Tree;
 
 /// A link of this node, by number. Numbers are never used again while the process lives.
@@ -267,7 +267,7 @@ impl Router {
         let mut local = LinkState::local(config.node);
         local.hello = Some(Hello { minor: 0, incarnation: config.incarnation, transit: false });
         let mut topology = Topology::default();
-        topology.touch_own(now.instant);
+        topology.begin(now.instant, config.transit);
         Self {
             mapping: config.mapping.build(),
             config,
@@ -420,6 +420,16 @@ impl Router {
     /// The link towards the owner of `name`, and the cost of the way, microseconds of round trip.
     pub fn route(&self, name: &Name) -> Option<(LinkId, u32)> {
         self.way(name)
+    }
+
+    /// Cost of the way to a router, microseconds of round trip; `None` if it is out of reach.
+    pub fn cost_to(&self, router: &NodeId) -> Option<u32> {
+        self.topology.way(&self.config.node, router).map(|(cost, _)| cost)
+    }
+
+    /// What the searches for ways came to.
+    pub fn ways(&self) -> Ways {
+        self.topology.ways()
     }
 
     /// What a link costs, microseconds of round trip, and whether it seems dead.

@@ -24,6 +24,17 @@ const SEARCH_EVERY: Duration = Duration::from_millis(50);
 /// A cost that differs by less than a quarter is not told anew.
 const COST_PART: u32 = 4;
 
+/// What a router's searches for ways came to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Ways {
+    /// Routers in reach, this one among them.
+    pub routers: usize,
+    /// Searches so far.
+    pub searches: u64,
+    /// When one found other ways than the one before.
+    pub changed: Option<Instant>,
+}
+
 /// A node as it described itself.
 #[derive(Debug)]
 pub(crate) struct NodeRecord {
@@ -60,6 +71,9 @@ pub(crate) struct Topology {
     /// When to search for ways, if something changed.
     pub(crate) search_at: Option<Instant>,
     searched: Option<Instant>,
+    searches: u64,
+    /// When a search found other ways than the one before.
+    ways_changed: Option<Instant>,
     /// When to describe this node anew.
     pub(crate) originate_at: Option<Instant>,
     originated: Option<Instant>,
@@ -86,6 +100,13 @@ impl Topology {
         self.search_at.get_or_insert(at);
     }
 
+    /// This node begins. A router waits a moment, in which its links come up, so that it speaks of all of them at once;
+    /// a node that only has something to share or to ask is in more of a hurry.
+    pub(crate) fn begin(&mut self, now: Instant, transit: bool) {
+        self.originated = transit.then_some(now);
+        self.touch_own(now);
+    }
+
     /// This node's own links changed.
     pub(crate) fn touch_own(&mut self, now: Instant) {
         let at = self.originated.map_or(now, |at| now.max(at + ORIGINATE_EVERY));
@@ -107,6 +128,11 @@ impl Topology {
         record.routers.iter().filter_map(over).min().map(|(cost, _, first)| (cost, first))
     }
 
+    /// What the searches for ways came to.
+    pub(crate) fn ways(&self) -> Ways {
+        Ways { routers: self.paths.len(), searches: self.searches, changed: self.ways_changed }
+    }
+
     fn search(&mut self, now: Instant, root: NodeId) {
         self.search_at = None;
         self.searched = Some(now);
@@ -119,7 +145,12 @@ impl Topology {
                 back.then_some((a.node, a.cost))
             })
         };
-        self.paths = shortest_paths(root, &self.paths, edges);
+        let paths = shortest_paths(root, &self.paths, edges);
+        self.searches += 1;
+        if paths != self.paths {
+            self.ways_changed = Some(now);
+            self.paths = paths;
+        }
     }
 
     fn insert(&mut self, node: NodeId, record: NodeRecord) {

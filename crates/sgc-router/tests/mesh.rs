@@ -266,6 +266,18 @@ fn the_cheapest_way_is_taken_and_a_change_of_cost_moves_it() {
 }
 
 #[test]
+fn a_router_that_begins_speaks_once_of_all_links_that_come_up_with_it() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.router.stats().nodes, 0);
+    bench.sent.clear();
+    bench.pass(ms(500));
+    assert_eq!(bench.told(), [(1, "link state"), (2, "link state"), (3, "link state")]);
+    let Control::LinkState { signed } = &bench.sent[0].1 else { unreachable!() };
+    let body = LinkStateBody::from_slice(&signed.body).unwrap();
+    assert_eq!(body.routers.len(), 3);
+}
+
+#[test]
 fn an_edge_counts_only_if_both_its_ends_say_it() {
     let mut bench = Bench::new();
     bench.says(1, 1, &[(0, 1000), (4, 10)], true);
@@ -312,7 +324,7 @@ fn a_node_that_may_not_route_cannot_say_that_it_does() {
     };
     let signed = bench.owner.sign_link_state(&body);
     bench.frame(1, Control::LinkState { signed });
-    assert_eq!((bench.dropped.as_slice(), bench.router.stats().nodes), (["not_router"].as_slice(), 1));
+    assert_eq!((bench.dropped.as_slice(), bench.router.stats().nodes), (["not_router"].as_slice(), 0));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! A [`World`] holds nodes (a `Router` and an `Endpoint` each, wired as the driver of `sgc-node` wires them),
 //! cables between them, and a queue of what is under way. Nothing happens but in [`World::run`] and its
 //! relatives, and the same seed gives the same run. Tests read what came of it: deliveries, events, drops.
-//! [`Model`] says what should have come of it, from the configuration alone.
+//! [`Model`] says what should have come of it, from the configuration alone. [`mesh`] has bare routers by the thousand.
 //!
 //! There is no socket, no thread and no sleep here, and no ROS: what a node publishes is a numbered message.
 //! Sealing is as in production; the provider's own randomness in signatures decides nothing.
@@ -28,6 +28,7 @@
 mod cast;
 mod clock;
 mod evil;
+pub mod mesh;
 mod model;
 mod node;
 mod publishers;
