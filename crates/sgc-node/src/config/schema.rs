@@ -96,7 +96,7 @@ impl Table {
                 "node",
             ],
             Self::Use => &["from", "topic", "type", "publish", "token"],
-            Self::Router => &["listen", "peer_rate", "announce", "accept", "mapping"],
+            Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],
