@@ -67,6 +67,15 @@ struct OfOwner {
     names: usize,
 }
 
+/// A question that was passed on, or began here.
+#[derive(Clone, Copy, Debug)]
+struct Question {
+    id: u64,
+    at: Instant,
+    /// Until the answer is known.
+    open: bool,
+}
+
 /// Everything that is known of names.
 #[derive(Debug, Default)]
 pub(crate) struct Names {
@@ -84,8 +93,10 @@ pub(crate) struct Names {
     /// Names that are asked for, and when the next time is.
     asking: BTreeMap<Name, Instant>,
     ask_at: BTreeSet<(Instant, Name)>,
-    /// When a question of others was passed on last.
-    passed_on: BTreeMap<Name, Instant>,
+    /// The question for a name that was passed on last.
+    passed_on: BTreeMap<Name, Question>,
+    /// Questions that began here.
+    questions: u64,
     pub(crate) prune_at: Option<Instant>,
 }
 
@@ -239,8 +250,8 @@ impl Router {
             Ok(expires) => expires,
             Err(why) => return self.not_verified(now, link, "advertisement", why),
         };
-        let asked =
-            news.iter().any(|n| self.names.asking.contains_key(n) || self.names.passed_on.contains_key(n));
+        let open = |n| self.names.passed_on.get(n).is_some_and(|q| q.open);
+        let asked = news.iter().any(|n| self.names.asking.contains_key(n) || open(n));
         let record = Record {
             owner: advert.owner,
             seq,
@@ -302,7 +313,9 @@ impl Router {
         self.names.records.insert(id, record);
         for name in names {
             self.names.remove_tombstone(name);
-            self.names.passed_on.remove(name);
+            if let Some(question) = self.names.passed_on.get_mut(name) {
+                question.open = false;
+            }
             if let Some(old) = self.names.names.insert(*name, id) {
                 self.release(old, 1);
             }
@@ -698,7 +711,9 @@ impl Router {
 
     // ---- Questions among routers.
 
-    pub(crate) fn handle_query(&mut self, now: Now, link: LinkId, hops: u8, names: &[Name]) {
+    /// Somebody asks. The answer goes back over the link that a question came over first: its copies over others are
+    /// passed over, or every router would be told of every name that anybody asks for.
+    pub(crate) fn handle_query(&mut self, now: Now, link: LinkId, id: u64, hops: u8, names: &[Name]) {
         let Some(state) = self.links.get(&link) else { return };
         if !self.config.transit || !state.is_transit() {
             return self.drop_frame(link, DropReason::NotRouter);
@@ -711,6 +726,10 @@ impl Router {
         self.names.prune_at.get_or_insert(until);
         let (mut unknown, mut refresh) = (Vec::new(), BTreeMap::<LinkId, Vec<Name>>::new());
         for name in names {
+            let before = self.names.passed_on.get(name).copied();
+            if before.is_some_and(|q| q.id == id) {
+                continue;
+            }
             let way = self.way(name).filter(|(way, _)| *way != link);
             if way.is_some()
                 && let Some(record) = self.names.record(name)
@@ -731,28 +750,27 @@ impl Router {
                 break;
             }
             state.asks.insert(*name, until);
-            let passed_on = self.names.passed_on.get(name);
-            if passed_on.is_none_or(|at| *at + QUERY_AGAIN <= now.instant) {
+            if before.is_none_or(|q| !q.open || q.at + QUERY_AGAIN <= now.instant) {
                 unknown.push(*name);
             }
         }
         if hops >= HOP_LIMIT - 1 {
             return self.drop_frame(link, DropReason::HopLimit);
         }
-        self.pass_on(now.instant, Some(link), hops + 1, &unknown);
+        self.pass_on(now.instant, Some(link), id, hops + 1, &unknown);
         for (from, names) in refresh {
-            self.send(from, Control::Query { hops: hops + 1, names });
+            self.send(from, Control::Query { id, hops: hops + 1, names });
         }
     }
 
     /// Asks all routers but the one who asked.
-    fn pass_on(&mut self, now: Instant, asker: Option<LinkId>, hops: u8, names: &[Name]) {
+    fn pass_on(&mut self, now: Instant, asker: Option<LinkId>, id: u64, hops: u8, names: &[Name]) {
         if names.is_empty() {
             return;
         }
         let room = self.config.limits.tombstones_max.saturating_sub(self.names.passed_on.len());
         let names = &names[..names.len().min(room)];
-        self.names.passed_on.extend(names.iter().map(|n| (*n, now)));
+        self.names.passed_on.extend(names.iter().map(|n| (*n, Question { id, at: now, open: true })));
         self.names.prune_at.get_or_insert(now + QUERY_LEASE);
         let targets: Vec<_> = self
             .links
@@ -762,9 +780,17 @@ impl Router {
             .collect();
         for link in targets {
             for names in names.chunks(NAMES_PER_FRAME_MAX) {
-                self.send(link, Control::Query { hops, names: names.to_vec() });
+                self.send(link, Control::Query { id, hops, names: names.to_vec() });
             }
         }
+    }
+
+    /// Number of a new question: nobody else has it, and nobody sees whose it is.
+    fn question(&mut self) -> u64 {
+        self.names.questions += 1;
+        // Of an odd factor, so that runs whose numbers are near each other have others.
+        let spread = self.names.questions.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        self.config.incarnation.wrapping_add(spread)
     }
 
     fn mark_asked(&mut self, now: Instant, name: &Name) {
@@ -849,11 +875,13 @@ impl Router {
             }
             self.names.ask_again(name, now.instant + QUERY_EVERY);
         }
-        self.pass_on(now.instant, None, 0, &everyone);
+        let id = self.question();
+        self.pass_on(now.instant, None, id, 0, &everyone);
         for (link, names) in one {
             for chunk in names.chunks(NAMES_PER_FRAME_MAX) {
                 chunk.iter().for_each(|name| self.mark_asked(now.instant, name));
-                self.send(link, Control::Query { hops: 0, names: chunk.to_vec() });
+                let id = self.question();
+                self.send(link, Control::Query { id, hops: 0, names: chunk.to_vec() });
             }
         }
     }
@@ -876,7 +904,7 @@ impl Router {
                 state.asks.retain(|_, until| *until > now.instant);
                 state.follows.retain(|_, until| *until > now.instant);
             }
-            self.names.passed_on.retain(|_, at| *at + QUERY_LEASE > now.instant);
+            self.names.passed_on.retain(|_, q| q.at + QUERY_LEASE > now.instant);
             let idle = |s: &LinkState| s.asks.is_empty() && s.follows.is_empty();
             let all_idle = self.names.passed_on.is_empty() && self.links.values().all(idle);
             self.names.prune_at = (!all_idle).then(|| now.instant + QUERY_LEASE);

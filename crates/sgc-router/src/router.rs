@@ -355,7 +355,7 @@ impl Router {
             Control::Crl { der } => self.handle_crl(now, link, &der),
             Control::Ack { name, sink, serial } => self.handle_ack(link, name, sink, serial),
             Control::LinkState { signed } => self.handle_link_state(now, link, signed),
-            Control::Query { hops, names } => self.handle_query(now, link, hops, &names),
+            Control::Query { id, hops, names } => self.handle_query(now, link, id, hops, &names),
             Control::Reroute { name, sink } => self.handle_reroute(link, name, sink),
             Control::Label { .. } | Control::LabelAck { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "label" });

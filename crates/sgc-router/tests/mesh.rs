@@ -385,7 +385,7 @@ fn names_are_told_to_all_routers_or_to_those_who_ask() {
         let from_proxy: Vec<_> = bench.told().into_iter().filter(|(link, _)| *link != 1).collect();
         assert_eq!(from_proxy, told, "{mapping:?}");
         let names = vec![bench.name(&A)];
-        bench.frame(1, Control::Query { hops: 0, names });
+        bench.frame(1, Control::Query { id: 0, hops: 0, names });
         assert_eq!(bench.told(), [(1, "advert"), (1, "link state")], "{mapping:?}: an answer");
         // Who asked hears of changes.
         bench.frame(4, bench.advert_frame(11, true, &[A]));
@@ -397,17 +397,23 @@ fn names_are_told_to_all_routers_or_to_those_who_ask() {
 fn an_unknown_name_is_asked_for_once_and_all_who_asked_are_answered() {
     let mut bench = Bench::with(MappingKind::Query, Limits::default());
     let names = vec![bench.name(&A)];
-    bench.frame(1, Control::Query { hops: 0, names: names.clone() });
+    bench.frame(1, Control::Query { id: 1, hops: 0, names: names.clone() });
     assert_eq!(bench.told(), [(2, "query"), (3, "query")]);
-    bench.frame(2, Control::Query { hops: 1, names: names.clone() });
-    assert_eq!(bench.told(), [], "the same question is under way");
-    bench.frame(3, Control::Query { hops: 63, names });
-    assert_eq!(bench.dropped, ["hop_limit"]);
+    bench.frame(3, Control::Query { id: 1, hops: 1, names: names.clone() });
+    assert_eq!(bench.told(), [], "the same question by another way");
+    bench.frame(2, Control::Query { id: 2, hops: 63, names: names.clone() });
+    assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![], ["hop_limit"].as_slice()));
+    bench.frame(2, Control::Query { id: 3, hops: 1, names: names.clone() });
+    assert_eq!(bench.told(), [], "one for the same name is under way");
     bench.up(4, &bench.owner.clone(), false, 1000);
     bench.owner_says(4, 0, &[(0, 1000)]);
     bench.advert(4, 10, &[A]);
     let adverts: Vec<_> = bench.told().into_iter().filter(|(_, what)| *what == "advert").collect();
-    assert_eq!(adverts, [(1, "advert"), (2, "advert"), (3, "advert")]);
+    assert_eq!(adverts, [(1, "advert"), (2, "advert")], "3 did not ask of its own");
+    bench.frame(3, Control::Query { id: 1, hops: 1, names: names.clone() });
+    assert_eq!(bench.told(), [], "a late copy");
+    bench.frame(3, Control::Query { id: 4, hops: 0, names });
+    assert!(bench.told().contains(&(3, "advert")));
 }
 
 #[test]
@@ -437,14 +443,14 @@ fn questions_are_bounded() {
     let limits = Limits { queries_burst: 16, interests_per_link_max: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
     let names: Vec<_> = (0..12).map(|n| bench.name(&numbered(n))).collect();
-    bench.frame(1, Control::Query { hops: 0, names });
+    bench.frame(1, Control::Query { id: 0, hops: 0, names });
     let asked = |bench: &Bench| match &bench.sent[..] {
         [(2, Control::Query { names, .. }), (3, _)] => names.len(),
         other => panic!("{other:?}"),
     };
     assert_eq!((asked(&bench), bench.dropped.as_slice()), (8, ["limit"].as_slice()));
     let names: Vec<_> = (20..28).map(|n| bench.name(&numbered(n))).collect();
-    bench.frame(1, Control::Query { hops: 0, names });
+    bench.frame(1, Control::Query { id: 0, hops: 0, names });
     assert_eq!((bench.sent.len(), bench.dropped.len()), (0, 2), "too fast");
 }
 

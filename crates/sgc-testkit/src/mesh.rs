@@ -678,7 +678,7 @@ fn weigh(frame: &Control) -> (&'static str, usize) {
         Control::Join { signed: s } => ("join", signed(s)),
         Control::Answer { signed: s } => ("answer", signed(s)),
         Control::Hello(Hello { .. }) => ("hello", 12),
-        Control::Query { names, .. } => ("query", 6 + 32 * names.len()),
+        Control::Query { names, .. } => ("query", 14 + 32 * names.len()),
         Control::Interest { names } => ("interest", 5 + 32 * names.len()),
         other => ("other", other.to_bytes().len()),
     }
@@ -698,7 +698,7 @@ mod tests {
             Control::Join { signed: signed.clone() },
             Control::Answer { signed },
             Control::Hello(Hello { minor: 0, incarnation: 7, transit: true }),
-            Control::Query { hops: 2, names: names.clone() },
+            Control::Query { id: 1, hops: 2, names: names.clone() },
             Control::Interest { names },
         ] {
             assert_eq!(weigh(&frame).1, frame.to_bytes().len(), "{frame:?}");

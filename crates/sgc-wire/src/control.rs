@@ -117,6 +117,8 @@ pub enum Control {
     /// Does anybody know where these names are? From router to router; answered with advertisements, now or when
     /// they become known.
     Query {
+        /// Random number of the question, from who asked first: its copies over other links are the same question.
+        id: u64,
         /// Links crossed so far.
         hops: u8,
         /// Which.
@@ -704,8 +706,9 @@ impl Encode for Control {
                 w.u8(14);
                 signed.encode(w);
             }
-            Self::Query { hops, names } => {
+            Self::Query { id, hops, names } => {
                 w.u8(15);
+                w.u64(*id);
                 w.u8(*hops);
                 encode_names(w, names);
             }
@@ -754,7 +757,7 @@ impl Decode for Control {
             12 => Self::Crl { der: blob(r, "revocation list", CRL_BYTES_MAX)? },
             13 => Self::Ack { name: Name::decode(r)?, sink: SinkId::decode(r)?, serial: r.u64()? },
             14 => Self::LinkState { signed: Signed::decode(r)? },
-            15 => Self::Query { hops: r.u8()?, names: decode_names(r)? },
+            15 => Self::Query { id: r.u64()?, hops: r.u8()?, names: decode_names(r)? },
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
             21 => Self::LabelAck { label: Label::decode(r)? },
@@ -787,7 +790,7 @@ mod tests {
             Control::Crl { der: Bytes::from_static(b"list") },
             Control::Ack { name, sink, serial: 7 },
             Control::LinkState { signed },
-            Control::Query { hops: 1, names: vec![name; 2] },
+            Control::Query { id: 7, hops: 1, names: vec![name; 2] },
             Control::Reroute { name, sink },
             Control::Label { label, name },
             Control::LabelAck { label },
