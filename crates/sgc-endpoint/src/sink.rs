@@ -104,6 +104,9 @@ pub enum SinkDrop {
     /// The message was delivered before, or is too old to tell.
     #[error("message delivered before")]
     Replayed,
+    /// A newer message of its best-effort source was delivered before.
+    #[error("a newer message was delivered before")]
+    Late,
     /// The fragment was received before.
     #[error("fragment received before")]
     DuplicateFragment,
@@ -137,6 +140,7 @@ impl SinkDrop {
             Self::ParkingFull => "sink_parking_full",
             Self::BelowFloor => "sink_below_floor",
             Self::Replayed => "sink_replayed",
+            Self::Late => "sink_late",
             Self::DuplicateFragment => "sink_duplicate_fragment",
             Self::Inconsistent => "sink_inconsistent",
             Self::Head => "sink_head",
@@ -754,6 +758,10 @@ impl SourceState {
             return Err(SinkDrop::Replayed);
         }
         match self.window.check(header.seq) {
+            // As in DDS: what is best effort comes in order or not at all.
+            Freshness::Fresh if !header.reliable && header.to.is_none() && header.seq < self.expected => {
+                Err(SinkDrop::Late)
+            }
             Freshness::Fresh => Ok(()),
             Freshness::Duplicate | Freshness::TooOld => Err(SinkDrop::Replayed),
         }

@@ -13,11 +13,11 @@ use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
     DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig, revocation_list,
 };
-use sgc_trust::{CertError, OpenError, SignedError};
+use sgc_trust::{CertError, CrlError, OpenError, SignedError};
 
 /// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
 const COMMITTED: &[u64] = &[
-    5, 24, 28, 34, 42, 43, 46, 64, 85, 99, 188, 342, // showed bugs
+    5, 24, 28, 34, 42, 43, 46, 64, 71, 85, 99, 188, 258, 342, // showed bugs
     1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31,
     32, 33, 35, 36, 37, 38, 39, 40,
 ];
@@ -197,7 +197,8 @@ impl Run {
             110..112 if dice.chance(60) => {
                 let fresh = |n: &NodeKey| !self.revoked.contains(n);
                 let thief = dice.pick(&nodes.iter().copied().filter(fresh).collect::<Vec<_>>())?;
-                Transition::Revoke(thief, dice.pick(&up)?)
+                let right: Vec<_> = up.iter().copied().filter(|n| !self.wrong_clocks.contains(n)).collect();
+                Transition::Revoke(thief, dice.pick(&right)?)
             }
             0..5 => dice.pick(&whole).map(|(a, b)| Transition::Cut(a, b))?,
             5..9 => {
@@ -466,7 +467,11 @@ impl Run {
                         | DropReason::Stale { .. }
                         // Passed on by those who have not heard of it.
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
-                    ) || matches!(&dropped.reason, DropReason::NotVerified { why, .. } if clock(why))
+                    ) || match &dropped.reason {
+                        DropReason::NotVerified { why, .. } => clock(why),
+                        DropReason::Crl(why) => self.clocks && matches!(why, CrlError::NotYetValid { .. }),
+                        _ => false,
+                    }
                 }
                 What::EndpointDrop(dropped) => match dropped {
                     sgc_endpoint::Dropped::Unexpected { .. } => true,

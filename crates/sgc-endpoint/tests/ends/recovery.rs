@@ -255,7 +255,7 @@ fn a_best_effort_source_is_asked_for_nothing() {
     let mut sink = sink(SUITE, &[&source]);
     let packets: Vec<_> = (1..=5).map(|n| published(&mut source, bytes(n), false).remove(0)).collect();
     assert_eq!(delivered(&mut sink, &packets[3..]), [4, 5].map(bytes));
-    assert_eq!(delivered(&mut sink, &packets[..1]), [bytes(1)], "as they come");
+    assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::Late), "in order or not at all");
     regranted(&mut sink, SinkId([3; 16]), grant(SUITE, 1, &[source.announce()]));
     assert_eq!(sink.unsynced().count(), 0);
     assert_eq!(marked(&mut source).len(), 0);
