@@ -4,14 +4,15 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring scale clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
-	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
+	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs),'
+	@echo '                 scale (simulated networks up to 300 routers; ARGS=--full: 1000 routers, a million names)'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -76,6 +77,10 @@ peers-check-long: peers
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc --locked --test ring $(ARGS) -- --nocapture
+
+# How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
+scale:
+	$(CARGO) run --release --locked -p sgc-testkit --example scale -- $(ARGS)
 
 clean-tools:
 	rm -rf .venv .tools .peers
