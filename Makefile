@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check bench-routing clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check bench-routing scale clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -14,6 +14,7 @@ help:
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 	@echo '                 model-check (larger bounds)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
+	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
 demo: build
 	./target/release/sgc demo $(ARGS)
@@ -87,6 +88,10 @@ model-check:
 bench-routing: build
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml -- all \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
+
+# How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
+scale:
+	$(CARGO) run --release --locked -p sgc-testkit --example scale -- $(ARGS)
 
 clean-tools:
 	rm -rf .venv .tools .peers

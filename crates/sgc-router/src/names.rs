@@ -635,14 +635,16 @@ impl Router {
 
     /// The ways to these names may be others by now: their trees follow, and who wants to know is told.
     pub(crate) fn routes_changed(&mut self, names: &[Name]) {
-        let mut links = BTreeSet::new();
+        let mut watched = BTreeMap::<LinkId, Vec<Name>>::new();
         for name in names {
             self.select(name);
             self.follow_way(name);
-            links.extend(self.names.watchers.get(name).into_iter().flatten().copied());
+            for link in self.names.watchers.get(name).into_iter().flatten() {
+                watched.entry(*link).or_default().push(*name);
+            }
         }
-        for link in links {
-            self.tell_interested(link, names);
+        for (link, names) in watched {
+            self.tell_interested(link, &names);
         }
         if self.config.transit {
             let waited = names.iter().filter(|n| self.names.watchers.contains_key(*n));

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use sgc_trust::{CrlError, Identity, SignedError, TrustAnchors};
 use sgc_wire::{Control, Hello, Name, NodeId, Now, SinkId, UnixMillis};
+use smallvec::SmallVec;
 
 use crate::FibEntry;
 use crate::limits::{Allowance, Limits};
@@ -245,6 +246,8 @@ pub struct Router {
     pub(crate) config: RouterConfig,
     pub(crate) mapping: Box<dyn Mapping>,
     pub(crate) links: BTreeMap<LinkId, LinkState>,
+    /// The links to each neighbour, ascending.
+    pub(crate) links_of: BTreeMap<NodeId, SmallVec<[LinkId; 2]>>,
     allowances: BTreeMap<NodeId, Allowance>,
     /// With so many it is time to look which are of no use.
     allowances_max: usize,
@@ -272,6 +275,7 @@ impl Router {
             mapping: config.mapping.build(),
             config,
             links: BTreeMap::from([(LinkId::LOCAL, local)]),
+            links_of: BTreeMap::new(),
             allowances: BTreeMap::new(),
             allowances_max: 2 * ALLOWANCES_MIN,
             topology,
@@ -289,7 +293,7 @@ impl Router {
     pub fn handle_link_up(&mut self, now: Now, link: LinkId, neighbour: Neighbour) {
         debug_assert_ne!(link, LinkId::LOCAL);
         self.now = now;
-        let of_node = self.links.values().filter(|l| l.node == neighbour.node).count();
+        let of_node = self.links_of.get(&neighbour.node).map_or(0, |links| links.len());
         let refused = if neighbour.node == self.config.node {
             Some(LinkClose::Loop)
         } else if self.is_untrusted(&neighbour.certs) {
@@ -303,6 +307,9 @@ impl Router {
             self.outputs.push_back(Output::Close { link, reason });
             return;
         }
+        let of_node = self.links_of.entry(neighbour.node).or_default();
+        of_node.push(link);
+        of_node.sort_unstable();
         self.links.insert(link, LinkState::new(now, neighbour));
         let hello = Hello { minor: 0, incarnation: self.config.incarnation, transit: self.config.transit };
         self.send(link, Control::Hello(hello));
@@ -479,6 +486,12 @@ impl Router {
     /// Takes back everything that came over or goes over `link`.
     pub(crate) fn forget_link(&mut self, link: LinkId) {
         let Some(state) = self.links.remove(&link) else { return };
+        if let Some(of_node) = self.links_of.get_mut(&state.node) {
+            of_node.retain(|l| *l != link);
+            if of_node.is_empty() {
+                self.links_of.remove(&state.node);
+            }
+        }
         for name in state.interests.keys() {
             self.unwatch(link, name);
         }

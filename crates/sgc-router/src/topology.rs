@@ -367,13 +367,14 @@ impl Router {
 
     /// The best link to a neighbour: the cheapest, of about equal ones the newest.
     pub(crate) fn link_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
-        let of_node =
-            |(l, s): &(&LinkId, &LinkState)| **l != LinkId::LOCAL && s.node == *node && s.hello.is_some();
+        let of_node = self.links_of.get(node).into_iter().flatten().rev();
+        let up =
+            of_node.filter_map(|link| Some((*link, self.links.get(link).filter(|s| s.hello.is_some())?)));
         let mut best: Option<(LinkId, u32)> = None;
-        for (link, state) in self.links.iter().rev().filter(of_node) {
+        for (link, state) in up {
             let cost = state.cost.now();
             if best.is_none_or(|(_, known)| cost.saturating_mul(2).saturating_add(5000) < known) {
-                best = Some((*link, cost));
+                best = Some((link, cost));
             }
         }
         best

@@ -101,6 +101,7 @@ struct Tables {
     events: Table,
     flood: Table,
     query: Table,
+    hub: Table,
 }
 
 impl Tables {
@@ -167,15 +168,17 @@ impl Tables {
                     "routers that hold some",
                 ],
             ),
+            hub: Table::new("hub", &["proxies", "names that they wait for", "KB held", "a search µs"]),
         }
     }
 
-    fn all(&self) -> [(&'static str, &Table); 4] {
+    fn all(&self) -> [(&'static str, &Table); 5] {
         [
             ("Cold start", &self.cold),
             ("Changes", &self.events),
             ("`flood`", &self.flood),
             ("`query`", &self.query),
+            ("One router with many proxies", &self.hub),
         ]
     }
 }
@@ -401,13 +404,12 @@ fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
     for names in names {
         let upto = names / (FLOOD_BATCHES * BATCH_NAMES);
         let batches = (upto - known) * FLOOD_BATCHES;
-        let mut frames = Tally::default();
         for owner in &owners[known..upto] {
             for n in 0..FLOOD_BATCHES {
                 mesh.advertise(*owner, n);
             }
         }
-        std::mem::swap(&mut frames, &mut mesh.settle());
+        let frames = mesh.settle();
         known = upto;
         for at in mesh.routers() {
             assert_eq!(mesh.router(at).stats().routed_names, *names, "router {at} does not know all");
@@ -435,6 +437,34 @@ fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
             roam.frames().to_string(),
         ]);
     }
+}
+
+/// One router with many proxies, each of which waits for ten names.
+fn hub(table: &mut Table, proxies: usize) {
+    let mut mesh = Mesh::new(proxies as u64, MappingKind::Query, cpu);
+    mesh.add_routers(2);
+    let batches = (proxies * 10).div_ceil(BATCH_NAMES);
+    let owner = mesh.add_proxy("owner-0", 0);
+    let others: Vec<_> = (0..proxies).map(|n| mesh.add_proxy(&format!("proxy-{n}"), 0)).collect();
+    mesh.record(0);
+    mesh.plug_all();
+    mesh.settle();
+    let mut names = Vec::new();
+    for batch in 0..batches {
+        mesh.advertise(owner, batch);
+        names.extend(mesh.names(owner, batch));
+    }
+    mesh.settle();
+    for (proxy, names) in others.iter().zip(names.chunks(10)) {
+        names.iter().for_each(|name| mesh.ask(*proxy, *name));
+    }
+    mesh.settle();
+    table.row(vec![
+        proxies.to_string(),
+        names.len().to_string(),
+        per(held(&mesh) as f64 / 1e3, 1),
+        per(search_time(&mut mesh).as_secs_f64() * 1e6, 1),
+    ]);
 }
 
 /// What it takes to believe a link state.
@@ -485,6 +515,9 @@ fn main() {
         if only.as_deref() != Some("query") {
             flooding(&mut tables.flood, routers, &names);
         }
+    }
+    for proxies in [10, 100, 1000] {
+        hub(&mut tables.hub, proxies);
     }
     println!("A link state takes {} µs to verify.\n", verify_time().as_micros());
     for (title, table) in tables.all() {
