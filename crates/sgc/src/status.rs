@@ -61,6 +61,8 @@ pub(crate) struct Link {
     pub(crate) remote: String,
     url: Option<String>,
     rtt_us: u64,
+    cost: u32,
+    silent: bool,
     sent_bytes: u64,
     received_bytes: u64,
     peer_slowed: u64,
@@ -224,7 +226,7 @@ impl Status {
         };
         section(
             "Links",
-            &["peer", "remote", "round trip", "sent", "received", "dialled"],
+            &["peer", "remote", "round trip", "cost", "sent", "received", "dialled"],
             self.links.iter().map(Link::row).collect(),
         );
         let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
@@ -270,6 +272,8 @@ impl Link {
             self.peer.chars().take(8).collect(),
             self.remote.clone(),
             output::millis(self.rtt_us),
+            // What silence adds is there to be counted with, not to be read.
+            if self.silent { "silent".into() } else { output::millis(self.cost.into()) },
             output::bytes(self.sent_bytes),
             output::bytes(self.received_bytes),
             self.url.clone().unwrap_or_default(),
@@ -333,7 +337,7 @@ mod tests {
     fn a_status_is_shown_in_tables() {
         let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
             "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
-                      "rtt_us":420,"sent_bytes":1500,"received_bytes":7}],
+                      "rtt_us":420,"cost":1420,"sent_bytes":1500,"received_bytes":7}],
             "routers":[{"router":"srv://lab.example","found_by":"srv","at":"quic://r1.lab.example:7447",
                         "state":"trying again","failures":2,"last_failure":"no answer","again_in_s":3}],
             "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
@@ -344,8 +348,8 @@ mod tests {
             "arm-1: sgc 0.1.0, up for 1 min 15 s",
             "",
             "Links:",
-            "  peer      remote          round trip  sent    received  dialled",
-            "  01234567  127.0.0.1:7447  0.42 ms     1.5 kB  7 B       quic://localhost:7447",
+            "  peer      remote          round trip  cost     sent    received  dialled",
+            "  01234567  127.0.0.1:7447  0.42 ms     1.42 ms  1.5 kB  7 B       quic://localhost:7447",
             "",
             "Routers:",
             "  router             found by  at                          state                last failure",
