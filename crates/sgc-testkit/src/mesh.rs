@@ -284,10 +284,9 @@ impl Mesh {
     /// Both ends of a cable see that the link is gone.
     pub fn unplug(&mut self, cable: usize) {
         let Some(links) = self.cables[cable].links.take() else { return };
-        for side in 0..2 {
-            let station = self.cables[cable].ends[side];
-            self.stations[station].links.remove(&links[side]);
-            self.input(station, Input::Down(links[side]), None);
+        for (station, link) in self.cables[cable].ends.into_iter().zip(links) {
+            self.stations[station].links.remove(&link);
+            self.input(station, Input::Down(link), None);
         }
     }
 
