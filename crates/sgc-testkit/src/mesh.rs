@@ -284,8 +284,7 @@ impl Mesh {
     /// Both ends of a cable see that the link is gone.
     pub fn unplug(&mut self, cable: usize) {
         let Some(links) = self.cables[cable].links.take() else { return };
-        let ends = self.cables[cable].ends;
-        for (station, link) in ends.into_iter().zip(links) {
+        for (station, link) in self.cables[cable].ends.into_iter().zip(links) {
             self.stations[station].links.remove(&link);
             self.input(station, Input::Down(link), None);
         }
