@@ -211,12 +211,12 @@ impl Router {
             Err(why) => return self.not_verified(now, link, "advertisement", why),
         };
         let owner = advert.owner.node_id;
-        if !from_router && owner != neighbour {
-            return self.drop_frame(link, DropReason::NotOwner { owner });
-        }
         if owner == self.config.node && link != LinkId::LOCAL {
             // What this node itself said, perhaps in a run whose clock was ahead: its endpoint has to go on from there.
             return self.send(LinkId::LOCAL, Control::Advert { cost, signed });
+        }
+        if !from_router && owner != neighbour {
+            return self.drop_frame(link, DropReason::NotOwner { owner });
         }
         let (seq, withdraw) = (advert.body.seq, advert.body.withdraw);
         if let Some(floor) = self.topology.node(&owner).map(|n| n.floor).filter(|floor| seq < *floor) {

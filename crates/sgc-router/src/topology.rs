@@ -178,9 +178,6 @@ impl Router {
     pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: Signed) {
         let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return };
         let (neighbour, from_router) = (state.node, state.is_transit());
-        if !self.config.transit {
-            return self.drop_frame(link, DropReason::Unknown { what: "link state" });
-        }
         let digest = signed_digest(&signed);
         if self.topology.seen.contains_key(&digest) {
             return;
@@ -190,12 +187,6 @@ impl Router {
             Err(why) => return self.not_verified(now, link, "link state", why),
         };
         let (node, body) = (verified.node.node_id, verified.body);
-        if !from_router && node != neighbour {
-            return self.drop_frame(link, DropReason::NotOwner { owner: node });
-        }
-        if body.transit && !verified.node.may_route {
-            return self.drop_frame(link, DropReason::NotRouter);
-        }
         if node == self.config.node {
             // Of an earlier run whose clock was ahead: this one goes on from there.
             if body.seq >= self.topology.own_seq {
@@ -203,6 +194,15 @@ impl Router {
                 self.topology.touch_own(now.instant);
             }
             return;
+        }
+        if !self.config.transit {
+            return self.drop_frame(link, DropReason::Unknown { what: "link state" });
+        }
+        if !from_router && node != neighbour {
+            return self.drop_frame(link, DropReason::NotOwner { owner: node });
+        }
+        if body.transit && !verified.node.may_route {
+            return self.drop_frame(link, DropReason::NotRouter);
         }
         if !self.allowance(&node).may_announce(now.instant) {
             return self.drop_frame(link, DropReason::Limit { what: "announcements of a node per second" });

@@ -17,7 +17,7 @@ use sgc_trust::{CertError, CrlError, OpenError, SignedError};
 
 /// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
 const COMMITTED: &[u64] = &[
-    5, 24, 28, 34, 42, 43, 46, 64, 71, 85, 99, 188, 258, 342, // showed bugs
+    5, 24, 28, 34, 42, 43, 46, 64, 71, 85, 99, 188, 258, 342, 2048, // showed bugs
     1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 25, 26, 27, 29, 30, 31,
     32, 33, 35, 36, 37, 38, 39, 40,
 ];
