@@ -354,12 +354,11 @@ impl<N: RosNetwork> Core<N> {
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 let (flows, pulse) = (HashMap::new(), Pulse::new(&link));
                 self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, pulse });
-                self.begin_to_look();
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
                 self.router.handle_link_up(now(), id, neighbour);
-                self.look_at_link(id);
+                self.begin_to_look(id);
             }
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(now(), id);
@@ -559,6 +558,7 @@ impl<N: RosNetwork> Core<N> {
     fn status(&self) -> Status {
         let links = self.links.iter().map(|(id, entry)| {
             let stats = entry.link.stats();
+            let (cost, silent) = self.router.link_cost(*id).unwrap_or_default();
             let over = self.data.rates().over(&entry.link.peer().node_id);
             LinkStatus {
                 id: id.0,
@@ -568,8 +568,8 @@ impl<N: RosNetwork> Core<N> {
                 url: entry.url.clone(),
                 kex: stats.key_exchange.label(),
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
-                cost: self.router.link_cost(*id).map_or(0, |(cost, _)| cost),
-                silent: self.router.link_cost(*id).is_some_and(|(_, silent)| silent),
+                cost,
+                silent,
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
                 labels_sent: entry.control.labels_known(),

@@ -855,6 +855,10 @@ impl Router {
 
     /// Asks other routers for names that somebody here waits for, if that is due.
     pub(crate) fn ask_due(&mut self, now: Now) {
+        // It is looked for whenever the machine is drained, so mostly there is nothing.
+        if self.names.ask_at.first().is_none_or(|(at, _)| *at > now.instant) {
+            return;
+        }
         let mut everyone = Vec::new();
         let mut one = BTreeMap::<LinkId, Vec<Name>>::new();
         while let Some((at, name)) = self.names.ask_at.first().copied().filter(|(at, _)| *at <= now.instant) {

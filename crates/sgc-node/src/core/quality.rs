@@ -45,15 +45,11 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// What is known of a link at its beginning, from its handshake.
-    pub(super) fn look_at_link(&mut self, id: LinkId) {
+    /// A link is up: its handshake has measured it, and it is looked at from here on.
+    pub(super) fn begin_to_look(&mut self, id: LinkId) {
+        self.look_due.get_or_insert_with(|| Instant::now() + LOOK_EVERY);
         if let Some(entry) = self.links.get(&id) {
             self.router.handle_link_quality(now(), id, entry.link.stats().rtt, false);
         }
-    }
-
-    /// A link is up: it is looked at from here on.
-    pub(super) fn begin_to_look(&mut self) {
-        self.look_due.get_or_insert_with(|| Instant::now() + LOOK_EVERY);
     }
 }
