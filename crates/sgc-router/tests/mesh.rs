@@ -106,23 +106,30 @@ impl Bench {
         if router == 0 { self.own.node_id() } else { self.routers[router - 1].node_id() }
     }
 
-    /// A link state of a router, over a link: to which routers it is linked, and whether to the owner.
-    fn says(&mut self, link: u32, router: usize, links: &[(usize, u32)], owner: bool) {
-        self.seq += 1;
+    /// A router's link state without other nodes, for the test to change.
+    fn link_state(&self, node: &Identity, seq: u64, links: &[(usize, u32)]) -> LinkStateBody {
         let mut routers: Vec<_> =
             links.iter().map(|(n, cost)| Adjacency { node: self.node(*n), cost: *cost }).collect();
         routers.sort_by_key(|a| a.node);
-        let body = LinkStateBody {
-            chain: self.routers[router - 1].chain_bytes(),
-            seq: self.seq,
+        LinkStateBody {
+            chain: node.chain_bytes(),
+            seq,
             issued_at: self.clock.now().unix,
             lease_ms: LEASE.as_millis() as u32,
             floor: 0,
             transit: true,
             routers,
-            attached: owner.then(|| self.owner.node_id().tag()).into_iter().collect(),
-        };
-        let signed = self.routers[router - 1].sign_link_state(&body);
+            attached: vec![],
+        }
+    }
+
+    /// A link state of a router, over a link: to which routers it is linked, and whether to the owner.
+    fn says(&mut self, link: u32, router: usize, links: &[(usize, u32)], owner: bool) {
+        self.seq += 1;
+        let attached = owner.then(|| self.owner.node_id().tag()).into_iter().collect();
+        let node = self.routers[router - 1].clone();
+        let body = LinkStateBody { attached, ..self.link_state(&node, self.seq, links) };
+        let signed = node.sign_link_state(&body);
         self.frame(link, Control::LinkState { signed });
         self.pass(ms(100));
     }
@@ -130,19 +137,7 @@ impl Bench {
     /// Where the owner says that it is.
     fn owner_says(&mut self, link: u32, floor: u64, routers: &[(usize, u32)]) {
         self.seq += 1;
-        let mut at: Vec<_> =
-            routers.iter().map(|(n, cost)| Adjacency { node: self.node(*n), cost: *cost }).collect();
-        at.sort_by_key(|a| a.node);
-        let body = LinkStateBody {
-            chain: self.owner.chain_bytes(),
-            seq: self.seq,
-            issued_at: self.clock.now().unix,
-            lease_ms: LEASE.as_millis() as u32,
-            floor,
-            transit: false,
-            routers: at,
-            attached: vec![],
-        };
+        let body = LinkStateBody { floor, transit: false, ..self.link_state(&self.owner, self.seq, routers) };
         let signed = self.owner.sign_link_state(&body);
         self.frame(link, Control::LinkState { signed });
         self.pass(ms(100));
@@ -312,16 +307,7 @@ fn a_link_state_goes_to_all_others_once_and_an_old_one_nowhere() {
 #[test]
 fn a_node_that_may_not_route_cannot_say_that_it_does() {
     let mut bench = Bench::new();
-    let body = LinkStateBody {
-        chain: bench.owner.chain_bytes(),
-        seq: 1,
-        issued_at: bench.clock.now().unix,
-        lease_ms: 1000,
-        floor: 0,
-        transit: true,
-        routers: vec![],
-        attached: vec![],
-    };
+    let body = bench.link_state(&bench.owner, 1, &[]);
     let signed = bench.owner.sign_link_state(&body);
     bench.frame(1, Control::LinkState { signed });
     assert_eq!((bench.dropped.as_slice(), bench.router.stats().nodes), (["not_router"].as_slice(), 0));
@@ -340,16 +326,7 @@ fn a_proxy_says_only_where_it_is_itself() {
 fn this_nodes_word_of_a_run_with_a_wrong_clock_is_overtaken() {
     let mut bench = Bench::new();
     let ahead = bench.clock.now().unix.0 + 1_000_000;
-    let body = LinkStateBody {
-        chain: bench.own.chain_bytes(),
-        seq: ahead,
-        issued_at: bench.clock.now().unix,
-        lease_ms: 1000,
-        floor: 0,
-        transit: true,
-        routers: vec![],
-        attached: vec![],
-    };
+    let body = bench.link_state(&bench.own, ahead, &[]);
     let signed = bench.own.sign_link_state(&body);
     bench.frame(1, Control::LinkState { signed });
     bench.pass(ms(200));
