@@ -11,9 +11,9 @@ use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
-    Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, Qos, Recover,
-    RefuseReason, RejectReason, Request, SecretBytes, Signed, SinkId, SourceId, SourceOffer, TopicGrant,
-    UnixMillis,
+    Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, PayloadEncoding, Qos,
+    Recover, RefuseReason, RejectReason, Request, RosNode, SecretBytes, Signed, SinkId, SourceId, SourceOffer,
+    TopicGrant, UnixMillis,
 };
 
 /// The time of the targets.
@@ -94,13 +94,18 @@ fn bodies() -> Vec<Vec<u8>> {
         type_hash: Some("RIHS01_ab".into()),
         qos: Qos { partitions: vec!["p".into()], ..Qos::default() },
         class: Class::Realtime,
-        sources: vec![CatalogueSource { source: SourceId([8; 16]), qos: Qos::default() }],
+        sources: vec![CatalogueSource {
+            source: SourceId([8; 16]),
+            qos: Qos::default(),
+            node: RosNode::new("/robot", "talker", Some("/robot")),
+        }],
     };
     let contents = [
         GrantContent::Topic(TopicGrant { entry: Some(Box::new(entry.clone())), ..grant(Suite::Standard) }),
         GrantContent::Catalogue(Catalogue { version: 2, entries: vec![entry] }),
     ];
-    let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+    let head =
+        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
     let mut all = vec![(0, advert.to_vec())];
     all.extend(joins.map(|j| (1, j.to_vec())));
     all.extend(answers.map(|a| (2, a.to_vec())));
@@ -131,7 +136,11 @@ fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
         };
         let mut source =
             Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");
-        let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+        let head = MessageHead {
+            kind: MessageKind::Write,
+            encoding: PayloadEncoding::Plain,
+            source_timestamp_ns: 7,
+        };
         let mut emit = |packet: sgc_wire::Packet| {
             let mut bytes = packet.header.to_vec();
             packet.payload.copy_into(&mut bytes);

@@ -39,6 +39,8 @@ pub struct DdsConfig {
     /// `sgc=<tag>;`, and endpoints that carry any such tag are not reported by discovery. `None` makes
     /// a plain DDS participant that marks nothing and sees everybody but itself.
     pub tag: Option<String>,
+    /// True if ROS 2 nodes are told of, both ways. The participant is then one of ROS 2 for every rmw.
+    pub graph: bool,
     /// The user's `CYCLONEDDS_URI`: XML fragments or `file://` names, separated by commas. It comes
     /// after the configuration made here, so what it sets wins, as in rmw_cyclonedds; lists (peers)
     /// add up. A `<Domain Id="7">` in it applies to the first network that this process opens on
@@ -112,6 +114,8 @@ pub struct Instance {
     pub interfaces_chosen: bool,
     /// This host's addresses other than loopback; see [`local_addresses`].
     pub host_addresses: Vec<Ipv4Addr>,
+    /// Addresses of this host from which static peers are reached.
+    pub towards_peers: Vec<Ipv4Addr>,
 }
 
 /// True if a peer can stand in Cyclone's XML and names a host: letters, digits and `.-_:[]%`.
@@ -148,7 +152,8 @@ fn participant_index_max(domain: u32) -> u32 {
 /// participant discovery where it is possible; a hundred participants of a host are asked, not 33; and
 /// peers are asked for ever, while Cyclone 11 gives up after 30 s. The host's other addresses are asked as
 /// well, from the loopback interface, which no packet leaves: a Cyclone 11 that is bound to such an
-/// address ignores participants that speak to it on another.
+/// address ignores participants that speak to it on another. And with static peers on other hosts, `LocalHost` takes
+/// the interfaces that lead to them, where Cyclone would take the first that can do multicast.
 ///
 /// # Errors
 /// [`RosError::Domain`] if the configuration is invalid.
@@ -178,6 +183,13 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
                     );
                 }
             } else {
+                if !instance.interfaces_chosen && !instance.towards_peers.is_empty() {
+                    general.push_str("<Interfaces>");
+                    for address in &instance.towards_peers {
+                        let _ = write!(general, "<NetworkInterface address=\"{address}\"/>");
+                    }
+                    general.push_str("</Interfaces>");
+                }
                 general.push_str("<AllowMulticast>false</AllowMulticast>");
             }
             let host = std::iter::once(&Ipv4Addr::LOCALHOST).chain(&instance.host_addresses);
@@ -220,6 +232,14 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
         xml.push_str(uri);
     }
     Ok(xml)
+}
+
+/// The hosts of the peers that are not this one by loopback, without their ports.
+pub fn far_hosts(peers: &[String]) -> impl Iterator<Item = &str> {
+    peers.iter().filter(|p| !is_loopback(p)).map(|peer| match peer.rsplit_once(':') {
+        Some((host, port)) if !host.contains(':') && port.bytes().all(|b| b.is_ascii_digit()) => host,
+        _ => peer.trim_start_matches('[').trim_end_matches(']'),
+    })
 }
 
 /// The IPv4 addresses of this host that are not loopback, from the text of Linux's `/proc/net/fib_trie`; at
@@ -322,6 +342,21 @@ mod tests {
         assert!(!xml.contains("NetworkInterface"));
         assert!(xml.contains("<AllowMulticast>false</AllowMulticast>"));
         assert!(xml.contains("Address=\"127.0.0.1\"") && xml.contains("Address=\"10.0.0.7\""));
+    }
+
+    #[test]
+    fn interfaces_that_lead_to_static_peers_are_taken_unless_the_user_chose() {
+        let towards_peers = vec![Ipv4Addr::new(10, 0, 0, 1), Ipv4Addr::new(10, 1, 0, 1)];
+        let taken = |discovery, interfaces_chosen| {
+            let instance = Instance { towards_peers: towards_peers.clone(), interfaces_chosen, ..plain() };
+            let static_peers = vec!["10.0.0.7".to_owned(), "10.1.0.7".to_owned()];
+            let config = DdsConfig { discovery, static_peers, ..DdsConfig::default() };
+            let xml = cyclone_config(&config, &instance).unwrap();
+            ["10.0.0.1", "10.1.0.1"].map(|a| xml.contains(&format!("<NetworkInterface address=\"{a}\"/>")))
+        };
+        assert_eq!(taken(DiscoveryRange::LocalHost, false), [true, true]);
+        assert_eq!(taken(DiscoveryRange::LocalHost, true), [false, false]);
+        assert_eq!(taken(DiscoveryRange::Subnet, false), [false, false]);
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! Which endpoints are there: a thread that reads DCPSPublication and DCPSSubscription.
+//! Which endpoints are there: a thread that reads DCPSPublication and DCPSSubscription, and DCPSParticipant where the
+//! ROS graph is wanted.
 //!
 //! Reports each endpoint once when it appears, once when it is gone, and as gone and new when what it
 //! offers changes. Endpoints of this participant are never reported, those of other SGC nodes only to a
@@ -7,18 +8,21 @@
 use std::collections::HashMap;
 use std::ffi::{CStr, c_char, c_void};
 use std::mem::MaybeUninit;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::thread;
 
 use cyclors::{
-    DDS_BUILTIN_TOPIC_DCPSPUBLICATION, DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION, dds_builtintopic_endpoint_t,
-    dds_create_reader, dds_instance_state_DDS_IST_ALIVE, dds_return_loan, dds_sample_info_t, dds_take,
+    DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, DDS_BUILTIN_TOPIC_DCPSPUBLICATION, DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
+    dds_builtintopic_endpoint_t, dds_builtintopic_participant_t, dds_create_reader, dds_entity_t,
+    dds_instance_state_DDS_IST_ALIVE, dds_return_loan, dds_sample_info_t, dds_take,
 };
 use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, Guid};
 
 use crate::entity::{Entity, check};
+use crate::graph::{Announcer, Listener, SharedHandler, lock};
 use crate::network::Participant;
-use crate::wait::{Stop, WaitSet};
+use crate::reader::CycloneReader;
+use crate::wait::{Stop, WaitSet, join};
 use crate::{qos, user_data};
 
 /// Samples taken at once.
@@ -30,57 +34,94 @@ const ENDPOINTS_MAX: usize = 65_536;
 /// Bound on a topic or type name, bytes (ROS 2 and DDS stop at 256).
 const NAME_BYTES_MAX: usize = 512;
 
-/// Starts the thread; what is there already is reported first.
+/// Discovery under way; dropping it ends it, and waits for its threads.
+#[derive(Debug)]
+pub(crate) struct Running {
+    stop: Arc<Stop>,
+    thread: Option<thread::JoinHandle<()>>,
+    /// What the participants say of their nodes.
+    _nodes: Option<CycloneReader>,
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.stop.request();
+        if let Some(thread) = self.thread.take() {
+            join(thread);
+        }
+    }
+}
+
+/// Starts the thread; what is there already is reported first. With an announcer, nodes are reported, too.
 pub(crate) fn start(
     participant: Arc<Participant>,
     handler: DiscoveryHandler,
-) -> Result<(Arc<Stop>, thread::JoinHandle<()>), String> {
+    announcer: Option<Arc<Announcer>>,
+) -> Result<Running, String> {
+    let handler: SharedHandler = Arc::new(Mutex::new(handler));
+    let graph = announcer.map(|announcer| Listener::new(Arc::clone(&handler), announcer));
     let stop = Stop::new(&participant)?;
-    let readers = [
-        BuiltinReader::new(&participant, EndpointKind::Writer)?,
-        BuiltinReader::new(&participant, EndpointKind::Reader)?,
-    ];
+    let endpoints = [EndpointKind::Writer, EndpointKind::Reader].map(Told::Endpoint);
+    let told = endpoints.into_iter().chain(graph.is_some().then_some(Told::Participant));
+    let readers: Vec<_> =
+        told.map(|told| BuiltinReader::new(&participant, told)).collect::<Result<_, _>>()?;
     let conditions: Vec<&Entity> = readers.iter().map(|r| &r.condition).collect();
     let wait_set = WaitSet::new(&participant, Arc::clone(&stop), &conditions)?;
-    let mut discovery = Discovery { wait_set, readers, known: HashMap::new(), handler, participant };
+    let nodes = graph.as_ref().map(|graph| graph.listen(&participant)).transpose()?;
+    let mut discovery = Discovery { wait_set, readers, known: HashMap::new(), handler, graph, participant };
     let thread = thread::Builder::new()
         .name("sgc-dds-disc".into())
         .spawn(move || discovery.run())
         .map_err(|e| e.to_string())?;
-    Ok((stop, thread))
+    Ok(Running { stop, thread: Some(thread), _nodes: nodes })
 }
 
 /// What the thread owns. Fields drop in this order: children first.
 struct Discovery {
     wait_set: WaitSet,
-    readers: [BuiltinReader; 2],
+    readers: Vec<BuiltinReader>,
     known: HashMap<Guid, DiscoveredEndpoint>,
-    handler: DiscoveryHandler,
+    handler: SharedHandler,
+    graph: Option<Arc<Listener>>,
     participant: Arc<Participant>,
 }
 
 struct BuiltinReader {
     condition: Entity,
     reader: Entity,
-    /// What its samples describe.
-    kind: EndpointKind,
+    told: Told,
+}
+
+/// What the samples of a reader describe.
+#[derive(Clone, Copy)]
+enum Told {
+    Endpoint(EndpointKind),
+    Participant,
+}
+
+/// What one of them says.
+enum Change {
+    Endpoint(Guid, Option<Announcement>),
+    /// Its USER_DATA, if it is there.
+    Participant(Guid, Option<Vec<u8>>),
 }
 
 impl BuiltinReader {
-    fn new(participant: &Participant, kind: EndpointKind) -> Result<Self, String> {
-        let topic = match kind {
-            EndpointKind::Reader => DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
-            EndpointKind::Writer => DDS_BUILTIN_TOPIC_DCPSPUBLICATION,
+    fn new(participant: &Participant, told: Told) -> Result<Self, String> {
+        let topic: dds_entity_t = match told {
+            Told::Endpoint(EndpointKind::Reader) => DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
+            Told::Endpoint(EndpointKind::Writer) => DDS_BUILTIN_TOPIC_DCPSPUBLICATION,
+            Told::Participant => DDS_BUILTIN_TOPIC_DCPSPARTICIPANT,
         };
         // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
         let reader = Entity::new(unsafe {
             dds_create_reader(participant.entity().handle(), topic, std::ptr::null(), std::ptr::null())
         })?;
-        Ok(Self { condition: reader.read_condition()?, reader, kind })
+        Ok(Self { condition: reader.read_condition()?, reader, told })
     }
 
     /// Takes what there is, up to a batch; `None` for an endpoint that is not alive or cannot be bridged.
-    fn take(&self, changes: &mut Vec<(Guid, Option<Announcement>)>) -> Result<usize, String> {
+    fn take(&self, changes: &mut Vec<Change>) -> Result<usize, String> {
         let mut samples: [*mut c_void; BATCH] = [std::ptr::null_mut(); BATCH];
         let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
         // SAFETY: both arrays have room for a batch; null pointers ask for loans, given back below.
@@ -95,18 +136,31 @@ impl BuiltinReader {
         };
         check(taken)?;
         for (sample, info) in samples.iter().zip(&infos).take(taken as usize) {
-            // SAFETY: Cyclone filled the first `taken` of both arrays, and samples of these two topics are
-            // of this type.
-            let (endpoint, info) =
-                unsafe { (&*sample.cast::<dds_builtintopic_endpoint_t>(), info.assume_init_ref()) };
+            // SAFETY: Cyclone filled the first `taken` of both arrays.
+            let info = unsafe { info.assume_init_ref() };
             let alive = info.instance_state == dds_instance_state_DDS_IST_ALIVE;
             // A sample that only tells a change of state has a key and nothing else.
             if alive && !info.valid_data {
                 continue;
             }
-            // SAFETY: valid data has valid names and QoS while the loan lasts.
-            let announcement = if alive { unsafe { Announcement::read(self.kind, endpoint) } } else { None };
-            changes.push((Guid(endpoint.key.v), announcement));
+            changes.push(match self.told {
+                Told::Endpoint(kind) => {
+                    // SAFETY: samples of these two topics are of this type.
+                    let endpoint = unsafe { &*sample.cast::<dds_builtintopic_endpoint_t>() };
+                    // SAFETY: valid data has valid names and QoS while the loan lasts.
+                    let read = || unsafe { Announcement::read(kind, endpoint) };
+                    let announcement = if alive { read() } else { None };
+                    Change::Endpoint(Guid(endpoint.key.v), announcement)
+                }
+                Told::Participant => {
+                    // SAFETY: samples of this topic are of this type.
+                    let participant = unsafe { &*sample.cast::<dds_builtintopic_participant_t>() };
+                    let qos = participant.qos;
+                    // SAFETY: valid data has a valid QoS while the loan lasts; null is looked for.
+                    let data = (alive && !qos.is_null()).then(|| unsafe { qos::user_data(qos) });
+                    Change::Participant(Guid(participant.key.v), data)
+                }
+            });
         }
         if taken > 0 {
             // SAFETY: gives back the loans of the take above, once.
@@ -167,8 +221,11 @@ impl Discovery {
                         tracing::error!(reason, "reading DDS discovery failed");
                         0
                     });
-                    for (guid, announcement) in changes.drain(..) {
-                        self.apply(guid, announcement);
+                    for change in changes.drain(..) {
+                        match change {
+                            Change::Endpoint(guid, announcement) => self.apply(guid, announcement),
+                            Change::Participant(guid, data) => self.apply_participant(guid, data.as_deref()),
+                        }
                     }
                     if taken < BATCH {
                         break;
@@ -191,7 +248,7 @@ impl Discovery {
             return;
         }
         if self.known.remove(&guid).is_some() {
-            (self.handler)(DiscoveryEvent::Vanished { guid });
+            lock(&self.handler)(DiscoveryEvent::Vanished { guid });
         }
         let Some(endpoint) = endpoint else { return };
         if self.known.len() >= ENDPOINTS_MAX {
@@ -199,6 +256,16 @@ impl Discovery {
             return;
         }
         self.known.insert(guid, endpoint.clone());
-        (self.handler)(DiscoveryEvent::Appeared(endpoint));
+        lock(&self.handler)(DiscoveryEvent::Appeared(endpoint));
+    }
+
+    fn apply_participant(&self, guid: Guid, user_data: Option<&[u8]>) {
+        let Some(graph) = self.graph.as_ref().filter(|_| !self.participant.owns(&guid)) else { return };
+        match user_data {
+            // What SGC nodes say of the nodes that they stand for is for ROS 2, not for SGC nodes.
+            Some(data) if user_data::is_tagged(data) && self.participant.ignores_tagged() => {}
+            Some(data) => graph.change(|view| view.participant_there(guid, user_data::enclave(data))),
+            None => graph.change(|view| view.participant_gone(&guid)),
+        }
     }
 }

@@ -9,11 +9,10 @@
 //! `entity` or `serdata`, whose `Drop` gives it back, and no raw pointer leaves the crate.
 //!
 //! # Keyed topics
-//! The sertype of `cyclors` knows no keys: all samples of a keyed topic are one instance to Cyclone.
-//! Data of keyed topics flows both ways, and a writer can dispose and unregister; what is *not* there:
-//! disposals and unregistrations by remote writers are not reported (Cyclone keeps no key payload for
-//! them), and history is kept per topic rather than per instance, so it is made
-//! [`qos::KEYED_INSTANCES_KEPT`] times as deep to make up for it.
+//! The types of samples here know no keys: all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
+//! flows both ways, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
+//! hash of its key (Fast DDS may send one) does not. History is kept per topic rather than per
+//! instance, so it is made [`qos::KEYED_INSTANCES_KEPT`] times as deep to make up for it.
 
 #![allow(unsafe_code)]
 #![warn(clippy::undocumented_unsafe_blocks)]
@@ -21,17 +20,26 @@
 pub mod config;
 mod discovery;
 mod entity;
+mod graph;
+mod identified;
+pub mod identity;
+mod keyed;
+mod known_writers;
 mod log;
 mod network;
 pub mod payload;
 pub mod qos;
 mod reader;
+mod rpc;
 mod serdata;
+mod service;
 pub mod user_data;
 mod wait;
 mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
+pub use identified::unidentified_messages;
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
+pub use service::{CycloneClient, CycloneServer};
 pub use writer::CycloneWriter;

@@ -3,29 +3,39 @@
 //! Creates the domain and the participant, and hands them to readers, writers and discovery, which keep
 //! them alive as long as they need them. Moves no sample itself.
 
+use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread;
 
 use cyclors::{
     DDS_RETCODE_PRECONDITION_NOT_MET, cdds_create_blob_topic, dds_create_domain, dds_create_participant,
     dds_create_publisher, dds_create_subscriber, dds_domain_set_deafmute, dds_get_children,
 };
-use sgc_ros::{DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError, RosNetwork, SampleHandler};
+use sgc_ros::{
+    DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError, RosNetwork,
+    SampleHandler, ServiceSpec,
+};
 
-use crate::config::{DdsConfig, Instance, chooses_interfaces, cyclone_config, local_addresses};
-use crate::discovery;
+use crate::config::{
+    DdsConfig, Instance, PEERS_MAX, chooses_interfaces, cyclone_config, far_hosts, local_addresses,
+};
+use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, reason};
+use crate::graph::Announcer;
+use crate::keyed;
 use crate::log;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
+use crate::service::{CycloneClient, CycloneServer};
 use crate::user_data;
-use crate::wait::{Stop, join};
 use crate::writer::CycloneWriter;
 
 /// First of Cyclone's domain ids for networks that share a ROS domain with another of this process; far
 /// above every ROS domain id.
 const ALIAS_FIRST: u32 = 0x5347_0000;
+
+/// Any port will do to ask for a route; this is the first that a participant of domain 0 listens at (RTPS 2.5, 9.6.2.3).
+const DISCOVERY_PORT: u16 = 7410;
 
 /// Bound on what is read of a file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
@@ -38,7 +48,9 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 /// discovery only.
 #[derive(Debug)]
 pub struct CycloneNetwork {
-    discovery: Mutex<Option<(Arc<Stop>, thread::JoinHandle<()>)>>,
+    discovery: Mutex<Option<Running>>,
+    /// If the ROS graph is told of, both ways.
+    announcer: Option<Arc<Announcer>>,
     participant: Arc<Participant>,
 }
 
@@ -63,7 +75,8 @@ impl CycloneNetwork {
         let refused = |reason| RosError::Domain { domain: config.domain, reason };
         let domain = create_domain(config)?;
         let qos = NativeQos::new().map_err(refused)?;
-        qos.set_user_data(&user_data::build(config.tag.as_deref(), None));
+        let enclave = config.graph.then_some(user_data::DEFAULT_ENCLAVE);
+        qos.set_user_data(&user_data::of_participant(config.tag.as_deref(), enclave));
         // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
         let entity =
             Entity::new(unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) })
@@ -76,7 +89,9 @@ impl CycloneNetwork {
             domain_id: config.domain,
             tag: config.tag.clone(),
         };
-        Ok(Self { discovery: Mutex::new(None), participant: Arc::new(participant) })
+        let participant = Arc::new(participant);
+        let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
+        Ok(Self { discovery: Mutex::new(None), announcer: announcer.map(Arc::new), participant })
     }
 
     /// GUID of the participant; readers and writers made here share its first 12 bytes.
@@ -104,6 +119,8 @@ impl CycloneNetwork {
 impl RosNetwork for CycloneNetwork {
     type Reader = CycloneReader;
     type Writer = CycloneWriter;
+    type Client = CycloneClient;
+    type Server = CycloneServer;
 
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError> {
         let refused = |reason| RosError::Domain { domain: self.participant.domain_id, reason };
@@ -111,7 +128,8 @@ impl RosNetwork for CycloneNetwork {
         if running.is_some() {
             return Err(refused("discovery has been started already".into()));
         }
-        *running = Some(discovery::start(Arc::clone(&self.participant), handler).map_err(refused)?);
+        let (participant, announcer) = (Arc::clone(&self.participant), self.announcer.clone());
+        *running = Some(discovery::start(participant, handler, announcer).map_err(refused)?);
         Ok(())
     }
 
@@ -123,21 +141,40 @@ impl RosNetwork for CycloneNetwork {
     fn create_writer(&self, spec: &EndpointSpec) -> Result<CycloneWriter, RosError> {
         CycloneWriter::new(&self.participant, spec).map_err(|reason| refuse_endpoint("writer", spec, reason))
     }
+
+    fn create_client(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<CycloneClient, RosError> {
+        CycloneClient::new(&self.participant, spec, handler)
+            .map_err(|reason| refuse_endpoint("client", &spec.request, reason))
+    }
+
+    fn create_server(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<CycloneServer, RosError> {
+        CycloneServer::new(&self.participant, spec, handler)
+            .map_err(|reason| refuse_endpoint("server", &spec.request, reason))
+    }
+
+    fn reader_guid(&self, reader: &CycloneReader) -> Guid {
+        reader.guid()
+    }
+
+    fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
+        self.announcer.as_ref().map_or(Ok(()), |announcer| announcer.announce(nodes))
+    }
 }
 
 impl Drop for CycloneNetwork {
     fn drop(&mut self) {
-        let running = self.discovery.get_mut().unwrap_or_else(PoisonError::into_inner).take();
-        if let Some((stop, thread)) = running {
-            stop.request();
-            join(thread);
-        }
+        // Ends with its threads, before the participant.
+        drop(self.discovery.get_mut().unwrap_or_else(PoisonError::into_inner).take());
     }
 }
 
 impl Participant {
     pub(crate) fn entity(&self) -> &Entity {
         &self.entity
+    }
+
+    pub(crate) fn guid(&self) -> Guid {
+        self.guid
     }
 
     /// True if the endpoint belongs to this participant.
@@ -152,6 +189,9 @@ impl Participant {
 
     /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.
     pub(crate) fn topic(&self, spec: &EndpointSpec) -> Result<Entity, String> {
+        if !spec.keyless {
+            return keyed::topic(self, &spec.topic, &spec.type_name);
+        }
         let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
         // SAFETY: both strings are copied and, despite their type, not written to.
         Entity::new(unsafe {
@@ -181,12 +221,18 @@ impl Participant {
         .map(Some)
     }
 
-    /// The QoS of an endpoint, USER_DATA included.
-    pub(crate) fn endpoint_qos(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<NativeQos, String> {
+    /// The QoS of an endpoint, USER_DATA included, to which `more` elements are added.
+    pub(crate) fn endpoint_qos(
+        &self,
+        kind: EndpointKind,
+        spec: &EndpointSpec,
+        more: &str,
+    ) -> Result<NativeQos, String> {
         if let Some(hash) = spec.type_hash.as_deref().filter(|h| !user_data::is_value(h)) {
             return Err(format!("type hash {hash:?} cannot stand in USER_DATA"));
         }
-        let data = user_data::build(self.tag.as_deref(), spec.type_hash.as_deref());
+        let mut data = user_data::build(self.tag.as_deref(), spec.type_hash.as_deref());
+        data.extend_from_slice(more.as_bytes());
         NativeQos::endpoint(kind, &spec.qos, spec.keyless, &data)
     }
 }
@@ -209,8 +255,12 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
     let interfaces_chosen =
         config.cyclonedds_uri.as_deref().is_some_and(|uri| chooses_interfaces(uri, read_file));
     let host_addresses = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default());
+    // With one address there is nothing to choose.
+    let towards_peers =
+        if host_addresses.len() > 1 { addresses_towards(&config.static_peers) } else { Vec::new() };
     let process = std::process::id();
-    let mut instance = Instance { process, number, aliased: false, interfaces_chosen, host_addresses };
+    let mut instance =
+        Instance { process, number, aliased: false, interfaces_chosen, host_addresses, towards_peers };
     let refused = |reason| RosError::Domain { domain: config.domain, reason };
 
     for (id, aliased) in [(config.domain, false), (ALIAS_FIRST.wrapping_add(number & 0x00ff_ffff), true)] {
@@ -227,6 +277,22 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
         return Ok(Domain { entity: Entity::new(handle).map_err(refused)?, id });
     }
     Err(refused("the domain could not be created".into()))
+}
+
+/// The addresses from which this host would speak to others: of the route to each, which takes no packet.
+fn addresses_towards(peers: &[String]) -> Vec<Ipv4Addr> {
+    let mut found = Vec::new();
+    for host in far_hosts(peers).take(PEERS_MAX) {
+        let route = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))
+            .and_then(|socket| socket.connect((host, DISCOVERY_PORT)).and_then(|()| socket.local_addr()));
+        if let Ok(SocketAddr::V4(address)) = route
+            && !found.contains(address.ip())
+        {
+            found.push(*address.ip());
+        }
+    }
+    found.retain(|address| !address.is_loopback());
+    found
 }
 
 fn read_file(name: &str) -> Option<String> {

@@ -11,7 +11,11 @@ pub const PAYLOAD_BYTES_MAX: usize = 64 << 20;
 /// Length of the encapsulation header, bytes.
 pub const HEADER_BYTES: usize = 4;
 
-/// A payload cut into what Cyclone is given: a header of its own, the body, and zeros up to a multiple of four.
+/// Length of what may stand between the header and the body, bytes.
+pub const PREFIX_BYTES: usize = 16;
+
+/// A payload cut into what Cyclone is given: a header of its own, what stands in front of the body, the body, and
+/// zeros up to a multiple of four.
 ///
 /// Cyclone sends samples in multiples of four bytes. Given a sample of another length it reads on past the end of
 /// the buffer, and what it finds there goes onto the network.
@@ -19,6 +23,10 @@ pub const HEADER_BYTES: usize = 4;
 pub struct Frame<'a> {
     /// The encapsulation header, its two pad bits saying how many of the last bytes are padding.
     pub header: [u8; HEADER_BYTES],
+    /// Put in front of the body; a multiple of eight bytes, so that nothing in the body changes its alignment.
+    pub prefix: [u8; PREFIX_BYTES],
+    /// How many of those: none, or all.
+    pub prefix_bytes: usize,
     /// The body, untouched.
     pub body: &'a [u8],
     /// How many zero bytes to append, 0 to 3.
@@ -32,15 +40,34 @@ impl<'a> Frame<'a> {
     /// [`RosError::Payload`] if it is shorter than its header, longer than [`PAYLOAD_BYTES_MAX`] or of an
     /// encapsulation that no specification defines.
     pub fn new(payload: &'a [u8]) -> Result<Self, RosError> {
+        Self::with(payload, 0, |_| [0; PREFIX_BYTES])
+    }
+
+    /// The same with a prefix, which is made for big endian (`false`) or little endian (`true`), as the payload is.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_prefix(
+        payload: &'a [u8],
+        prefix: impl FnOnce(bool) -> [u8; PREFIX_BYTES],
+    ) -> Result<Self, RosError> {
+        Self::with(payload, PREFIX_BYTES, prefix)
+    }
+
+    fn with(
+        payload: &'a [u8],
+        prefix_bytes: usize,
+        prefix: impl FnOnce(bool) -> [u8; PREFIX_BYTES],
+    ) -> Result<Self, RosError> {
         let refused = RosError::Payload { bytes: payload.len() };
         let Some((&header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else { return Err(refused) };
         let pad = payload.len().wrapping_neg() & 3;
-        if payload.len() + pad > PAYLOAD_BYTES_MAX
+        if payload.len() + prefix_bytes + pad > PAYLOAD_BYTES_MAX
             || !is_encapsulation(u16::from_be_bytes([header[0], header[1]]))
         {
             return Err(refused);
         }
-        let mut frame = Self { header, body, pad };
+        let mut frame = Self { header, prefix: prefix(is_little_endian(header)), prefix_bytes, body, pad };
         if pad > 0 {
             // Bits set before said how an aligned payload was padded, so they mean nothing here.
             frame.header[3] = (frame.header[3] & !3) | pad as u8;
@@ -50,8 +77,13 @@ impl<'a> Frame<'a> {
 
     /// Length of header, body and padding, bytes: a multiple of four.
     pub fn bytes(&self) -> usize {
-        HEADER_BYTES + self.body.len() + self.pad
+        HEADER_BYTES + self.prefix_bytes + self.body.len() + self.pad
     }
+}
+
+/// The byte order of a payload: the encapsulation identifiers for little endian are the odd ones (RTPS 2.5, 10.2).
+pub fn is_little_endian(header: [u8; HEADER_BYTES]) -> bool {
+    header[1] & 1 == 1
 }
 
 /// Encapsulation identifiers: 0 to 4 of RTPS 2.5 table 10.1 (CDR, PL_CDR, XML), 6 to 11 of XTypes 1.3
@@ -67,7 +99,7 @@ mod tests {
     #[test]
     fn aligned_payloads_are_left_alone() {
         let frame = Frame::new(&[0, 1, 0, 2, 9, 9, 0, 0]).unwrap();
-        assert_eq!(frame, Frame { header: [0, 1, 0, 2], body: &[9, 9, 0, 0], pad: 0 });
+        assert_eq!((frame.header, frame.body, frame.pad), ([0, 1, 0, 2], &[9, 9, 0, 0][..], 0));
         assert_eq!(Frame::new(&[0, 1, 0, 0]).unwrap().bytes(), 4);
     }
 
@@ -78,6 +110,15 @@ mod tests {
             let frame = Frame::new(&payload).unwrap();
             assert_eq!((frame.pad, frame.header[3]), (pad, 0xf0 | pad as u8));
             assert_eq!(frame.bytes() % 4, 0);
+        }
+    }
+
+    #[test]
+    fn a_prefix_is_in_the_byte_order_of_its_payload() {
+        for (id, little) in [(0, false), (1, true), (6, false), (7, true)] {
+            let payload = [0, id, 0, 0, 5];
+            let frame = Frame::with_prefix(&payload, |found| [u8::from(found == little); 16]).unwrap();
+            assert_eq!((frame.prefix, frame.pad, frame.bytes()), ([1; 16], 3, 24));
         }
     }
 

@@ -9,13 +9,11 @@ use std::ffi::{CStr, CString, c_char, c_void};
 
 use cyclors::*;
 use sgc_ros::EndpointKind;
-use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
+// Cyclone is not told the keys and takes all samples of a keyed topic for one instance.
+pub use sgc_ros::KEYED_INSTANCES_KEPT;
+use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
 use crate::entity::{INFINITE, c_string};
-
-/// How many instances' worth of history is kept for a keyed topic, since Cyclone is not told the keys and
-/// takes all samples for one instance.
-pub const KEYED_INSTANCES_KEPT: u32 = 256;
 
 /// Deepest history kept by an endpoint made here, and what a reader that asks for all is given: Cyclone's
 /// own bound on a reader stops delivery to *every* reader of the domain while it is reached, so a handler
@@ -26,6 +24,10 @@ pub const HISTORY_DEPTH_MAX: u32 = 4096;
 /// How long a write waits for a reader that does not acknowledge, milliseconds. Only writers that keep all
 /// wait: one that keeps the last samples overwrites them, acknowledged or not.
 pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
+
+/// Data representations by their numbers (XTypes 1.3, 7.6.3.1.1).
+const XCDR1: i16 = DDS_DATA_REPRESENTATION_XCDR1 as i16;
+const XCDR2: i16 = DDS_DATA_REPRESENTATION_XCDR2 as i16;
 
 /// Cyclone's QoS object, deleted on drop.
 pub(crate) struct NativeQos(*mut dds_qos_t);
@@ -92,6 +94,7 @@ impl NativeQos {
             dds_qset_ignorelocal(native.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT);
         }
         native.set_user_data(user_data);
+        native.set_representations(kind, qos.representations);
         Ok(native)
     }
 
@@ -110,6 +113,17 @@ impl NativeQos {
             // SAFETY: pointer and length are those of a slice, which is copied.
             unsafe { dds_qset_userdata(self.0, user_data.as_ptr().cast(), user_data.len()) };
         }
+    }
+
+    /// A writer offers one: XCDR2 if nothing else will do.
+    fn set_representations(&self, kind: EndpointKind, representations: Representations) {
+        let ids: &[i16] = match (kind, representations) {
+            (EndpointKind::Reader, Representations::BOTH) => &[XCDR1, XCDR2],
+            (_, all) if all.written() == Representations::XCDR2 => &[XCDR2],
+            _ => &[XCDR1],
+        };
+        // SAFETY: the object is valid, and the ids are copied.
+        unsafe { dds_qset_data_representation(self.0, ids.len() as u32, ids.as_ptr()) };
     }
 
     pub(crate) fn as_ptr(&self) -> *const dds_qos_t {
@@ -215,7 +229,33 @@ pub(crate) unsafe fn discovered(kind: EndpointKind, qos: *const dds_qos_t) -> Op
         lease_ns: finite(lease),
         // SAFETY: as above.
         partitions: unsafe { partitions(qos) }?,
+        // SAFETY: as above.
+        representations: unsafe { representations(kind, qos) },
     })
+}
+
+/// What an endpoint takes or offers: of a writer's list the first entry counts (XTypes 1.3, 7.6.3.1.1).
+///
+/// # Safety
+/// `qos` must be a valid QoS object.
+unsafe fn representations(kind: EndpointKind, qos: *const dds_qos_t) -> Representations {
+    let (mut n, mut values) = (0_u32, std::ptr::null_mut::<dds_data_representation_id_t>());
+    // SAFETY: `qos` is valid by contract; on success `values` is an array of `n` numbers that is ours to free.
+    if !unsafe { dds_qget_data_representation(qos, &mut n, &mut values) } || values.is_null() {
+        return Representations::default();
+    }
+    let looked_at = if kind == EndpointKind::Writer { n.min(1) } else { n };
+    // SAFETY: the array has at least that many entries.
+    let ids = unsafe { std::slice::from_raw_parts(values, looked_at as usize) };
+    let known = ids.iter().filter_map(|id| match *id {
+        XCDR1 => Some(Representations::XCDR1),
+        XCDR2 => Some(Representations::XCDR2),
+        _ => None,
+    });
+    let all = known.reduce(Representations::or).unwrap_or_default();
+    // SAFETY: allocated by the getter for the caller, freed once.
+    unsafe { dds_free(values.cast()) };
+    all
 }
 
 /// # Safety
@@ -302,6 +342,7 @@ mod tests {
                         liveliness,
                         lease_ns: Some(3_000_000),
                         partitions: vec![],
+                        representations: Representations::XCDR2,
                     };
                     assert_eq!(round_trip(EndpointKind::Writer, &qos, true), qos);
                 }

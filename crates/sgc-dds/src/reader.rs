@@ -3,32 +3,24 @@
 //! The thread sleeps in a wait set, takes serialised samples by reference and calls the handler, which may
 //! block: then samples gather in this reader's own history, and no other reader waits.
 
-use std::collections::HashMap;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 use std::thread;
 
-use cyclors::{
-    DDS_ANY_STATE, dds_builtintopic_free_endpoint, dds_create_reader, dds_get_matched_publication_data,
-    dds_instance_handle_t, dds_sample_info_t, dds_takecdr, ddsi_serdata,
-};
-use sgc_ros::{EndpointKind, EndpointSpec, Guid, Sample, SampleHandler, SampleKind};
+use cyclors::{DDS_ANY_STATE, dds_create_reader, dds_sample_info_t, dds_takecdr, ddsi_serdata};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid, Sample, SampleHandler};
 use sgc_wire::History;
 
 use crate::entity::{Entity, check};
+use crate::known_writers::KnownWriters;
 use crate::network::Participant;
 use crate::payload::HEADER_BYTES;
-use crate::qos;
 use crate::serdata::Serdata;
-use crate::user_data;
 use crate::wait::{Stop, WaitSet, join};
 
 /// Most samples taken at once. A reader of smaller depth takes no more than its depth, so that a handler
 /// that blocks is not followed by a backlog of samples that history has replaced.
 const BATCH: usize = 16;
-
-/// Bound on the writers whose GUID is remembered.
-const WRITERS_MAX: usize = 1024;
 
 /// A raw reader; dropping it ends its thread, waits for a handler that is at work, and deletes the entities.
 #[derive(Debug)]
@@ -44,7 +36,7 @@ impl CycloneReader {
         spec: &EndpointSpec,
         handler: SampleHandler,
     ) -> Result<Self, String> {
-        let qos = participant.endpoint_qos(EndpointKind::Reader, spec)?;
+        let qos = participant.endpoint_qos(EndpointKind::Reader, spec, "")?;
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Reader, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
@@ -69,7 +61,7 @@ impl CycloneReader {
             stop: Arc::clone(&stop),
             participant: Arc::clone(participant),
             batch,
-            writers: HashMap::new(),
+            writers: KnownWriters::default(),
             handler,
         };
         let thread = thread::Builder::new()
@@ -94,14 +86,6 @@ impl Drop for CycloneReader {
     }
 }
 
-/// Who wrote a sample.
-#[derive(Clone, Copy)]
-struct KnownWriter {
-    guid: Guid,
-    /// True if it carries a tag: an SGC proxy made it, this one's or another's.
-    tagged: bool,
-}
-
 /// What the thread owns. Fields drop in this order: children first.
 struct Service {
     wait_set: WaitSet,
@@ -112,7 +96,7 @@ struct Service {
     stop: Arc<Stop>,
     participant: Arc<Participant>,
     batch: usize,
-    writers: HashMap<dds_instance_handle_t, KnownWriter>,
+    writers: KnownWriters,
     handler: SampleHandler,
 }
 
@@ -186,49 +170,24 @@ impl Service {
         if !info.valid_data {
             return None;
         }
-        let writer = self.writer(info.publication_handle);
+        let writer = self.writers.find(&self.reader, info.publication_handle);
         // DDS matches readers with writers of other proxies on this network too. What those wrote came
         // through SGC already: sharing it again would send it round and round.
         if writer.is_some_and(|w| w.tagged) && self.participant.ignores_tagged() {
             return None;
         }
+        let kind = sample.kind();
         let payload = sample.into_payload();
         if payload.len() < HEADER_BYTES {
             tracing::debug!(bytes = payload.len(), "a sample without encapsulation header is dropped");
             return None;
         }
         Some(Sample {
-            kind: SampleKind::Write,
+            kind,
             writer: writer.map(|w| w.guid),
             source_timestamp_ns: info.source_timestamp,
             payload,
             more: false,
         })
-    }
-
-    /// Who a writer is; `None` if it is gone already and was never asked for.
-    fn writer(&mut self, handle: dds_instance_handle_t) -> Option<KnownWriter> {
-        if let Some(writer) = self.writers.get(&handle) {
-            return Some(*writer);
-        }
-        // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
-        let data = unsafe { dds_get_matched_publication_data(self.reader.handle(), handle) };
-        // SAFETY: null or valid, see above.
-        let endpoint = unsafe { data.as_ref() }?;
-        let guid = Guid(endpoint.key.v);
-        let tagged = if endpoint.qos.is_null() {
-            false
-        } else {
-            // SAFETY: not null, and valid as long as the endpoint is.
-            user_data::is_tagged(&unsafe { qos::user_data(endpoint.qos) })
-        };
-        // SAFETY: not null, not used any more, freed once.
-        unsafe { dds_builtintopic_free_endpoint(data) };
-        if self.writers.len() >= WRITERS_MAX {
-            self.writers.clear();
-        }
-        let writer = KnownWriter { guid, tagged };
-        self.writers.insert(handle, writer);
-        Some(writer)
     }
 }

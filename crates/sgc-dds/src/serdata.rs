@@ -8,11 +8,14 @@ use std::ffi::c_void;
 
 use bytes::Bytes;
 use cyclors::{
-    ddsi_serdata, ddsi_serdata_from_ser_iov, ddsi_serdata_kind_SDK_DATA, ddsi_serdata_kind_SDK_KEY,
-    ddsi_serdata_size, ddsi_serdata_to_ser_ref, ddsi_serdata_to_ser_unref, ddsi_serdata_unref, ddsi_sertype,
-    ddsrt_iovec_t,
+    DDSI_STATUSINFO_DISPOSE, ddsi_serdata, ddsi_serdata_from_ser_iov, ddsi_serdata_kind_SDK_DATA,
+    ddsi_serdata_kind_SDK_KEY, ddsi_serdata_size, ddsi_serdata_to_ser_ref, ddsi_serdata_to_ser_unref,
+    ddsi_serdata_unref, ddsi_sertype, ddsrt_iovec_t,
 };
 
+use sgc_ros::SampleKind;
+
+use crate::keyed;
 use crate::payload::Frame;
 
 /// One reference to a sample.
@@ -46,7 +49,12 @@ impl Serdata {
             iov_base: bytes.as_ptr().cast_mut().cast::<c_void>(),
             iov_len: bytes.len(),
         };
-        let pieces = [piece(&frame.header), piece(frame.body), piece(&ZEROS[..frame.pad])];
+        let pieces = [
+            piece(&frame.header),
+            piece(&frame.prefix[..frame.prefix_bytes]),
+            piece(frame.body),
+            piece(&ZEROS[..frame.pad]),
+        ];
         let kind = if key_only { ddsi_serdata_kind_SDK_KEY } else { ddsi_serdata_kind_SDK_DATA };
         // SAFETY: the sertype is valid by contract; the pieces are slices that live through the call, are
         // only read, and add up to the size given.
@@ -61,6 +69,17 @@ impl Serdata {
         unsafe {
             (*self.0).timestamp.v = source_timestamp_ns;
             (*self.0).statusinfo = statusinfo;
+        }
+    }
+
+    /// What a received sample says of its instance.
+    pub(crate) fn kind(&self) -> SampleKind {
+        // SAFETY: valid while the reference is held.
+        let (status, key_only) = unsafe { ((*self.0).statusinfo, keyed::is_key_only(self.0)) };
+        match key_only {
+            true if status & DDSI_STATUSINFO_DISPOSE != 0 => SampleKind::Dispose,
+            true => SampleKind::Unregister,
+            false => SampleKind::Write,
         }
     }
 

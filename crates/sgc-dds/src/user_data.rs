@@ -1,10 +1,15 @@
 //! The USER_DATA of endpoints: `key=value;` elements, as rmw writes them.
 //!
-//! Pure. Two keys matter here: `typehash` (REP 2016, written by rmw from Iron on) and `sgc`, by which
-//! SGC nodes know each other's endpoints and keep out of loops.
+//! Pure. Three keys matter here: `typehash` (REP 2016, written by rmw from Iron on) of endpoints, `enclave` of
+//! participants, and `sgc` of both, by which SGC nodes know each other's endpoints and keep out of loops.
 
 const TAG_KEY: &str = "sgc";
 const TYPE_HASH_KEY: &str = "typehash";
+const ENCLAVE_KEY: &str = "enclave";
+
+/// The enclave of a participant without security, of which every rmw wants to know: it takes no participant for one of
+/// ROS 2 that names none.
+pub const DEFAULT_ENCLAVE: &str = "/";
 
 /// Bound on one value, bytes.
 pub const VALUE_BYTES_MAX: usize = 128;
@@ -20,8 +25,17 @@ pub fn is_value(text: &str) -> bool {
 
 /// The USER_DATA of an endpoint made here. The caller has checked both values with [`is_value`].
 pub fn build(tag: Option<&str>, type_hash: Option<&str>) -> Vec<u8> {
+    joined([(TAG_KEY, tag), (TYPE_HASH_KEY, type_hash)])
+}
+
+/// The USER_DATA of a participant made here; the same holds for its values.
+pub fn of_participant(tag: Option<&str>, enclave: Option<&str>) -> Vec<u8> {
+    joined([(ENCLAVE_KEY, enclave), (TAG_KEY, tag)])
+}
+
+fn joined(elements: [(&str, Option<&str>); 2]) -> Vec<u8> {
     let mut text = String::new();
-    for (key, value) in [(TAG_KEY, tag), (TYPE_HASH_KEY, type_hash)] {
+    for (key, value) in elements {
         if let Some(value) = value {
             text.push_str(key);
             text.push('=');
@@ -46,6 +60,12 @@ pub fn type_hash(user_data: &[u8]) -> Option<String> {
         .map(str::to_owned)
 }
 
+/// The enclave of a participant, if it names one: then it is one of ROS 2.
+pub fn enclave(user_data: &[u8]) -> Option<&str> {
+    let (_, value) = elements(user_data).find(|(key, _)| *key == ENCLAVE_KEY.as_bytes())?;
+    std::str::from_utf8(value).ok()
+}
+
 fn elements(user_data: &[u8]) -> impl Iterator<Item = (&[u8], &[u8])> {
     let bounded = &user_data[..user_data.len().min(USER_DATA_BYTES_MAX)];
     bounded.split(|b| *b == b';').filter_map(|element| {
@@ -65,6 +85,11 @@ mod tests {
         assert!(is_tagged(&data));
         assert_eq!(type_hash(&data).as_deref(), Some("RIHS01_ab"));
         assert!(build(None, None).is_empty());
+        let participant = of_participant(Some("arm-1"), Some(DEFAULT_ENCLAVE));
+        assert_eq!(participant, b"enclave=/;sgc=arm-1;");
+        assert!(is_tagged(&participant));
+        assert_eq!((enclave(&participant), enclave(&data)), (Some("/"), None));
+        assert_eq!(enclave(b"enclave=\xff;"), None);
     }
 
     #[test]

@@ -5,9 +5,10 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use cyclors::{
-    dds_create_guardcondition, dds_create_waitset, dds_set_guardcondition, dds_waitset_attach,
+    dds_create_guardcondition, dds_create_waitset, dds_entity_t, dds_set_guardcondition, dds_waitset_attach,
     dds_waitset_wait,
 };
 
@@ -88,4 +89,21 @@ pub(crate) fn join(thread: JoinHandle<()>) {
     if thread.join().is_err() {
         tracing::error!("a DDS thread ended by a panic of its handler");
     }
+}
+
+/// Sleeps until a status of one of these entities changes that its mask lets through, or that long.
+pub(crate) fn wait_for_status(
+    participant: &Participant,
+    entities: &[dds_entity_t],
+    longest: Duration,
+) -> Result<(), String> {
+    // SAFETY: takes a number, checked by Cyclone.
+    let set = Entity::new(unsafe { dds_create_waitset(participant.entity().handle()) })?;
+    for entity in entities {
+        // SAFETY: takes numbers only; handles are checked by Cyclone, the attachment is opaque to it.
+        check(unsafe { dds_waitset_attach(set.handle(), *entity, 0) })?;
+    }
+    let longest = i64::try_from(longest.as_nanos()).unwrap_or(INFINITE);
+    // SAFETY: no attachments are asked for, so the null pointer with length 0 is not written to.
+    check(unsafe { dds_waitset_wait(set.handle(), std::ptr::null_mut(), 0, longest) })
 }

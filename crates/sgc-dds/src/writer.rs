@@ -4,17 +4,17 @@
 //! thread of Cyclone's or of an async runtime.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use cyclors::{
     DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_create_writer,
     dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
-    dds_publication_matched_status,
+    dds_publication_matched_status, dds_wait_for_acks,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleKind};
 
-use crate::entity::{Entity, check, reason};
+use crate::entity::{Entity, INFINITE, check, reason};
 use crate::network::Participant;
 use crate::payload::Frame;
 use crate::serdata::Serdata;
@@ -39,7 +39,7 @@ pub struct CycloneWriter {
 
 impl CycloneWriter {
     pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
-        let qos = participant.endpoint_qos(EndpointKind::Writer, spec)?;
+        let qos = participant.endpoint_qos(EndpointKind::Writer, spec, "")?;
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
@@ -65,6 +65,10 @@ impl CycloneWriter {
 }
 
 impl RosWriter for CycloneWriter {
+    fn guid(&self) -> Guid {
+        self.guid
+    }
+
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
         let failed = |reason: String| RosError::Write { reason };
         let frame = Frame::new(&payload)?;
@@ -98,6 +102,12 @@ impl RosWriter for CycloneWriter {
             ret if ret < 0 => Err(failed(reason(ret))),
             _ => Ok(()),
         }
+    }
+
+    fn wait_acknowledged(&self, max: Duration) -> bool {
+        let ns = i64::try_from(max.as_nanos()).unwrap_or(INFINITE);
+        // SAFETY: takes numbers; the handle is checked by Cyclone.
+        unsafe { dds_wait_for_acks(self.writer.handle(), ns) >= 0 }
     }
 
     fn matched_readers(&self) -> u32 {

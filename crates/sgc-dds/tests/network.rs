@@ -10,11 +10,12 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
+use sgc_ros::graph::{GidBytes, decode_nodes, encode_nodes, graph_reader, graph_writer};
 use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosError, RosNetwork, RosWriter,
-    Sample, SampleKind,
+    DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, RosError, RosNetwork,
+    RosWriter, Sample, SampleKind,
 };
-use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
+use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations, RosNode};
 
 /// Longest wait for an event, far beyond what any takes.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -174,6 +175,7 @@ fn discovery_tells_name_type_hash_and_full_qos_and_the_end() {
         liveliness: Liveliness::ManualByTopic,
         lease_ns: Some(2_000_000_000),
         partitions: vec!["left".into(), "right".into()],
+        representations: Representations::XCDR2,
     };
     let writer_spec = EndpointSpec { type_hash: Some(hash.clone()), qos: qos.clone(), ..spec("chatter") };
     let writer = ros.create_writer(&writer_spec).unwrap();
@@ -558,23 +560,35 @@ fn payloads_outlive_reader_and_network() {
 }
 
 #[test]
-fn keyed_data_passes_in_both_directions_and_disposals_can_be_written() {
+fn keyed_data_passes_in_both_directions_and_so_does_the_end_of_instances() {
     let (ros, sgc) = (open(88, None), open(88, Some("arm-1")));
     let keyed = |topic| EndpointSpec { keyless: false, ..spec(topic) };
-    let (_r1, from_sgc) = read(&ros, &with(keyed("k"), |q| q.history = History::KeepLast(1)));
-    let w1 = writer(&sgc, &with(keyed("k"), |q| q.history = History::KeepLast(1)), 1);
-    for i in 0..100 {
-        write(&w1, &string_cdr(&i.to_string()));
-    }
-    for i in 0..100 {
-        let sample = next(&from_sgc);
-        assert_eq!(sample.payload, padded(&string_cdr(&i.to_string())), "instances are not told apart");
-    }
-    for kind in [SampleKind::Dispose, SampleKind::Unregister] {
-        w1.write(kind, 0, string_cdr("1")).unwrap();
-        write(&w1, &string_cdr("again"));
-        let sample = next(&from_sgc);
-        assert_eq!((sample.kind, sample.payload), (SampleKind::Write, padded(&string_cdr("again")).into()));
+    for (topic, from, to) in [("k0", &sgc, &ros), ("k1", &ros, &sgc)] {
+        let (_reader, samples) = read(to, &with(keyed(topic), |q| q.history = History::KeepLast(1)));
+        let writer = writer(from, &with(keyed(topic), |q| q.history = History::KeepLast(1)), 1);
+        for i in 0..100 {
+            write(&writer, &string_cdr(&i.to_string()));
+        }
+        for i in 0..100 {
+            let sample = next(&samples);
+            assert_eq!(sample.payload, padded(&string_cdr(&i.to_string())), "instances are not told apart");
+        }
+        // Each in its place, with its key.
+        let said = [
+            (SampleKind::Dispose, "1"),
+            (SampleKind::Write, "again"),
+            (SampleKind::Unregister, "a longer key than sixteen bytes"),
+            (SampleKind::Dispose, "never written"),
+            (SampleKind::Write, "last"),
+        ];
+        for (kind, text) in said {
+            writer.write(kind, 77, string_cdr(text)).unwrap();
+        }
+        for (kind, text) in said {
+            let sample = next(&samples);
+            assert_eq!((sample.kind, &sample.payload[..]), (kind, &padded(&string_cdr(text))[..]));
+            assert_eq!(sample.source_timestamp_ns, 77);
+        }
     }
 
     // A keyless reader is no match for a keyed writer.
@@ -673,4 +687,91 @@ fn the_users_configuration_overrides_ours() {
     let shown = ros.create_writer(&spec("shown")).unwrap();
     assert_eq!(appeared(&events).guid, shown.guid());
     quiet(&events);
+}
+
+fn open_graph(domain: u32, tag: Option<&str>) -> CycloneNetwork {
+    CycloneNetwork::open(&DdsConfig { graph: true, ..config(domain, tag) }).unwrap()
+}
+
+fn graph_node(name: &str, readers: &[Guid], writers: &[Guid]) -> GraphNode {
+    let node = RosNode::new("/robot", name, None).unwrap();
+    GraphNode { node, readers: readers.to_vec(), writers: writers.to_vec() }
+}
+
+/// The next event about nodes, past those about endpoints.
+fn nodes(events: &Receiver<DiscoveryEvent>) -> (Guid, Vec<GraphNode>) {
+    loop {
+        if let DiscoveryEvent::Nodes { participant, nodes } = next(events) {
+            return (participant, nodes);
+        }
+    }
+}
+
+#[test]
+fn nodes_and_their_endpoints_are_told_and_gone_with_their_participant() {
+    let (ros, sgc) = (open_graph(96, None), open_graph(96, Some("arm-1")));
+    let events = discover(&sgc);
+    let talker = ros.create_writer(&spec("chatter")).unwrap();
+    let announced = [graph_node("talker", &[], &[talker.guid()])];
+    ros.announce(&announced).unwrap();
+    assert_eq!(nodes(&events), (ros.guid(), announced.to_vec()));
+    ros.announce(&[]).unwrap();
+    assert_eq!(nodes(&events), (ros.guid(), vec![]));
+    ros.announce(&announced).unwrap();
+    assert_eq!(nodes(&events).1.len(), 1);
+    let participant = ros.guid();
+    drop((talker, ros));
+    assert_eq!(nodes(&events), (participant, vec![]));
+    // Who comes late is told what there is, but nothing of what is another participant's.
+    let ros = open_graph(96, None);
+    ros.announce(&announced).unwrap();
+    let late = open_graph(96, Some("late"));
+    assert_eq!(nodes(&discover(&late)), (ros.guid(), vec![graph_node("talker", &[], &[])]));
+}
+
+#[test]
+fn what_proxies_announce_is_for_ros_and_not_for_other_proxies() {
+    let (ros, sgc, other) =
+        (open_graph(97, None), open_graph(97, Some("arm-1")), open_graph(97, Some("arm-2")));
+    let (seen, other_seen) = (discover(&ros), discover(&other));
+    let mirrored = sgc.create_writer(&spec("chatter")).unwrap();
+    sgc.announce(&[graph_node("talker", &[], &[mirrored.guid()])]).unwrap();
+    let told = nodes(&seen);
+    assert_eq!((told.0, &told.1[0].writers[..]), (sgc.guid(), &[mirrored.guid()][..]));
+    // Beside it a node of ROS, which every proxy hears of.
+    ros.announce(&[graph_node("local", &[], &[])]).unwrap();
+    assert_eq!(nodes(&other_seen).0, ros.guid());
+    // Switched off, a participant neither tells nor hears.
+    let off = open(97, Some("arm-3"));
+    let off_seen = discover(&off);
+    off.announce(&[graph_node("x", &[], &[])]).unwrap();
+    ros.announce(&[graph_node("local", &[], &[]), graph_node("second", &[], &[])]).unwrap();
+    assert_eq!(nodes(&other_seen).1.len(), 2);
+    assert!(!off_seen.try_iter().any(|event| matches!(event, DiscoveryEvent::Nodes { .. })));
+}
+
+#[test]
+fn ids_are_as_long_as_those_of_the_network() {
+    let sgc = open_graph(98, Some("arm-1"));
+    let events = discover(&sgc);
+    sgc.announce(&[graph_node("talker", &[], &[])]).unwrap();
+    // A plain participant that reads and writes the topic itself, as an older ROS 2 would.
+    let old = open(98, None);
+    let (_reader, said) = read(&old, &graph_reader());
+    let heard = || decode_nodes(&next(&said).payload).unwrap();
+    assert_eq!(heard().gid_bytes, GidBytes::Sixteen);
+    let writer = writer(&old, &graph_writer(), 1);
+    write(&writer, &encode_nodes(&old.guid(), &[graph_node("old", &[], &[])], GidBytes::TwentyFour));
+    assert_eq!(nodes(&events).0, old.guid());
+    let again = heard();
+    assert_eq!(
+        (again.gid_bytes, again.participant, again.nodes.len()),
+        (GidBytes::TwentyFour, sgc.guid(), 1)
+    );
+    // What nobody can read, or is about somebody else, changes nothing.
+    write(&writer, &Bytes::from_static(&[0, 1, 0, 0, 1, 2, 3, 4]));
+    write(&writer, &encode_nodes(&sgc.guid(), &[graph_node("forged", &[], &[])], GidBytes::Sixteen));
+    write(&writer, &encode_nodes(&old.guid(), &[graph_node("new", &[], &[])], GidBytes::Sixteen));
+    assert_eq!(nodes(&events).1[0].node.name(), "new");
+    assert_eq!(heard().gid_bytes, GidBytes::Sixteen);
 }

@@ -256,6 +256,8 @@ pub struct Endpoint {
     pub(crate) followed: BTreeMap<Name, NodeId>,
     pub(crate) followed_names: BTreeMap<NodeId, String>,
     pub(crate) catalogue_dirty: bool,
+    /// Until when what changes in the catalogue is gathered.
+    pub(crate) catalogue_rests: Option<Instant>,
     pub(crate) unadvertised: BTreeSet<Blind>,
     pub(crate) withdrawn: BTreeSet<Blind>,
     advert_seq: u64,
@@ -289,6 +291,7 @@ impl Endpoint {
             followed: BTreeMap::new(),
             followed_names: BTreeMap::new(),
             catalogue_dirty: false,
+            catalogue_rests: None,
             withdrawn: BTreeSet::new(),
             advert_seq: 0,
             renew_at: None,
@@ -352,6 +355,10 @@ impl Endpoint {
             Control::LinkState { .. } => self.unexpected("link state"),
             Control::Query { .. } => self.unexpected("query"),
             Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
+            Control::Pulse { .. } => self.unexpected("pulse"),
+            Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
+                self.unexpected("lane");
+            }
         }
     }
 
@@ -378,9 +385,8 @@ impl Endpoint {
         }
         self.outputs.pop_front().unwrap_or_else(|| {
             let joins = self.joins.values().filter_map(Join::deadline);
-            Output::Timeout(
-                joins.chain(self.renew_at).chain(self.enforce_at).chain(self.rotation_deadline()).min(),
-            )
+            let own = [self.renew_at, self.enforce_at, self.rotation_deadline(), self.catalogue_deadline()];
+            Output::Timeout(joins.chain(own.into_iter().flatten()).min())
         })
     }
 

@@ -132,6 +132,22 @@ impl History {
         }
     }
 
+    /// Lets go what was dated before `ns`, up to the first that was not: messages of one publisher are dated in turn. What has
+    /// no date stays, marks go too.
+    pub(crate) fn expire(&mut self, ns: i64) {
+        while let Some(first) = self.kept.front()
+            && (first.is_mark() || (1..ns).contains(&first.head.source_timestamp_ns))
+            && self.kept.iter().any(|m| !m.is_mark())
+        {
+            for tail in [&mut self.late, &mut self.recent] {
+                if tail.from <= first.seq && tail.numbers > 0 {
+                    tail.drop_first(first);
+                }
+            }
+            self.kept.pop_front();
+        }
+    }
+
     /// Where the history for late joiners begins: the next number if there is none.
     pub(crate) fn late_from(&self) -> u64 {
         self.late.from
@@ -161,6 +177,8 @@ impl History {
 
 #[cfg(test)]
 mod tests {
+    use sgc_wire::PayloadEncoding;
+
     use super::*;
 
     fn history(depth: usize, bytes_max: usize, messages_max: usize, recovery_bytes_max: usize) -> History {
@@ -169,7 +187,7 @@ mod tests {
 
     fn push(history: &mut History, kind: MessageKind, bytes: usize) {
         let seq = history.newest().map_or(history.oldest(), |m| m.seq + 1);
-        let head = MessageHead { kind, source_timestamp_ns: 0 };
+        let head = MessageHead { kind, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
         history.push(Kept { seq, head, payload: vec![0; bytes].into() });
     }
 
@@ -219,12 +237,41 @@ mod tests {
     }
 
     #[test]
+    fn what_has_expired_goes_and_what_came_after_it_stays() {
+        let mut history = history(3, 10_000, 5, 10_000);
+        for n in 1..=6_i64 {
+            let kind = if n == 2 { MessageKind::Mark } else { MessageKind::Write };
+            let head = MessageHead {
+                kind,
+                encoding: Default::default(),
+                source_timestamp_ns: if n == 2 { 0 } else { n * 10 },
+            };
+            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+        }
+        assert_eq!((history.late_from(), history.oldest()), (4, 2));
+        history.expire(35);
+        assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (4, 4, vec![4, 5, 6]));
+        history.expire(55);
+        assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (6, 6, vec![6]));
+        history.expire(i64::MAX);
+        assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (7, 7, 0));
+        let head =
+            MessageHead { kind: MessageKind::Write, encoding: Default::default(), source_timestamp_ns: 70 };
+        history.push(Kept { seq: 7, head, payload: vec![0; 8].into() });
+        assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (7, 7, vec![7]));
+    }
+
+    #[test]
     fn without_a_purpose_nothing_is_kept() {
         let mut history = history(0, 1000, 0, 0);
         for n in 1..4 {
             history.push(Kept {
                 seq: n,
-                head: MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 },
+                head: MessageHead {
+                    kind: MessageKind::Write,
+                    encoding: PayloadEncoding::Plain,
+                    source_timestamp_ns: 0,
+                },
                 payload: Bytes::from_static(b"x"),
             });
             assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (n + 1, n + 1, 0));

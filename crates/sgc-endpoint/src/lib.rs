@@ -9,6 +9,8 @@
 //! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
+mod calls;
+mod compression;
 mod endpoint;
 mod history;
 mod joiner;
@@ -21,6 +23,11 @@ mod shares;
 mod sink;
 mod source;
 
+pub use calls::{
+    ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallRefused, CallStats,
+    Caller, Outcome,
+};
+pub use compression::{COMPRESS_BYTES_MIN, CompressionError, Compressor, Decompressor};
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
 pub use history::{RECOVERY_BYTES_MAX, RECOVERY_MESSAGES_MAX, RecoveryLimits};
 pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};

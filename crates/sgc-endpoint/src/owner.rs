@@ -3,14 +3,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
-    Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueSource, Control, Credentials,
-    Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos, Recover, RefuseReason, Request,
-    Role, SEALED_BYTES_MAX, Signed, SinkId, TopicGrant,
+    Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Control,
+    Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos, Recover,
+    RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
 };
 
 use crate::endpoint::{Dropped, Endpoint, Event};
@@ -20,6 +20,9 @@ use crate::{SinkProgress, SourceProgress};
 /// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
 /// epochs whose packets are still under way.
 const EPOCHS_AHEAD_MAX: u32 = 3;
+
+/// How long changes of the catalogue are gathered after it was sent.
+const CATALOGUE_REST: Duration = Duration::from_millis(100);
 
 impl Endpoint {
     /// Shares an interface under the name that its metadata gives with the newest secret.
@@ -120,9 +123,24 @@ impl Endpoint {
         self.catalogue_dirty = true;
     }
 
+    /// Who publishes on a share: by source, the sink that what is for it is addressed to.
+    pub fn publishers(&self, name: &Name) -> BTreeMap<SourceId, SinkId> {
+        let sinks = self.shares.shares.get(name).into_iter().flat_map(|share| &share.sinks);
+        let publishers = sinks.filter_map(|(sink, granted)| match &granted.request {
+            Request::Publish { offer } => Some((offer.source, *sink)),
+            Request::Subscribe { .. } | Request::Renew { .. } => None,
+        });
+        publishers.collect()
+    }
+
     /// The key of a share, for its sources.
     pub fn share_grant(&self, name: &Name) -> Option<TopicGrant> {
         self.shares.shares.get(name).map(|s| s.grant(&s.epoch, None))
+    }
+
+    /// True if the type of a share has a key, so that each of its instances has a history.
+    pub fn is_keyed(&self, name: &Name) -> bool {
+        self.shares.shares.get(name).is_some_and(|s| !s.spec.keyless)
     }
 
     /// Begins a new epoch of a share.
@@ -145,6 +163,7 @@ impl Endpoint {
         }
         self.renew_at = None;
         self.enforce_at = None;
+        self.catalogue_rests = None;
     }
 
     /// Answers [`Event::RenewAsked`], once or again when something changed.
@@ -324,6 +343,15 @@ impl Endpoint {
         self.tell_own(name);
     }
 
+    /// Who publishes is told to all that hear them: those of a service are heard by this node alone.
+    fn publishers_changed(&mut self, name: Name) {
+        if self.shares.shares.get(&name).is_some_and(Share::is_service) {
+            self.tell_own(name);
+        } else {
+            self.regrant(name);
+        }
+    }
+
     fn grant_again(&mut self, name: Name, sink: SinkId) {
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         let Some(granted) = share.sinks.get_mut(&sink) else { return };
@@ -359,11 +387,20 @@ impl Endpoint {
         }
     }
 
-    /// Sends each follower its catalogue if what it may see changed.
+    /// When followers are to be told what changed meanwhile.
+    pub(crate) fn catalogue_deadline(&self) -> Option<Instant> {
+        self.catalogue_rests.filter(|_| self.catalogue_dirty)
+    }
+
+    /// Sends each follower its catalogue if what it may see changed, at once the first time and then after a while: a
+    /// network that starts makes hundreds of changes.
     pub(crate) fn tell_followers(&mut self) {
-        if !std::mem::take(&mut self.catalogue_dirty) {
+        if self.catalogue_rests.is_some_and(|until| self.now.instant < until)
+            || !std::mem::take(&mut self.catalogue_dirty)
+        {
             return;
         }
+        self.catalogue_rests = Some(self.now.instant + CATALOGUE_REST);
         self.shares.version += 1;
         for (name, sink) in self.shares.followers.keys().copied().collect::<Vec<_>>() {
             self.tell_follower(name, sink);
@@ -500,7 +537,7 @@ impl Endpoint {
             self.event(Event::SinkJoined { name, sink, peer, role });
         }
         if publishes && !known {
-            self.regrant(name);
+            self.publishers_changed(name);
         }
     }
 
@@ -620,7 +657,7 @@ impl Endpoint {
             if too_many {
                 self.begin_epoch(name);
             } else if role == Role::Publish {
-                self.regrant(name);
+                self.publishers_changed(name);
             }
         }
     }
@@ -649,12 +686,21 @@ fn refusal(denied: Denied) -> RefuseReason {
     }
 }
 
-/// Leaves out entries until the catalogue can be sent; returns how many.
+/// Makes a catalogue small enough to be sent: first without the nodes of its publishers, then without telling volatile
+/// publishers apart, and last by leaving entries out; returns how many.
 fn fit(catalogue: &mut Catalogue) -> usize {
     let all = catalogue.entries.len();
-    let mut bytes = 0;
     let room = SEALED_BYTES_MAX - 1024;
     catalogue.entries.truncate(CATALOGUE_ENTRIES_MAX);
+    let fits = |entries: &[CatalogueEntry]| entries.iter().map(|e| e.to_vec().len()).sum::<usize>() <= room;
+    if !fits(&catalogue.entries) {
+        catalogue.entries.iter_mut().flat_map(|e| &mut e.sources).for_each(|s| s.node = None);
+    }
+    if !fits(&catalogue.entries) {
+        let volatile = catalogue.entries.iter_mut().filter(|e| !e.qos.is_transient_local());
+        volatile.for_each(|e| e.sources.clear());
+    }
+    let mut bytes = 0;
     catalogue.entries.retain(|e| {
         bytes += e.to_vec().len();
         bytes <= room

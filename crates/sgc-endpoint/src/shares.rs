@@ -8,8 +8,8 @@ use bytes::Bytes;
 use rand_core::RngCore;
 use sgc_trust::{Policy, Suite, VerifiedPeer};
 use sgc_wire::{
-    Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, GRANT_SOURCES_MAX, Metadata, Name, NodeId, Qos,
-    Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, ENTRY_SOURCES_MAX, GRANT_SOURCES_MAX, Kind,
+    Metadata, Name, NodeId, Qos, Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::{SinkProgress, SourceProgress};
@@ -31,7 +31,7 @@ pub struct ShareSpec {
     pub type_hash: Option<String>,
     /// What the interface as a whole offers.
     pub qos: Qos,
-    /// The publishers behind it that sinks must tell apart (transient-local ones).
+    /// This node's publishers behind it, as far as sinks tell them apart.
     pub sources: Vec<CatalogueSource>,
 }
 
@@ -151,6 +151,8 @@ impl Share {
             let next = self.heard.as_ref().map_or(0, |heard| heard.newest(&source)).saturating_add(1);
             SourceAnnounce { source, key, oldest: next, next, recover: 0 }
         });
+        // Who calls a service hears its owner alone, and who else calls it is nobody's business.
+        let others = others.filter(|_| peer.is_none() || !self.is_service());
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {
             epoch: epoch.number,
@@ -159,6 +161,11 @@ impl Share {
             sources: own.chain(others).take(GRANT_SOURCES_MAX).collect(),
             entry: describe.map(|p| Box::new(self.entry(&p.peer))),
         }
+    }
+
+    /// True if those who publish on it call a service.
+    pub(crate) fn is_service(&self) -> bool {
+        self.spec.metadata.kind == Kind::Service
     }
 
     /// Remembers since when a node receives the share, if it did not before; at most `max` nodes, beside those that
@@ -216,8 +223,19 @@ impl Share {
             type_hash: self.spec.type_hash.clone(),
             qos: self.spec.qos.clone(),
             class: self.spec.class,
-            sources: self.spec.sources.clone(),
+            sources: self.listed_sources(),
         }
+    }
+
+    /// This node's publishers behind it; and one for all others, where others may publish. They are not told apart: each would
+    /// be listed after its first messages. A transient-local topic has no others, since those keep no history; and who calls a
+    /// service is nobody else's business.
+    fn listed_sources(&self) -> Vec<CatalogueSource> {
+        let has_others =
+            !self.spec.policy.publish.is_empty() && !self.spec.qos.is_transient_local() && !self.is_service();
+        let others = CatalogueSource { source: SourceId::OTHERS, qos: self.spec.qos.clone(), node: None };
+        let own = self.spec.sources.iter().take(ENTRY_SOURCES_MAX - 1).cloned();
+        own.chain(has_others.then_some(others)).collect()
     }
 }
 

@@ -353,9 +353,10 @@ impl Sink {
         self.sources.get(source).is_some_and(|s| s.recovers)
     }
 
-    /// Something of these sources was not handed over: they must be asked for it.
-    pub fn suspect(&mut self) {
-        for source in self.sources.values_mut().filter(|s| s.recovers && s.last_epoch.is_none()) {
+    /// Something of a source was not handed over: it must be asked for it, if it can be.
+    pub fn suspect(&mut self, source: &SourceId) {
+        let known = self.sources.get_mut(source);
+        if let Some(source) = known.filter(|s| s.recovers && s.last_epoch.is_none()) {
             source.unsync();
         }
     }

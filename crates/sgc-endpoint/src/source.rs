@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 use bytes::Bytes;
 use sgc_trust::{Batch, MessageKey, SourceKey, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, SinkId,
-    SourceAnnounce, SourceId, TopicGrant,
+    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader,
+    PayloadEncoding, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::history::{History, Kept, RecoveryLimits};
@@ -52,6 +52,9 @@ pub enum PublishError {
     /// The source has numbered all messages that it can; it takes one of another id to go on.
     #[error("a source carries at most {SOURCE_MESSAGES_MAX} messages")]
     Exhausted,
+    /// What is for one sink would be kept for others.
+    #[error("a source that keeps messages has none for one sink alone")]
+    Keeps,
 }
 
 /// How far a source is, to be read without its lock.
@@ -203,6 +206,29 @@ impl Source {
         result
     }
 
+    /// Seals one message for one sink alone and hands its packets to `emit` in order; of a source that keeps nothing.
+    /// It is numbered like any other: so no nonce is used twice, and the sink takes it once.
+    pub fn publish_to(
+        &mut self,
+        sink: SinkId,
+        head: &MessageHead,
+        payload: Bytes,
+        mut emit: impl FnMut(Packet),
+    ) -> Result<(), PublishError> {
+        if self.config.history_depth > 0 || self.progress.recovers {
+            return Err(PublishError::Keeps);
+        }
+        self.flush(&mut emit);
+        let key = SourceKey::derive_addressed(&self.grant, &self.config.name, &self.config.id, &sink);
+        // The suite was in this build when the source was made.
+        let Some(key) = key else { return Ok(()) };
+        let seq = self.next_number(&payload)?;
+        self.seal_fragments(Some(&key), seq, head, &payload, &mut emit);
+        self.keep(Kept { seq, head: *head, payload });
+        self.flush(emit);
+        Ok(())
+    }
+
     /// Signs and hands over what waits for a signature.
     pub fn flush(&mut self, mut emit: impl FnMut(Packet)) {
         if self.batch.is_empty() {
@@ -256,9 +282,20 @@ impl Source {
         for (seq, head, payload) in asked {
             self.seal_fragments(Some(&key), seq, &head, &payload, &mut emit);
         }
-        let head = MessageHead { kind: MessageKind::Synced, source_timestamp_ns: 0 };
+        let head = MessageHead {
+            kind: MessageKind::Synced,
+            encoding: PayloadEncoding::Plain,
+            source_timestamp_ns: 0,
+        };
         self.seal_fragments(Some(&key), 0, &head, &[], &mut emit);
         self.flush(emit);
+    }
+
+    /// Lets go what was dated before `ns`, nanoseconds since the Unix epoch: its lifespan is over, and nobody is to be given
+    /// it any more.
+    pub fn expire(&mut self, ns: i64) {
+        self.history.expire(ns);
+        self.progress.oldest.store(self.history.late_from(), Release);
     }
 
     /// Its id.
@@ -306,7 +343,8 @@ impl Source {
     /// Publishes a mark; the caller has room for its number.
     fn seal_mark(&mut self, emit: &mut impl FnMut(Packet)) {
         self.seq += 1;
-        let head = MessageHead { kind: MessageKind::Mark, source_timestamp_ns: 0 };
+        let head =
+            MessageHead { kind: MessageKind::Mark, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
         // Its own place in the history may be that of the oldest: what it says is what is left then.
         self.keep(Kept { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
         let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());

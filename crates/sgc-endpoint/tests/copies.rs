@@ -14,7 +14,8 @@ use sgc_endpoint::{
 };
 use sgc_trust::{MessageKey, Suite, trailer_bytes_max};
 use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
+    Class, MessageHead, MessageKind, Name, Packet, Payload, PayloadEncoding, SecretBytes, SinkId, SourceId,
+    TopicGrant,
 };
 
 struct Counting;
@@ -66,7 +67,8 @@ fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
 }
 
 const NAME: Name = Name([1; 32]);
-const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 7 };
+const HEAD: MessageHead =
+    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
 
 /// What a packet and a message take besides their payload: header, head, tag, counters of references, a signature and
 /// the hashes of a batch; bytes. Less than the smallest payload here, so that a second copy of any shows.

@@ -2,25 +2,28 @@
 //!
 //! One question a connection. Who asks nothing gets the status, as one JSON document; this is what the first version
 //! did. Otherwise one line, `sgc/1 WORD [ARGUMENT]`, is answered with `{"ok": …}` or `{"error": "…"}`, except for
-//! `status`, whose answer is the document itself. What is asked is carried out elsewhere.
+//! `status`, whose answer is the document itself, and for `tap`, whose answer is that line and then a stream of
+//! [`TapHead`]s with what is seen. What is asked is carried out elsewhere.
 
 use std::fs;
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use sgc_wire::CRL_BYTES_MAX;
+use sgc_wire::{CRL_BYTES_MAX, Name};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tracing::debug;
 
 use crate::core::CoreEvent;
+use crate::graph::Side;
 use crate::reload::Reloader;
+use crate::tap::{Tap, TapWish, Tapped};
 
 /// What a line of a question begins with; the number is the version of the protocol.
 pub const ADMIN_PREFIX: &str = "sgc/1 ";
@@ -31,6 +34,12 @@ pub const ADMIN_LINE_BYTES_MAX: usize = CRL_BYTES_MAX * 4 / 3 + 64;
 const CONNECTIONS_MAX: usize = 16;
 /// How long a question is waited for before its absence counts as one for the status.
 const SILENCE: Duration = Duration::from_millis(250);
+/// Taps at one time; they last, so they leave places for others.
+const TAPS_MAX: usize = 8;
+/// How long who looks at a topic may leave what there is to see.
+const TAP_STALL_MAX: Duration = Duration::from_secs(30);
+/// Longest ROS name that is asked for, bytes: DDS topics have at most 256, with a prefix.
+const TOPIC_BYTES_MAX: usize = 254;
 /// How long a question that was begun may take, and how long its answer may be in being read.
 const TRANSFER_MAX: Duration = Duration::from_secs(5);
 
@@ -43,6 +52,90 @@ pub enum AdminRequest {
     Reload,
     /// Take this revocation list, DER.
     Crl(Vec<u8>),
+    /// What is there and where it goes: a [`Graph`](crate::graph::Graph). Also of this name, if it is not in use here.
+    Graph(Option<Name>),
+    /// Show the messages of a topic, until the connection ends.
+    Tap {
+        /// ROS topic, as it is called here.
+        topic: String,
+        /// Which; what comes from the far side if it is used here, else what is published here.
+        side: Option<Side>,
+        /// Most bytes of a payload that are sent; the rest is cut off.
+        bytes: u32,
+    },
+}
+
+/// What precedes each message of a tap: [`TapHead::BYTES`] bytes, numbers big endian in this order. So many bytes
+/// of payload as `carried` says follow it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TapHead {
+    /// 0: data; 1: its instance was disposed of; 2: unregistered.
+    pub kind: u8,
+    /// When its publisher dated it, nanoseconds since the Unix epoch.
+    pub source_timestamp_ns: i64,
+    /// When it went by, likewise.
+    pub seen_unix_ns: i64,
+    /// Since the tap began, by a clock that only goes forward.
+    pub seen_ns: u64,
+    /// Messages that were not looked at in time so far.
+    pub dropped: u64,
+    /// Bytes of the payload.
+    pub bytes: u32,
+    /// Bytes of it that follow.
+    pub carried: u32,
+}
+
+impl TapHead {
+    /// Its bytes.
+    pub const BYTES: usize = 41;
+
+    /// As it is sent.
+    pub fn to_bytes(&self) -> [u8; Self::BYTES] {
+        let mut bytes = [0; Self::BYTES];
+        bytes[0] = self.kind;
+        bytes[1..9].copy_from_slice(&self.source_timestamp_ns.to_be_bytes());
+        bytes[9..17].copy_from_slice(&self.seen_unix_ns.to_be_bytes());
+        bytes[17..25].copy_from_slice(&self.seen_ns.to_be_bytes());
+        bytes[25..33].copy_from_slice(&self.dropped.to_be_bytes());
+        bytes[33..37].copy_from_slice(&self.bytes.to_be_bytes());
+        bytes[37..].copy_from_slice(&self.carried.to_be_bytes());
+        bytes
+    }
+
+    /// As it was sent.
+    pub fn from_bytes(bytes: &[u8; Self::BYTES]) -> Self {
+        let long = |at: usize| {
+            let part: [u8; 8] = std::array::from_fn(|i| bytes[at + i]);
+            part
+        };
+        let short = |at: usize| u32::from_be_bytes(std::array::from_fn(|i| bytes[at + i]));
+        Self {
+            kind: bytes[0],
+            source_timestamp_ns: i64::from_be_bytes(long(1)),
+            seen_unix_ns: i64::from_be_bytes(long(9)),
+            seen_ns: u64::from_be_bytes(long(17)),
+            dropped: u64::from_be_bytes(long(25)),
+            bytes: short(33),
+            carried: short(37),
+        }
+    }
+
+    fn of(message: &Tapped, begun: Instant, dropped: u64, most: u32) -> Self {
+        let bytes = message.payload.len().try_into().unwrap_or(u32::MAX);
+        Self {
+            kind: match message.kind {
+                sgc_ros::SampleKind::Write => 0,
+                sgc_ros::SampleKind::Dispose => 1,
+                sgc_ros::SampleKind::Unregister => 2,
+            },
+            source_timestamp_ns: message.source_timestamp_ns,
+            seen_unix_ns: message.seen_unix_ns,
+            seen_ns: message.seen.saturating_duration_since(begun).as_nanos().try_into().unwrap_or(u64::MAX),
+            dropped,
+            bytes,
+            carried: bytes.min(most),
+        }
+    }
 }
 
 impl AdminRequest {
@@ -64,8 +157,26 @@ impl AdminRequest {
                 Ok(list) if !list.is_empty() && list.len() <= CRL_BYTES_MAX => Ok(Self::Crl(list)),
                 _ => Err(AdminError::Argument { word: "crl" }),
             },
+            ("graph", "") => Ok(Self::Graph(None)),
+            ("graph", name) => match parse_name(name) {
+                Some(name) => Ok(Self::Graph(Some(name))),
+                None => Err(AdminError::Argument { word: "graph" }),
+            },
+            ("tap", rest) => Self::parse_tap(rest).ok_or(AdminError::Argument { word: "tap" }),
             (word, _) => Err(AdminError::Unknown { word: word.chars().take(32).collect() }),
         }
+    }
+
+    fn parse_tap(rest: &str) -> Option<Self> {
+        let mut words = rest.split(' ');
+        let (side, bytes, topic) = (words.next()?, words.next()?, words.next()?);
+        let side = match side {
+            "any" => None,
+            label => Some(Side::from_label(label)?),
+        };
+        let fits = topic.starts_with('/') && topic.len() <= TOPIC_BYTES_MAX && words.next().is_none();
+        let bytes = bytes.parse().ok()?;
+        fits.then(|| Self::Tap { topic: topic.to_owned(), side, bytes })
     }
 
     /// The line to send, with its end.
@@ -74,6 +185,11 @@ impl AdminRequest {
             Self::Status => format!("{ADMIN_PREFIX}status\n"),
             Self::Reload => format!("{ADMIN_PREFIX}reload\n"),
             Self::Crl(list) => format!("{ADMIN_PREFIX}crl {}\n", STANDARD.encode(list)),
+            Self::Graph(None) => format!("{ADMIN_PREFIX}graph\n"),
+            Self::Graph(Some(name)) => format!("{ADMIN_PREFIX}graph {name}\n"),
+            Self::Tap { topic, side, bytes } => {
+                format!("{ADMIN_PREFIX}tap {} {bytes} {topic}\n", side.map_or("any", Side::label))
+            }
         }
     }
 }
@@ -100,7 +216,7 @@ pub enum AdminError {
         word: &'static str,
     },
     /// A word that is not known.
-    #[error("{word:?} is nothing that this node can be asked: status, reload and crl are")]
+    #[error("{word:?} is nothing that this node can be asked: status, reload, crl, graph and tap are")]
     Unknown {
         /// The word.
         word: String,
@@ -127,15 +243,16 @@ pub(crate) fn bind_socket(path: &Path) -> io::Result<UnixListener> {
 /// Answers until the node ends.
 pub(crate) async fn serve(listener: UnixListener, events: mpsc::Sender<CoreEvent>, reloader: Arc<Reloader>) {
     let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
+    let taps = Arc::new(Semaphore::new(TAPS_MAX));
     while let Ok(place) = places.clone().acquire_owned().await {
         let Ok((stream, _)) = listener.accept().await else { return };
         if events.is_closed() {
             return;
         }
-        let (events, reloader) = (events.clone(), reloader.clone());
+        let (events, reloader, taps) = (events.clone(), reloader.clone(), taps.clone());
         tokio::spawn(async move {
             if is_ours(&stream) {
-                answer(stream, &events, &reloader).await;
+                answer(stream, &events, &reloader, &taps).await;
             }
             drop(place);
         });
@@ -148,13 +265,29 @@ fn is_ours(stream: &UnixStream) -> bool {
     stream.peer_cred().is_ok_and(|peer| peer.uid() == own || peer.uid() == 0)
 }
 
-async fn answer(mut stream: UnixStream, events: &mpsc::Sender<CoreEvent>, reloader: &Reloader) {
+async fn answer(
+    mut stream: UnixStream,
+    events: &mpsc::Sender<CoreEvent>,
+    reloader: &Reloader,
+    taps: &Semaphore,
+) {
     let request = read_line(&mut stream).await.and_then(|line| AdminRequest::parse(&line));
     let text = match request {
         Ok(AdminRequest::Status) => match status(events).await {
             Some(text) => text,
             None => return,
         },
+        Ok(AdminRequest::Tap { topic, side, bytes }) => {
+            let Ok(_place) = taps.try_acquire() else {
+                let many = envelope(Err(format!("{TAPS_MAX} topics are looked at already")));
+                let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(many.as_bytes())).await;
+                return;
+            };
+            match begin_tap(TapWish { topic, side }, events).await {
+                Ok(tap) => return show(stream, tap, bytes).await,
+                Err(why) => envelope(Err(why)),
+            }
+        }
         Ok(request) => envelope(carry_out(request, events, reloader).await),
         Err(error) => envelope(Err(error.to_string())),
     };
@@ -199,6 +332,46 @@ async fn status(events: &mpsc::Sender<CoreEvent>) -> Option<String> {
     serde_json::to_string(&status.await.ok()?).ok()
 }
 
+async fn begin_tap(wish: TapWish, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
+    let (reply, tap) = oneshot::channel();
+    let stopping = || "the node is stopping".to_owned();
+    events.send(CoreEvent::Tap(wish, reply)).await.map_err(|_| stopping())?;
+    tap.await.map_err(|_| stopping())?.map_err(|why| why.to_string())
+}
+
+/// Shows what goes by until nobody looks any more or there is no more.
+async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
+    let begun = Instant::now();
+    let what = serde_json::json!({
+        "ok": { "side": tap.side.label(), "type": tap.type_name, "type_hash": tap.type_hash }
+    });
+    let (mut gone, mut into) = stream.split();
+    let write = async {
+        into.write_all(format!("{what}\n").as_bytes()).await?;
+        while let Some((message, dropped)) = tap.queue.pop().await {
+            let head = TapHead::of(&message, begun, dropped, most);
+            let carried = message.payload.get(..head.carried as usize).unwrap_or_default();
+            let write = async {
+                into.write_all(&head.to_bytes()).await?;
+                into.write_all(carried).await
+            };
+            tokio::time::timeout(TAP_STALL_MAX, write).await.map_err(|_| io::ErrorKind::TimedOut)??;
+        }
+        Ok::<(), io::Error>(())
+    };
+    let mut nothing = [0; 64];
+    let looks_away = async { while matches!(gone.read(&mut nothing).await, Ok(1..)) {} };
+    tokio::select! {
+        _ = write => {}
+        () = looks_away => {}
+    }
+    tap.queue.close();
+    if let Some(reader) = tap.reader.take() {
+        // It waits for the thread that served it.
+        tokio::task::spawn_blocking(move || drop(reader));
+    }
+}
+
 /// Gives JSON, or what went wrong.
 async fn carry_out(
     request: AdminRequest,
@@ -208,6 +381,14 @@ async fn carry_out(
     let stopping = || "the node is stopping".to_owned();
     match request {
         AdminRequest::Status => status(events).await.ok_or_else(stopping),
+        AdminRequest::Graph(name) => {
+            let (reply, graph) = oneshot::channel();
+            events.send(CoreEvent::Graph(name, reply)).await.map_err(|_| stopping())?;
+            let graph = graph.await.map_err(|_| stopping())?;
+            serde_json::to_string(&graph).map_err(|error| error.to_string())
+        }
+        // It is not answered in one line.
+        AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
         AdminRequest::Reload => {
             let report = reloader.reload("sgc reload").await?;
             serde_json::to_string(&report).map_err(|error| error.to_string())
@@ -219,6 +400,17 @@ async fn carry_out(
             Ok(serde_json::json!({ "news": is_news }).to_string())
         }
     }
+}
+
+fn parse_name(text: &str) -> Option<Name> {
+    if text.len() != 64 || !text.bytes().all(|b| b.is_ascii_hexdigit()) {
+        return None;
+    }
+    let mut name = [0; 32];
+    for (byte, digits) in name.iter_mut().zip(text.as_bytes().chunks_exact(2)) {
+        *byte = u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?;
+    }
+    Some(Name(name))
 }
 
 fn envelope(result: Result<String, String>) -> String {
@@ -234,7 +426,16 @@ mod tests {
 
     #[test]
     fn questions_round_trip() {
-        for request in [AdminRequest::Status, AdminRequest::Reload, AdminRequest::Crl(vec![0x30, 0, 255])] {
+        let tap = |side| AdminRequest::Tap { topic: "/a/b".into(), side, bytes: 64 };
+        for request in [
+            AdminRequest::Status,
+            AdminRequest::Reload,
+            AdminRequest::Crl(vec![0x30, 0, 255]),
+            AdminRequest::Graph(None),
+            AdminRequest::Graph(Some(Name([0xab; 32]))),
+            tap(None),
+            tap(Some(Side::Sent)),
+        ] {
             let line = request.to_line();
             assert!(line.ends_with('\n') && line.len() <= ADMIN_LINE_BYTES_MAX);
             assert_eq!(AdminRequest::parse(line.as_bytes()), Ok(request));
@@ -242,6 +443,20 @@ mod tests {
         assert!(AdminRequest::Crl(vec![1; CRL_BYTES_MAX]).to_line().len() <= ADMIN_LINE_BYTES_MAX);
         assert_eq!(AdminRequest::parse(b""), Ok(AdminRequest::Status));
         assert_eq!(AdminRequest::parse(b"status\r\n"), Ok(AdminRequest::Status));
+    }
+
+    #[test]
+    fn heads_of_taps_round_trip() {
+        let head = TapHead {
+            kind: 2,
+            source_timestamp_ns: -1,
+            seen_unix_ns: 1 << 60,
+            seen_ns: 77,
+            dropped: 5,
+            bytes: 1 << 20,
+            carried: 64,
+        };
+        assert_eq!(TapHead::from_bytes(&head.to_bytes()), head);
     }
 
     #[test]
@@ -253,6 +468,12 @@ mod tests {
             (b"sgc/1 crl", AdminError::Argument { word: "crl" }),
             (b"sgc/1 crl !", AdminError::Argument { word: "crl" }),
             (b"sgc/1 stop", AdminError::Unknown { word: "stop".into() }),
+            (b"sgc/1 graph 12", AdminError::Argument { word: "graph" }),
+            (b"sgc/1 tap any 64", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 tap any 64 a", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 tap any -1 /a", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 tap both 1 /a", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 tap any 1 /a b", AdminError::Argument { word: "tap" }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {
             assert_eq!(AdminRequest::parse(line), Err(error), "{}", line.escape_ascii());

@@ -315,6 +315,11 @@ impl Audit {
         }
     }
 
+    /// What a peer is called, if it is known by a name.
+    pub fn name_of(&self, peer: &NodeId) -> Option<String> {
+        self.shared.as_ref()?.names.load().get(peer).cloned()
+    }
+
     /// Records that did not fit, since the node started.
     pub fn lost_total(&self) -> u64 {
         self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))

@@ -3,10 +3,13 @@
 //! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
 //! happens in tasks and threads of its own.
 
+mod graph;
+mod nodes;
 mod outputs;
 mod publish;
 mod quality;
 mod ros;
+mod services;
 mod trust;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -16,20 +19,26 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
-use sgc_ros::{DiscoveryEvent, EndpointSpec, RosNetwork, Routes, ShareRule, UseRule};
+use sgc_ros::{
+    DiscoveryEvent, EndpointSpec, Guid, RosClient, RosNetwork, RosServer, Routes, ServiceSpec, ShareRule,
+    UseRule,
+};
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
 use sgc_trust::{CrlError, Identity, TrustAnchors};
-use sgc_wire::{Control, Credentials, Name, Now, RefuseReason, SinkId, SourceId, UnixMillis};
+use sgc_wire::{Control, Credentials, Name, NodeId, Now, RefuseReason, SinkId, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
+use crate::calls::Calls;
+use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
-use crate::core::quality::Pulse;
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
 use crate::finding::Board;
+use crate::graph::Graph;
+use crate::heart::{Heart, Patience};
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
 use crate::outflow::OutFlow;
@@ -39,6 +48,7 @@ use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::LocalShare;
 use crate::stats::{Drops, NameStats};
 use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::tap::{Tap, TapError, TapQueue, TapWish};
 
 /// Events that may wait for the control task; who sends more waits.
 pub(crate) const INBOX_MAX: usize = 4096;
@@ -54,6 +64,8 @@ const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 64 << 20;
 /// Messages of history kept where the publisher keeps all.
 const HISTORY_KEEP_ALL_MAX: usize = 4096;
+/// How many instances' worth of history a transient-local source of a keyed topic keeps, as the writers of `sgc-dds` do.
+const KEYED_INSTANCES_KEPT: usize = 256;
 /// How long packets of past epochs may be under way.
 const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
@@ -106,8 +118,19 @@ pub(crate) enum CoreEvent {
         name: Name,
         /// As it was asked for.
         spec: EndpointSpec,
+        /// Its GUID on the local network.
+        guid: Guid,
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
+    },
+    /// What calls local servers for others was made, or what local clients call.
+    ServiceReady {
+        /// The share or the joined name.
+        name: Name,
+        /// As it was asked for.
+        spec: ServiceSpec,
+        /// Either.
+        end: ServiceEnd,
     },
     /// What the fleet's file holds for this authority itself.
     OwnRenewal(Result<Credentials, RefuseReason>),
@@ -142,10 +165,22 @@ pub(crate) enum CoreEvent {
     MessageKeys(MessageKeys),
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
+    /// Somebody asks what is there, and where it goes; also of a name that this node need not know.
+    Graph(Option<Name>, oneshot::Sender<Graph>),
+    /// Somebody wants to see what goes by.
+    Tap(TapWish, oneshot::Sender<Result<Tap, TapError>>),
     /// Take nothing in any more; answered with what still leaves.
     Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
     /// Take back what is shared and say goodbye; answered with the links, which the peers then close.
     Stop(oneshot::Sender<Vec<AnyLink>>),
+}
+
+/// This node's end of a service on the local network.
+pub(crate) enum ServiceEnd {
+    /// It calls local servers.
+    Client(Arc<dyn RosClient>),
+    /// Local clients call it.
+    Server(Arc<dyn RosServer>),
 }
 
 struct LinkEntry {
@@ -155,7 +190,7 @@ struct LinkEntry {
     flows: HashMap<Name, Arc<OutFlow>>,
     /// Why this node closed it, if it did.
     closed_for: Option<String>,
-    pulse: Pulse,
+    heart: Heart,
 }
 
 /// The control task's state. `N` is the local network; a pure router has none.
@@ -169,12 +204,22 @@ pub(crate) struct Core<N: RosNetwork> {
     links: BTreeMap<LinkId, LinkEntry>,
     /// When to look at them.
     look_due: Option<Instant>,
+    /// How often peers are asked that say nothing.
+    patience: Patience,
+    /// The peers that have to be asked sooner.
+    impatient: BTreeMap<NodeId, Duration>,
     next_link: u32,
     entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
     shares: HashMap<Name, Arc<LocalShare>>,
     readers: HashMap<Name, (EndpointSpec, Option<Box<dyn std::any::Any + Send>>)>,
     sinks: HashMap<Name, Arc<LocalSink>>,
+    /// Names of services, shared or joined.
+    calls: BTreeMap<Name, Calls>,
+    /// Their ends on the local network, as they are wanted.
+    service_ends: HashMap<Name, ServiceSpec>,
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
+    /// Which nodes the local graph shows for them.
+    graph: LocalGraph,
     history_due: BTreeMap<(Name, SourceId), Instant>,
     /// When the keys of past epochs of a joined name are dropped.
     retire_due: BTreeMap<Name, Instant>,
@@ -207,6 +252,10 @@ pub(crate) struct Core<N: RosNetwork> {
     alive: mpsc::Sender<()>,
     audit: Audit,
     board: Board,
+    /// Who asked for a share and was refused, and why.
+    refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
+    /// Who looks at the local network.
+    local_taps: Vec<Arc<TapQueue>>,
 }
 
 /// What a [`Core`] is made of.
@@ -245,6 +294,8 @@ pub(crate) struct CoreParts<N> {
     pub audit: Audit,
     /// How routers are being found.
     pub(crate) board: Board,
+    /// How often peers are asked that say nothing.
+    pub(crate) patience: Patience,
 }
 
 /// The present, by both clocks.
@@ -257,6 +308,7 @@ impl<N: RosNetwork> Core<N> {
     /// The control task and the inbox of its sinks.
     pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
         let (requests, requested) = mpsc::channel(INBOX_MAX);
+        let graph = LocalGraph::new(parts.identity.node_name().as_str());
         let core = Self {
             identity: parts.identity,
             router: parts.router,
@@ -266,12 +318,17 @@ impl<N: RosNetwork> Core<N> {
             data: Arc::new(DataPlane::new(parts.rates)),
             links: BTreeMap::new(),
             look_due: None,
+            patience: parts.patience,
+            impatient: BTreeMap::new(),
             next_link: 1,
             entries: HashMap::new(),
             shares: HashMap::new(),
             readers: HashMap::new(),
             sinks: HashMap::new(),
+            calls: BTreeMap::new(),
+            service_ends: HashMap::new(),
             writers: HashMap::new(),
+            graph,
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
             message_keys: parts.message_keys,
@@ -296,6 +353,8 @@ impl<N: RosNetwork> Core<N> {
             alive: parts.alive,
             audit: parts.audit,
             board: parts.board,
+            refused: BTreeMap::new(),
+            local_taps: Vec::new(),
         };
         (core, requested)
     }
@@ -337,6 +396,7 @@ impl<N: RosNetwork> Core<N> {
             }
             self.handle_timeouts();
             deadline = self.drain();
+            self.show_graph();
         }
     }
 
@@ -352,8 +412,8 @@ impl<N: RosNetwork> Core<N> {
                 let remote = link.remote();
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                let (flows, pulse) = (HashMap::new(), Pulse::new(&link));
-                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, pulse });
+                let (flows, heart) = (HashMap::new(), self.heart_of(&link));
+                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, heart });
                 if reply.send(Some((id, self.data.clone()))).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
@@ -363,6 +423,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(now(), id);
                 if let Some(entry) = self.links.remove(&id) {
+                    self.remember_patience(entry.link.peer().node_id, entry.heart.patience());
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
                     let record = record.remote(entry.link.remote());
                     self.audit.write(match &entry.closed_for {
@@ -377,18 +438,23 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.count_from("malformed_control", link);
             }
             CoreEvent::Discovery(event) => {
+                self.calls_discovery(&event);
                 if let Some(routes) = &mut self.routes {
                     routes.handle_discovery(Instant::now(), event);
                 }
             }
-            CoreEvent::ReaderReady { name, spec, reader } => match self.readers.get_mut(&name) {
-                Some((wanted, slot)) if *wanted == spec => *slot = Some(reader),
+            CoreEvent::ReaderReady { name, spec, guid, reader } => match self.readers.get_mut(&name) {
+                Some((wanted, slot)) if *wanted == spec => {
+                    *slot = Some(reader);
+                    self.graph.reader_there(name, guid);
+                }
                 _ => drop_elsewhere(reader),
             },
             CoreEvent::WriterReady { name, source, spec, writer } => {
                 let wanted = self.writers.get(&(name, source)) == Some(&spec);
                 match (self.sinks.get(&name), writer) {
                     (Some(sink), Some(writer)) if wanted => {
+                        self.graph.writer_there((name, source), writer.guid());
                         sink.set_writer(source, Some(writer));
                         self.ask_histories(name);
                     }
@@ -396,6 +462,7 @@ impl<N: RosNetwork> Core<N> {
                     (_, None) => {}
                 }
             }
+            CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
             CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
             CoreEvent::OwnRenewal(answer) => self.own_renewal(answer),
             CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
@@ -421,6 +488,10 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }
+            CoreEvent::Graph(name, reply) => {
+                let _ = reply.send(self.graph(name));
+            }
+            CoreEvent::Tap(wish, reply) => self.tap(wish, reply),
             CoreEvent::Quiesce(reply) => {
                 let _ = reply.send(self.quiesce());
             }
@@ -466,6 +537,7 @@ impl<N: RosNetwork> Core<N> {
         for name in long {
             self.endpoint.rotate(now, &name);
         }
+        self.calls_due(now.instant);
         self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
@@ -506,7 +578,8 @@ impl<N: RosNetwork> Core<N> {
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due];
-                let all = [router, endpoint, routes, history, retire, rekey].into_iter().chain(own);
+                let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
+                let all = all.into_iter().chain(own);
                 return all.flatten().min();
             }
         }
@@ -524,14 +597,17 @@ impl<N: RosNetwork> Core<N> {
             self.drain();
         }
         self.close_not_admitted();
+        self.want_all_lanes();
     }
 
     /// Stops taking in; what is queued still leaves.
     fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
         self.routes = None;
+        self.local_taps.drain(..).for_each(|tap| tap.close());
         for share in self.shares.values() {
             share.close();
         }
+        self.close_all_calls();
         for (_, (_, reader)) in self.readers.drain() {
             if let Some(reader) = reader {
                 drop_elsewhere(reader);
@@ -570,8 +646,10 @@ impl<N: RosNetwork> Core<N> {
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 cost,
                 silent,
+                keep_alive_ms: entry.heart.step().as_millis().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
+                lanes: entry.control.lanes().count(),
                 labels_sent: entry.control.labels_known(),
                 labels_received: entry.link.labels_defined(),
                 peer_slowed: over.slowed,
@@ -596,14 +674,22 @@ impl<N: RosNetwork> Core<N> {
                 .routes
                 .iter()
                 .flat_map(Routes::status)
-                .map(|route| {
+                .map(|mut route| {
+                    self.describe_calls(&mut route);
                     let messages = route.name.and_then(|n| {
                         let published = self.shares.get(&n).map(|s| s.published());
                         published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
                     });
                     let share = route.name.and_then(|n| self.shares.get(&n));
-                    RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()))
+                    let compressed = share.and_then(|s| s.compressed());
+                    RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
                 })
+                .collect(),
+            problems: self
+                .routes
+                .iter()
+                .flat_map(|routes| routes.problems())
+                .map(ToString::to_string)
                 .collect(),
             names: names.collect(),
             drops,

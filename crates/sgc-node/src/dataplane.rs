@@ -13,6 +13,7 @@ use sgc_router::{FibEntry, LinkId};
 use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
+use crate::heart::Activity;
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
 use crate::sinks::LocalSink;
@@ -31,7 +32,7 @@ pub(crate) struct Forward {
 /// One way out.
 pub(crate) enum Out {
     /// Over a link.
-    Link(Arc<OutFlow>),
+    Link(Arc<OutFlow>, Arc<Activity>),
     /// To this node's own subscriber.
     Local(Arc<LocalSink>),
 }
@@ -107,7 +108,7 @@ impl DataPlane {
         }
         forward.stats.count(packet.payload.len());
         if let Some(sink) = packet.header.to {
-            return match forward.entry.egress_to(&sink).and_then(|link| forward.out(link)) {
+            return match forward.entry.egress_to(ingress, &sink).and_then(|link| forward.out(link)) {
                 Some(out) => self.send(ingress, &forward, out, packet).await,
                 None => self.drop_packet(ingress, &packet, DataDrop::NoSuchSink),
             };
@@ -129,6 +130,9 @@ impl DataPlane {
     /// Counts a drop of something of `name` that came over `ingress`.
     pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
         debug!(%ingress, name = %name.short(), ?reason, "dropped");
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.count_drops(reason, 1);
+        }
         // What comes the wrong way may still have been under way when the way changed.
         let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
         if self.drops.count_from(reason.key(), ingress) && suspicious {
@@ -144,7 +148,10 @@ impl DataPlane {
     async fn send(&self, ingress: LinkId, forward: &Forward, out: &Out, packet: Packet) {
         let name = packet.header.name;
         let dropped = match out {
-            Out::Link(flow) => flow.push(packet).await,
+            Out::Link(flow, activity) => {
+                activity.note();
+                flow.push(packet).await
+            }
             Out::Local(sink) => sink.deliver(packet, &self.drops).await,
         };
         if let Some((reason, n)) = dropped {
@@ -172,7 +179,7 @@ mod tests {
         let name = Name([1; 32]);
         let [up, near, far] = [1, 2, 3].map(LinkId);
         let outs = [near, far].map(|link| (link, OutFlow::idle()));
-        let ways = outs.iter().map(|(link, flow)| (*link, Out::Link(flow.clone()))).collect();
+        let ways = outs.iter().map(|(link, flow)| (*link, Out::Link(flow.clone(), Arc::default()))).collect();
         let (down, publishers) = ([near, far].as_slice().into(), [].as_slice().into());
         let entry = FibEntry { trees: [Tree { up, down, publishers }].into(), sinks: vec![] };
         let data = DataPlane::default();

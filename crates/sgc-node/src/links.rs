@@ -10,7 +10,8 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
-    AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, Listener, Refusal,
+    AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
+    Refusal,
 };
 use sgc_trust::CertError;
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
@@ -21,9 +22,12 @@ use tracing::{debug, info, warn};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::core::CoreEvent;
 use crate::dataplane::DataPlane;
-use crate::finding::{Aim, BACKOFF_MAX, Claim, Claims, Failure, Holder, Line, wait};
+use crate::finding::{Aim, BACKOFF_MAX, Claim, Claims, Climb, Dialled, Holder, Line, is_over_udp, wait};
+use crate::heart::Activity;
 use crate::labels::{LabelBook, NameLabel, Progress};
+use crate::lanes::{Dial, LaneDoor, Lanes};
 use crate::peer_rate::PeerRate;
+use crate::roaming::{self, Move, Origin, source_towards};
 use crate::stats::DataDrop;
 
 /// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
@@ -33,6 +37,9 @@ const SETTLE_MAX: Duration = Duration::from_secs(5);
 /// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
 const QUIET_MIN: Duration = Duration::from_millis(100);
 const QUIET_RTTS: u32 = 4;
+/// How long nothing may come by a new socket until another link is tried beside it: what the transport is may be blocked
+/// where the node is now.
+const DOUBT_AFTER: Duration = Duration::from_millis(1500);
 /// How long it may take to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
@@ -40,6 +47,8 @@ const GOODBYE_MAX: Duration = Duration::from_secs(1);
 pub(crate) struct ControlTx {
     frames: mpsc::Sender<Control>,
     labels: LabelBook,
+    activity: Arc<Activity>,
+    lanes: Arc<Lanes>,
 }
 
 impl ControlTx {
@@ -47,6 +56,16 @@ impl ControlTx {
     pub(crate) fn label(&mut self, name: Name) -> Option<NameLabel> {
         let frames = &self.frames;
         self.labels.label(name, |label| frames.try_send(Control::Label { label, name }).is_ok())
+    }
+
+    /// Whether packets go over the link.
+    pub(crate) fn activity(&self) -> &Arc<Activity> {
+        &self.activity
+    }
+
+    /// The lanes of the link.
+    pub(crate) fn lanes(&self) -> &Arc<Lanes> {
+        &self.lanes
     }
 
     /// How many labels the peer knows.
@@ -61,12 +80,15 @@ impl ControlTx {
 }
 
 /// Serves a link, and in its place each one that is made because the credentials changed (`redial`), or because it is
-/// to lead elsewhere (`aim`); returns when the last of them has ended.
+/// to lead elsewhere (`aim`), because a better way than the one in use (`url`) works, or because the network is another and
+/// the transport cannot follow; returns when the last of them has
+/// ended.
 ///
 /// The new link is made while the old one is up, which is taken down only when both sides have told each other what they
 /// know on the new one. As long as that fails, the old one stays.
 pub(crate) async fn keep_renewed(
     link: AnyLink,
+    mut url: LinkUrl,
     mut aim: watch::Receiver<Aim>,
     mut redial: watch::Receiver<()>,
     holder: &Holder,
@@ -74,32 +96,85 @@ pub(crate) async fn keep_renewed(
     line: &Line,
 ) -> LinkError {
     let core = &holder.core;
-    let url = aim.borrow().url.to_string();
-    let mut current = Served::start(link, Some(url), core).await;
+    let serve = |link, url: &LinkUrl| {
+        let dial = (holder.lane_dialer.clone(), url.clone());
+        async move { Served::start(link, Some(dial), LaneDoor::default(), core).await }
+    };
+    let mut current = serve(link, &url).await;
     // For jitter alone.
     let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
     let mut failures = None;
+    let climb_from = |aim: &Aim, url: &LinkUrl, rng: &mut ChaCha20Rng| {
+        Climb::new(aim.better_than(url).len(), Instant::now(), rng)
+    };
+    let mut climb = climb_from(&aim.borrow(), &url, &mut rng);
+    let mut network = holder.network.onward();
+    let mut origin = Origin::of(current.link.remote());
+    // Whether a link is wanted in place of this one without anything else having to happen.
+    let mut is_wanted = false;
+    // When to look whether anything came since a change of the network, and how much had come before.
+    let mut doubted = None;
     loop {
         let next = async {
-            match failures {
+            let climbs = match failures {
+                _ if is_wanted => false,
                 None => tokio::select! {
-                    () = changed(&mut redial) => {}
-                    () = changed(&mut aim) => {}
+                    () = changed(&mut redial) => false,
+                    () = changed(&mut aim) => false,
+                    () = climb.is_due() => true,
                 },
-                Some(failures) => tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await,
-            }
-            redial.mark_unchanged();
-            let aim = aim.borrow_and_update().clone();
-            let link = holder.dial(&aim).await?;
-            let claim = holder.claim_again(&link, &claim)?;
-            Ok::<_, Failure>((link, aim, claim))
+                Some(failures) => {
+                    tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await;
+                    false
+                }
+            };
+            let dialled = if climbs {
+                let aim = aim.borrow().clone();
+                holder.dial_first(aim.better_than(&url)).await.map(|dialled| (dialled, aim))
+            } else {
+                // Until there is one, whatever cuts this attempt short.
+                is_wanted = true;
+                redial.mark_unchanged();
+                let aim = aim.borrow_and_update().clone();
+                holder.dial(&aim).await.map(|dialled| (dialled, aim))
+            };
+            let claimed = |(dialled, aim): (Dialled, Aim)| {
+                let claim = holder.claim_again(&dialled.link, &claim)?;
+                Ok((dialled, aim, claim))
+            };
+            dialled.and_then(claimed).map_err(|why| (why, climbs))
         };
         tokio::select! {
             end = current.end(core) => return end,
+            () = network.changed() => {
+                let remote = current.link.remote();
+                let source = source_towards(remote);
+                let moves = origin.moves(source, is_over_udp(url.scheme));
+                roaming::report(remote, source, moves);
+                match moves {
+                    Move::Stay => {}
+                    Move::Rebind => {
+                        holder.rebind();
+                        doubted = Some((Instant::now() + DOUBT_AFTER, current.link.stats().received_bytes));
+                    }
+                    Move::Redial => is_wanted = true,
+                }
+                failures = failures.map(|_| 0);
+                climb.network_changed(Instant::now());
+            }
+            before = passed(doubted) => {
+                doubted = None;
+                if current.link.stats().received_bytes == before {
+                    info!(%url, "nothing comes since the network changed; connecting anew beside it");
+                    is_wanted = true;
+                }
+            }
             dialled = next => match dialled {
-                Ok((link, aim, other)) => {
+                Ok((dialled, aim, other)) => {
+                    (is_wanted, doubted) = (false, None);
+                    let Dialled { link, url: way, passed } = dialled;
                     let node = link.peer().node_id;
-                    let next = Served::start(link, Some(aim.url.to_string()), core).await;
+                    let next = serve(link, &way).await;
                     tokio::select! {
                         () = next.settled() => {
                             failures = None;
@@ -112,16 +187,24 @@ pub(crate) async fn keep_renewed(
                             continue;
                         }
                         end = current.end(core) => {
-                            info!(url = %aim.url, "link ended: {end}");
+                            info!(%url, "link ended: {end}");
                             (current, failures) = (next, None);
                         }
                     }
-                    line.linked(&aim, &node);
+                    holder.linked(&aim, &way, &passed, &node, line);
+                    climb = climb_from(&aim, &way, &mut rng);
+                    origin = Origin::of(current.link.remote());
+                    url = way;
                     if let Some(other) = other {
                         claim = other;
                     }
                 }
-                Err(why) => {
+                Err((why, true)) => {
+                    debug!("no better way yet: {why}");
+                    climb.failed(Instant::now(), &mut rng);
+                }
+                Err((why, false)) => {
+                    is_wanted = false;
                     if failures.is_none() {
                         warn!("cannot connect anew: {why}; the old link stays and it is tried again");
                     }
@@ -130,6 +213,17 @@ pub(crate) async fn keep_renewed(
                 }
             }
         }
+    }
+}
+
+/// Waits until its time has come, and returns what was noted then; for ever if there is nothing.
+async fn passed(noted: Option<(Instant, u64)>) -> u64 {
+    match noted {
+        Some((at, what)) => {
+            tokio::time::sleep_until(at).await;
+            what
+        }
+        None => std::future::pending().await,
     }
 }
 
@@ -146,11 +240,12 @@ pub(crate) struct Door {
     pub(crate) credentials: CredentialStore,
     pub(crate) claims: Claims,
     pub(crate) audit: Audit,
+    pub(crate) lanes: LaneDoor,
 }
 
 /// Accepts links until the node ends.
 pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop: oneshot::Receiver<()>) {
-    let Door { core, credentials, claims, audit } = door;
+    let Door { core, credentials, claims, audit, lanes } = door;
     // At most one for each CA that is trusted.
     let mut strangers = BTreeSet::new();
     loop {
@@ -159,12 +254,18 @@ pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop:
             _ = &mut stop => None,
         };
         match accepted {
+            Some(Ok(link)) if link.lane().is_some() => {
+                if let Some(token) = link.lane() {
+                    lanes.enter(token, link);
+                }
+            }
             Some(Ok(link)) => {
                 let (core, credentials, claims) = (core.clone(), credentials.clone(), claims.clone());
+                let lanes = lanes.clone();
                 tokio::spawn(async move {
                     let _arrival = claims.note_arrival(link.peer().node_id);
                     let remote = link.remote();
-                    let served = Served::start(link.clone(), None, &core).await;
+                    let served = Served::start(link.clone(), None, lanes, &core).await;
                     // What changed since the handshake; the control task knows of the link from here on.
                     if !credentials.admits(link.peer()) {
                         link.close(CloseReason::not_admitted());
@@ -196,23 +297,36 @@ struct Served {
     id: Option<LinkId>,
     /// How many control frames came.
     heard: watch::Receiver<u64>,
+    lanes: Arc<Lanes>,
 }
 
 impl Served {
     /// Reports it and starts to move what comes in.
-    async fn start(link: AnyLink, url: Option<String>, core: &mpsc::Sender<CoreEvent>) -> Self {
+    async fn start(
+        link: AnyLink,
+        dial: Option<Dial>,
+        door: LaneDoor,
+        core: &mpsc::Sender<CoreEvent>,
+    ) -> Self {
         let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
         let (reply, id) = oneshot::channel();
         let (count, heard) = watch::channel(0);
         let progress = Arc::<Progress>::default();
-        let control = ControlTx { frames: frames.clone(), labels: LabelBook::new(progress.clone()) };
+        let activity = Arc::<Activity>::default();
+        let url = dial.as_ref().map(|(_, url)| url.to_string());
+        let lanes = Lanes::new(link.clone(), frames.clone(), dial, door);
+        let labels = LabelBook::new(progress.clone());
+        let (activity_tx, lanes_tx) = (activity.clone(), lanes.clone());
+        let control = ControlTx { frames: frames.clone(), labels, activity: activity_tx, lanes: lanes_tx };
         let up = CoreEvent::LinkUp { link: link.clone(), url, control, reply };
         let id = match (core.send(up).await, id.await) {
             (Ok(()), Ok(Some((id, data)))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
-                let reader =
-                    ControlRx { link: link.clone(), id, frames, progress, count, core: core.clone() };
-                spawn_tasks(&link, id, data, outgoing, reader);
+                let inflow = Inflow::new(&link, id, data, activity);
+                lanes.start(inflow.clone());
+                let (core, lanes) = (core.clone(), lanes.clone());
+                let reader = ControlRx { link: link.clone(), id, frames, progress, lanes, count, core };
+                spawn_tasks(inflow, outgoing, reader);
                 Some(id)
             }
             _ => {
@@ -220,12 +334,13 @@ impl Served {
                 None
             }
         };
-        Self { link, id, heard }
+        Self { link, id, heard, lanes }
     }
 
     /// Waits for its end and reports that. Dropping the future loses nothing: it is to be called again.
     async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
         let end = self.link.closed().await;
+        self.lanes.close();
         if let Some(id) = self.id {
             let _ = core.send(CoreEvent::LinkDown { id }).await;
         }
@@ -260,22 +375,14 @@ impl Served {
         let _ = timeout(GOODBYE_MAX, goodbye).await;
         self.link.close(CloseReason::Replaced);
         self.end(&core).await;
-        info!(remote = %self.link.remote(), "a link with newer credentials took the place of this one");
+        info!(remote = %self.link.remote(), "a newer link took the place of this one");
     }
 }
 
-fn spawn_tasks(
-    link: &AnyLink,
-    id: LinkId,
-    data: Arc<DataPlane>,
-    outgoing: mpsc::Receiver<Control>,
-    reader: ControlRx,
-) {
-    tokio::spawn(send_control(link.clone(), outgoing));
+fn spawn_tasks(inflow: Inflow, outgoing: mpsc::Receiver<Control>, reader: ControlRx) {
+    tokio::spawn(send_control(inflow.link.clone(), outgoing));
     tokio::spawn(reader.run());
-    let inflow = Inflow::new(link, id, data);
-    tokio::spawn(inflow.clone().accept_flows());
-    tokio::spawn(inflow.read_datagrams());
+    inflow.spawn();
 }
 
 async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
@@ -287,13 +394,14 @@ async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
     }
 }
 
-/// Takes control frames in. Those about labels end here, the rest is the control task's.
+/// Takes control frames in. Those about labels, lanes and pulses end here, the rest is the control task's.
 struct ControlRx {
     link: AnyLink,
     id: LinkId,
     /// For acknowledgements.
     frames: mpsc::Sender<Control>,
     progress: Arc<Progress>,
+    lanes: Arc<Lanes>,
     /// How many frames came.
     count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
@@ -315,6 +423,16 @@ impl ControlRx {
         }
     }
 
+    /// False if the peer is too far behind, and has no link any more.
+    fn answer(&self, frame: Control) -> bool {
+        let is_sent = self.frames.try_send(frame).is_ok();
+        if !is_sent {
+            warn!(link = self.id.0, remote = %self.link.remote(), "the peer does not take control frames; the link is closed");
+            self.link.close(CloseReason::Overloaded);
+        }
+        is_sent
+    }
+
     /// False if no more is to be taken in; the error is the peer's.
     async fn take(&self, frame: Result<Control, DecodeError>) -> Result<bool, String> {
         let frame = frame.map_err(|error| error.to_string())?;
@@ -323,17 +441,22 @@ impl ControlRx {
         match frame {
             Control::Label { label, name } if is_greeted => {
                 self.link.define_label(label, name).map_err(|error| error.to_string())?;
-                if self.frames.try_send(Control::LabelAck { label }).is_err() {
-                    warn!(link = self.id.0, remote = %self.link.remote(), "the peer does not take control frames; the link is closed");
-                    self.link.close(CloseReason::Overloaded);
-                    return Ok(false);
-                }
-                Ok(true)
+                Ok(self.answer(Control::LabelAck { label }))
             }
+            Control::Pulse { answers: false } if is_greeted => {
+                Ok(self.answer(Control::Pulse { answers: true }))
+            }
+            // That something came is the answer.
+            Control::Pulse { answers: true } if is_greeted => Ok(true),
             Control::LabelAck { label } if is_greeted => match self.progress.acknowledge(label) {
                 true => Ok(true),
                 false => Err(format!("label {} is acknowledged but was not given", label.index())),
             },
+            frame @ (Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. })
+                if is_greeted =>
+            {
+                self.lanes.handle(&frame).map(|()| true)
+            }
             frame => Ok(self.core.send(CoreEvent::Frame { link: self.id, frame }).await.is_ok()),
         }
     }
@@ -341,11 +464,14 @@ impl ControlRx {
 
 /// Brings what comes over a link into the data path, within what its peer may send.
 #[derive(Clone)]
-struct Inflow {
+pub(crate) struct Inflow {
     link: AnyLink,
+    /// The only name whose packets may come, if it is a lane.
+    only: Option<Name>,
     id: LinkId,
     data: Arc<DataPlane>,
     rate: Option<Arc<PeerRate>>,
+    activity: Arc<Activity>,
 }
 
 /// What becomes of a packet.
@@ -359,13 +485,34 @@ enum Admission {
 }
 
 impl Inflow {
-    fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>) -> Self {
+    fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>, activity: Arc<Activity>) -> Self {
         let rate = data.rates().of(link.peer().node_id);
-        Self { link: link.clone(), id, data, rate }
+        Self { link: link.clone(), only: None, id, data, rate, activity }
+    }
+
+    /// The same for a lane of the link.
+    pub(crate) fn by_lane(&self, lane: AnyLink, name: Name) -> Self {
+        Self { link: lane, only: Some(name), ..self.clone() }
+    }
+
+    /// Starts to take in.
+    pub(crate) fn spawn(self) {
+        tokio::spawn(self.clone().accept_flows());
+        tokio::spawn(self.read_datagrams());
+    }
+
+    /// True if a packet may come here; otherwise it is counted.
+    fn belongs(&self, packet: &Packet) -> bool {
+        let belongs = self.only.is_none_or(|only| only == packet.header.name);
+        if !belongs {
+            self.data.drop_packet(self.id, packet, DataDrop::WrongWay);
+        }
+        belongs
     }
 
     /// A message that cannot wait is judged by its beginning; one that is under way is slowed like a reliable one.
     async fn admit(&self, packet: &Packet) -> Admission {
+        self.activity.note();
         let Some(rate) = &self.rate else { return Admission::Granted };
         let bytes = packet.encoded_bytes();
         if !packet.header.reliable && packet.header.index == 0 {
@@ -391,6 +538,7 @@ impl Inflow {
         let (id, data, remote) = (self.id, &self.data, self.link.remote());
         loop {
             match flow.recv().await {
+                Ok(Some(packet)) if !self.belongs(&packet) => return flow.stop(FlowEnd::Unwanted),
                 Ok(Some(packet)) => match self.admit(&packet).await {
                     Admission::Granted => data.forward(id, packet).await,
                     Admission::OverRate if packet.header.fragments() == 1 => {}
@@ -421,7 +569,9 @@ impl Inflow {
         while let Ok(received) = self.link.recv_datagram().await {
             match received {
                 // Whatever it says of itself, a datagram keeps those behind it waiting.
+                Ok(packet) if !self.belongs(&packet) => {}
                 Ok(packet) => {
+                    self.activity.note();
                     if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
                         data.forward(id, packet).await;
                     }
@@ -458,7 +608,8 @@ mod tests {
 
     use super::*;
     use crate::core::now;
-    use crate::finding::{Board, Dns, keep_at};
+    use crate::finding::{Board, Dns, WayBook, keep_at};
+    use crate::roaming::Network;
 
     /// What a control task was told, as far as links go.
     #[derive(Debug, PartialEq)]
@@ -519,6 +670,8 @@ mod tests {
 
     /// A node that keeps a link to a router, both with control tasks of the test.
     struct Bench {
+        board: Board,
+        change_network: watch::Sender<u64>,
         fleet: Fleet,
         arm: CredentialStore,
         router: CredentialStore,
@@ -531,7 +684,8 @@ mod tests {
         /// Whether nobody greets.
         mute: Arc<AtomicBool>,
         close_far: mpsc::Sender<LinkId>,
-        _stop: oneshot::Sender<()>,
+        far_core: mpsc::Sender<CoreEvent>,
+        stops: Vec<oneshot::Sender<()>>,
     }
 
     fn enroll(fleet: &Fleet, node: &str) -> Arc<Identity> {
@@ -539,8 +693,24 @@ mod tests {
         Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
+    fn door(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Door {
+        let (core, credentials) = (core.clone(), credentials.clone());
+        Door {
+            core,
+            credentials,
+            claims: Claims::default(),
+            audit: Audit::default(),
+            lanes: LaneDoor::default(),
+        }
+    }
+
     impl Bench {
         fn new() -> Self {
+            Self::by(Vec::new())
+        }
+
+        /// With better ways to the router than the one that works.
+        fn by(mut ways: Vec<LinkUrl>) -> Self {
             let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
             let arm = CredentialStore::new(enroll(&fleet, "arm"));
             let router = CredentialStore::new(enroll(&fleet, "router"));
@@ -554,22 +724,45 @@ mod tests {
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            let door = Door {
-                core: far_core,
-                credentials: router.clone(),
-                claims: Claims::default(),
-                audit: Audit::default(),
-            };
-            tokio::spawn(keep_accepting(listener, door, stopped));
+            tokio::spawn(keep_accepting(listener, door(&far_core, &router), stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             let me = arm.identity().node_id();
             let (dns, claims) = (Dns::default(), Claims::default());
-            let holder = Holder { me, dialer, dns, core: near_core, redial: on_redial, claims };
-            let line = Board::default().line(&url, "static");
+            let book = WayBook::default();
+            let (change_network, network) = Network::told();
+            let holder = Holder {
+                me,
+                lane_dialer: dialer.clone(),
+                dialer,
+                dns,
+                core: near_core,
+                redial: on_redial,
+                claims,
+                network,
+                ways: book,
+            };
+            let board = Board::default();
+            let line = board.line(&url, "static");
             let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
-            tokio::spawn(keep_at(url, holder, line, rng));
-            Self { fleet, arm, router, redial, near, far, doors, far_closes, mute, close_far, _stop: stop }
+            ways.push(url);
+            tokio::spawn(keep_at(Aim::by(ways).unwrap(), holder, line, rng));
+            Self {
+                board,
+                change_network,
+                fleet,
+                arm,
+                router,
+                redial,
+                near,
+                far,
+                doors,
+                far_closes,
+                mute,
+                close_far,
+                far_core,
+                stops: vec![stop],
+            }
         }
 
         fn cert(store: &CredentialStore) -> CertId {
@@ -587,7 +780,7 @@ mod tests {
         }
     }
 
-    /// Greets as another node and gives so many labels, which are acknowledged; then sends this frame. How the link ends.
+    /// Greets as another node and gives so many labels, which are acknowledged, and asks for a pulse; then sends this frame. How the link ends.
     async fn end_after(labels: u32, frame: Control) -> CloseReason {
         let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
         let addr = "quic://127.0.0.1:0".parse().unwrap();
@@ -597,7 +790,13 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, _told) = control_task(Arc::default(), Arc::default(), mpsc::channel(1).1);
         let (_stop, stopped) = oneshot::channel();
-        let door = Door { core, credentials: router, claims: Claims::default(), audit: Audit::default() };
+        let door = Door {
+            core,
+            credentials: router,
+            claims: Claims::default(),
+            audit: Audit::default(),
+            lanes: LaneDoor::default(),
+        };
         tokio::spawn(keep_accepting(listener, door, stopped));
         let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
@@ -610,6 +809,11 @@ mod tests {
             link.send_control(Control::Label { label, name: Name([1; 32]) }.to_bytes()).await.unwrap();
             assert_eq!(heard().await, Control::LabelAck { label });
         }
+        // What is an answer has none.
+        for answers in [true, false] {
+            link.send_control(Control::Pulse { answers }.to_bytes()).await.unwrap();
+        }
+        assert_eq!(heard().await, Control::Pulse { answers: true });
         link.send_control(frame.to_bytes()).await.unwrap();
         match soon(link.closed()).await {
             LinkError::Closed { by_peer: true, reason } => reason,
@@ -618,7 +822,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn labels_are_acknowledged_and_who_breaks_their_order_is_cut_off() {
+    async fn labels_and_pulses_are_answered_and_who_breaks_their_order_is_cut_off() {
         let label = |index| Control::Label { label: Label::new(index).unwrap(), name: Name([2; 32]) };
         let ack = Control::LabelAck { label: Label::new(0).unwrap() };
         assert_eq!(end_after(3, Control::Goodbye).await, CloseReason::Goodbye);
@@ -642,6 +846,40 @@ mod tests {
             bench.expect_up(id + 1).await;
             bench.expect(Told::Down(LinkId(id)), Told::Down(LinkId(id))).await;
         }
+    }
+
+    #[tokio::test]
+    async fn a_way_that_is_silent_is_passed_over_until_it_works_again() {
+        // Nobody answers there.
+        let mute = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let url: LinkUrl = format!("quic://{}", mute.local_addr().unwrap()).parse().unwrap();
+        let mut bench = Bench::by(vec![url]);
+        bench.expect_up(1).await;
+        let passed_over = async {
+            while bench.board.snapshot()[0].why_not_first.is_none() {
+                tokio::task::yield_now().await;
+            }
+        };
+        soon(passed_over).await;
+        let row = &bench.board.snapshot()[0];
+        let why = "quic: no answer within 0.7 s; is UDP blocked?";
+        assert_eq!((row.why_not_first.as_deref(), row.state), (Some(why), "linked"));
+        // The better way works again, and another network is a reason to try it.
+        let addr = format!("quic://{}", mute.local_addr().unwrap()).parse().unwrap();
+        drop(mute);
+        let listener = Listener::bind(&addr, bench.router.clone(), LinkOptions::default(), Arc::default());
+        let (stop, stopped) = oneshot::channel();
+        bench.stops.push(stop);
+        let door = door(&bench.far_core, &bench.router);
+        tokio::spawn(keep_accepting(listener.unwrap(), door, stopped));
+        bench.change_network.send_modify(|change| *change += 1);
+        bench.expect_up(2).await;
+        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        let row = &bench.board.snapshot()[0];
+        assert_eq!(
+            (row.why_not_first.as_deref(), row.at.as_deref()),
+            (None, Some(addr.to_string().as_str()))
+        );
     }
 
     #[tokio::test]

@@ -27,14 +27,22 @@ use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
-use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted};
+use crate::file_watch::FileWatch;
+use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
+use crate::heart::Patience;
+use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
 use crate::message_keys;
 use crate::peer_rate::PeerRates;
 use crate::reload::{ConfigSource, Reloader, Running};
+use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
 use crate::state::{self, StateError};
 
+/// How much later than a pulse the transport keeps a link alive by itself.
+const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
+/// How long the transport keeps a link over which nothing comes, at least: two and a half of the longest times between pulses.
+const IDLE_TIMEOUT_MIN: Duration = Duration::from_secs(40);
 /// How long queues may take to empty at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
 /// From how long before its certificate's end a node warns of it.
@@ -151,6 +159,8 @@ pub struct RunOptions {
     pub source: Option<ConfigSource>,
     /// Each message has the configuration read again, as SIGHUP does.
     pub reload: Option<mpsc::Receiver<()>>,
+    /// The file that `source` reads, to be read again when it changes, if its configuration does not say otherwise.
+    pub file: Option<PathBuf>,
     /// The port of mDNS, if not its own: so that tests have a local network each.
     pub mdns_port: Option<u16>,
 }
@@ -253,6 +263,7 @@ pub async fn run_on<N: RosNetwork>(
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
+    let file_watch = options.file.filter(|_| config.watch).map(|file| FileWatch::begin(file, &config));
     let state = state_dir(&config, identity.node_name().as_str())?;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
     rules.warnings.iter().for_each(|warning| warn!("{warning}"));
@@ -262,7 +273,18 @@ pub async fn run_on<N: RosNetwork>(
     let credentials = CredentialStore::new(identity.clone());
     credentials.set_anchors(anchors.clone());
     credentials.set_admitted(rules.partners.admitted.clone());
-    let link_options = LinkOptions { post_quantum: identity.post_quantum(), ..LinkOptions::default() };
+    let patience = config.keep_alive.map_or_else(Patience::default, Patience::fixed);
+    let link_options = LinkOptions {
+        post_quantum: identity.post_quantum(),
+        // Pulses come first; these are for peers that are asked by nobody any more.
+        keep_alive: patience.max + KEEP_ALIVE_SLACK,
+        idle_timeout: IDLE_TIMEOUT_MIN.max(patience.max * 5 / 2),
+        congestion: config.transport.congestion,
+        offload: config.transport.offload,
+        mtu_discovery: config.transport.mtu_discovery,
+        dscp: config.transport.dscp,
+        ..LinkOptions::default()
+    };
     let listeners = config
         .listen
         .iter()
@@ -272,7 +294,15 @@ pub async fn run_on<N: RosNetwork>(
         })
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
-    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options, transport.clone()));
+    let dialer = Arc::new(Dialer::new(credentials.clone(), link_options.clone(), transport.clone()));
+    // Packets are marked by their socket.
+    let lane_dialer = match config.transport.lane_dscp {
+        None => dialer.clone(),
+        marked => {
+            let options = LinkOptions { dscp: marked, ..link_options };
+            Arc::new(Dialer::new(credentials.clone(), options, transport.clone()))
+        }
+    };
 
     let mut rng = system_rng()?;
     let started = now();
@@ -321,6 +351,7 @@ pub async fn run_on<N: RosNetwork>(
     let claims = Claims::default();
     let (core, requested) = Core::new(CoreParts {
         board: board.clone(),
+        patience,
         message_keys,
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
@@ -360,14 +391,18 @@ pub async fn run_on<N: RosNetwork>(
     let holder = Holder {
         me: identity.node_id(),
         dialer: dialer.clone(),
+        lane_dialer: lane_dialer.clone(),
         dns: Dns::new(config.resolver),
         core: events.clone(),
         redial: on_redial,
         claims: claims.clone(),
+        network: Network::watch(),
+        ways: WayBook::open(state.as_deref()),
     };
     let heard = local.clone().zip(nearby);
     tasks.extend(finding::start(&config.routers, &rules.routers, &holder, &board, heard, &mut rng));
     drop(holder);
+    let lanes = LaneDoor::default();
     let mut accepting = Vec::new();
     for listener in listeners {
         info!("listening on {}", listener.local());
@@ -377,6 +412,7 @@ pub async fn run_on<N: RosNetwork>(
             credentials: credentials.clone(),
             claims: claims.clone(),
             audit: audit.clone(),
+            lanes: lanes.clone(),
         };
         accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
     }
@@ -392,8 +428,8 @@ pub async fn run_on<N: RosNetwork>(
         running: Mutex::new(Running { config, rules, suites }),
         changed: Notify::new(),
     });
-    let watch = reloader.clone();
-    tasks.push(tokio::spawn(async move { watch.watch_expiry().await }));
+    let expiring = reloader.clone();
+    tasks.push(tokio::spawn(async move { expiring.watch_expiry().await }));
     if let Some(mut asked) = options.reload {
         let reloader = reloader.clone();
         tasks.push(tokio::spawn(async move {
@@ -402,6 +438,9 @@ pub async fn run_on<N: RosNetwork>(
                 let _ = reloader.reload("SIGHUP").await;
             }
         }));
+    }
+    if let Some(watch) = file_watch {
+        tasks.push(tokio::spawn(watch.run(reloader.clone())));
     }
     match admin::bind_socket(&socket) {
         Ok(listener) => tasks.push(tokio::spawn(admin::serve(listener, events.clone(), reloader.clone()))),
@@ -448,7 +487,8 @@ pub async fn run_on<N: RosNetwork>(
         let _ = stop.send(());
         let _ = task.await;
     }
-    dialer.close(CloseReason::Goodbye).await;
+    // Where it is the same, it has nothing to do the second time.
+    tokio::join!(dialer.close(CloseReason::Goodbye), lane_dialer.close(CloseReason::Goodbye));
     let _ = core.await;
     drop(reloader);
     if tokio::time::timeout(DRAIN_MAX, all_ended.recv()).await.is_err() {
@@ -511,6 +551,7 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
         },
         static_peers: ros.static_peers.clone(),
         tag: Some(identity.node_name().to_string()),
+        graph: ros.graph,
         cyclonedds_uri: ros.cyclonedds_uri.clone(),
     }
 }

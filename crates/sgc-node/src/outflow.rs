@@ -8,12 +8,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use sgc_transport::{AnyLink, Delivery, FlowEnd, FlowTx, Link, LinkError};
-use sgc_wire::{Name, Packet, SourceId};
+use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
+use sgc_wire::{Label, Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
 
 use crate::labels::NameLabel;
+use crate::lanes::Lanes;
 use crate::queue::{PushError, Queue};
 use crate::stats::DataDrop;
 
@@ -25,8 +26,23 @@ pub(crate) const OUTFLOW_RELIABLE_BYTES_MAX: usize = 4 << 20;
 pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
 /// Bytes of best-effort packets that may wait; of larger messages only what fits is kept, and they are lost.
 pub(crate) const OUTFLOW_BYTES_MAX: usize = 16 << 20;
-/// How long a best-effort packet may wait; then it is worth nothing.
+/// How long a best-effort packet may wait if nothing else is said; then it is worth nothing.
 pub(crate) const OUTFLOW_AGE_MAX: Duration = Duration::from_secs(1);
+
+/// What becomes of best-effort packets that wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct FlowLimits {
+    /// How long one may wait; judged at the beginning of a message.
+    pub max_age: Duration,
+    /// Of messages in one packet, too, only the newest of each source waits.
+    pub newest_only: bool,
+}
+
+impl Default for FlowLimits {
+    fn default() -> Self {
+        Self { max_age: OUTFLOW_AGE_MAX, newest_only: false }
+    }
+}
 
 /// A packet, and since when it waits.
 type Waiting = (Packet, Instant);
@@ -44,7 +60,13 @@ pub(crate) struct OutFlow {
 
 impl OutFlow {
     /// Starts the task that sends; it ends when the flow is closed and empty, or the link ends.
-    pub(crate) fn spawn(link: AnyLink, name: Name, label: Option<NameLabel>) -> Arc<Self> {
+    pub(crate) fn spawn(
+        link: AnyLink,
+        name: Name,
+        label: Option<NameLabel>,
+        lanes: Arc<Lanes>,
+        limits: FlowLimits,
+    ) -> Arc<Self> {
         let flow = Arc::new(Self {
             queue: Queue::new(OUTFLOW_PACKETS_MAX),
             complete: AtomicUsize::new(0),
@@ -52,14 +74,24 @@ impl OutFlow {
         });
         let task = flow.clone();
         tokio::spawn(async move {
-            let mut sender = Sender { link, label, reliable: None, messages: VecDeque::new(), before: None };
+            let mut sender = Sender {
+                by: link.clone(),
+                lane: None,
+                name,
+                link,
+                lanes,
+                label,
+                reliable: None,
+                messages: VecDeque::new(),
+            };
             // Of the message that is being sent, and what came between.
             let mut taken = VecDeque::new();
             while let Some((packet, since)) = task.next(&mut taken).await {
                 // Judged by its beginning: a large message that is under way goes on.
                 let begins = !packet.header.reliable && packet.header.index == 0;
-                let stale = begins && since.elapsed() > OUTFLOW_AGE_MAX;
-                if task.is_superseded(&packet) || stale {
+                let stale = begins && since.elapsed() > limits.max_age;
+                let newer = limits.newest_only && task.has_newer(&packet, &mut taken);
+                if task.is_superseded(&packet) || newer || stale {
                     sender.abandon(&packet);
                     continue;
                 }
@@ -147,10 +179,26 @@ impl OutFlow {
     fn take_rest(&self, first: &Packet, taken: &mut VecDeque<Waiting>) {
         let id = |packet: &Packet| (packet.header.source, packet.header.seq);
         let ends = |packet: &Packet| id(packet) == id(first) && packet.header.is_last();
-        while !taken.back().is_some_and(|(packet, _)| ends(packet)) {
+        let mut is_whole = taken.iter().any(|(packet, _)| ends(packet));
+        while !is_whole {
             let Some(next) = self.queue.try_pop() else { return };
+            is_whole = ends(&next.0);
             taken.push_back(next);
         }
+    }
+
+    /// True if a best-effort message in one packet has a newer one of its source behind it. What waits is taken for that.
+    fn has_newer(&self, packet: &Packet, taken: &mut VecDeque<Waiting>) -> bool {
+        let is_one = |packet: &Packet| !packet.header.reliable && packet.header.fragments() == 1;
+        if !is_one(packet) {
+            return false;
+        }
+        while taken.len() < OUTFLOW_PACKETS_MAX
+            && let Some(next) = self.queue.try_pop()
+        {
+            taken.push_back(next);
+        }
+        taken.iter().any(|(next, _)| is_one(next) && next.header.source == packet.header.source)
     }
 
     /// True if a packet begins or continues a best-effort message that a complete newer one overtakes.
@@ -181,25 +229,75 @@ struct Message {
 
 /// The link's end.
 struct Sender {
+    /// What is sent by: the link, or a lane of it.
+    by: AnyLink,
+    /// The number of the lane.
+    lane: Option<u64>,
+    name: Name,
     link: AnyLink,
+    lanes: Arc<Lanes>,
     /// Of the one name that all packets are of.
     label: Option<NameLabel>,
     reliable: Option<FlowTx>,
     /// Best-effort messages in several packets that are being sent, the oldest first.
     messages: VecDeque<Message>,
-    /// The last that was sent, which may still be under way. No other is: what the transport has, nothing newer takes
-    /// the place of, and many at once would all come late.
-    before: Option<Delivery>,
 }
 
 impl Sender {
     async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
+        if packet.header.index == 0 {
+            self.choose().await?;
+        }
+        match self.send_by(packet).await {
+            // The lane ended and the link did not: the next message goes over that.
+            Err(error) if self.lane.is_some() && !error.is_link_alive() => {
+                debug!(name = %self.name.short(), %error, "a lane ended; its topic shares the link");
+                self.take_link();
+                Ok(())
+            }
+            other => other,
+        }
+    }
+
+    /// Takes the lane if there is one, else the link. What was sent by the other arrives first, or its lane is gone.
+    async fn choose(&mut self) -> Result<(), LinkError> {
+        let lane = self.lanes.of(&self.name);
+        if lane.as_ref().map(|(number, _)| *number) == self.lane {
+            return Ok(());
+        }
+        if let Some(flow) = self.reliable.take() {
+            let delivered = async { flow.finish_slowly().await?.done().await };
+            match delivered.await {
+                Err(error) if self.lane.is_none() && !error.is_link_alive() => return Err(error),
+                Ok(()) | Err(_) => {}
+            }
+        }
+        self.take_link();
+        if let Some((number, lane)) = lane {
+            (self.by, self.lane) = (lane, Some(number));
+        }
+        Ok(())
+    }
+
+    /// From here on everything is sent over the link.
+    fn take_link(&mut self) {
+        (self.by, self.lane) = (self.link.clone(), None);
+        self.reliable = None;
+        self.messages.clear();
+    }
+
+    /// Labels are the link's own.
+    fn label(&self) -> Option<Label> {
+        self.label.as_ref().filter(|_| self.lane.is_none()).and_then(NameLabel::known)
+    }
+
+    async fn send_by(&mut self, packet: Packet) -> Result<(), LinkError> {
         let header = &packet.header;
-        let label = self.label.as_ref().and_then(NameLabel::known);
+        let label = self.label();
         if header.reliable {
             let flow = match &mut self.reliable {
                 Some(flow) => flow,
-                none => none.insert(self.link.open_flow(header.class).await?),
+                none => none.insert(self.by.open_flow(header.class).await?),
             };
             return match flow.send_as(&packet, label).await {
                 // The far side gave up this flow, not the link: begin another.
@@ -211,9 +309,9 @@ impl Sender {
             };
         }
         if header.fragments() == 1
-            && self.link.datagram_max().is_some_and(|max| packet.encoded_bytes_as(label) <= max)
+            && self.by.datagram_max().is_some_and(|max| packet.encoded_bytes_as(label) <= max)
         {
-            return match self.link.send_datagram_as(&packet, label).await {
+            return match self.by.send_datagram_as(&packet, label).await {
                 // The path's limit sank in between.
                 Err(LinkError::DatagramTooLong { .. }) => self.send_alone(&packet).await,
                 other => other,
@@ -229,7 +327,7 @@ impl Sender {
             {
                 oldest.flow.reset(FlowEnd::Stale);
             }
-            let flow = self.link.open_flow(header.class).await?;
+            let flow = self.by.open_flow(header.class).await?;
             self.messages.push_back(Message { id, next: 0, flow });
         }
         let at = self.messages.iter().position(|m| (m.id, m.next) == (id, header.index));
@@ -240,7 +338,8 @@ impl Sender {
             sent => {
                 let ended = at.and_then(|at| self.messages.remove(at));
                 match (sent, ended) {
-                    (Ok(()), Some(message)) => return self.await_delivery(message.flow).await,
+                    // All of it was let in by the link, which has room for the newest then.
+                    (Ok(()), Some(message)) => return message.flow.finish().await,
                     // The far side gave up this flow, not the link.
                     (Ok(()) | Err(LinkError::FlowStopped(_)), _) => {}
                     (Err(error), _) => return Err(error),
@@ -250,17 +349,9 @@ impl Sender {
         Ok(())
     }
 
-    /// Ends the flow of a message, and waits for the one before.
-    async fn await_delivery(&mut self, flow: FlowTx) -> Result<(), LinkError> {
-        match self.before.replace(flow.finish_slowly().await?) {
-            Some(mut before) => before.done().await,
-            None => Ok(()),
-        }
-    }
-
     async fn send_alone(&mut self, packet: &Packet) -> Result<(), LinkError> {
-        let mut flow = self.link.open_flow(packet.header.class).await?;
-        match flow.send_as(packet, self.label.as_ref().and_then(NameLabel::known)).await {
+        let mut flow = self.by.open_flow(packet.header.class).await?;
+        match flow.send_as(packet, self.label()).await {
             Ok(()) => flow.finish().await,
             // The far side gave up this flow, not the link.
             Err(LinkError::FlowStopped(_)) => Ok(()),
@@ -342,5 +433,29 @@ mod tests {
             }
         }
         assert_eq!(begun, [999]);
+    }
+
+    #[tokio::test]
+    async fn of_messages_in_one_packet_the_newest_of_each_source_waits_if_so_wished() {
+        let one = |source: u8, seq| {
+            let mut packet = packet(seq, 0);
+            (packet.header.source, packet.header.total) = (SourceId([source; 16]), 1000);
+            packet
+        };
+        let flow = OutFlow::idle();
+        for seq in 1..10 {
+            flow.push(one(2, seq)).await;
+            flow.push(one(3, seq)).await;
+        }
+        for index in 0..3 {
+            flow.push(packet(10, index)).await;
+        }
+        let (mut taken, mut sent) = (VecDeque::new(), vec![]);
+        while let Some((next, _)) = taken.pop_front().or_else(|| flow.queue.try_pop()) {
+            if !flow.has_newer(&next, &mut taken) {
+                sent.push((next.header.source.0[0], next.header.seq));
+            }
+        }
+        assert_eq!(sent, [(2, 9), (3, 9), (2, 10), (2, 10), (2, 10)]);
     }
 }

@@ -4,9 +4,9 @@
 
 use std::fmt::Write as _;
 
-use sgc_ros::ShareRule;
+use sgc_ros::{Interface, Part, ShareRule};
 use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
-use sgc_wire::{GroupTag, Metadata, NodeId, Role};
+use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 
 use crate::config::{Recipient, ShareConfig};
 use crate::partners::Partners;
@@ -45,6 +45,10 @@ pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> 
         all
     };
     let mut policy = Policy { subscribe: all(&share.to), publish: all(&share.publish) };
+    // Tokens are for topics.
+    if share.interface != Interface::Topic {
+        return policy;
+    }
     for grant in tokens_of(share, partners) {
         match grant.node {
             Some(node) => drop(policy.subscribe.nodes.insert(node)),
@@ -54,18 +58,37 @@ pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> 
     policy
 }
 
-/// What the machine needs to know of a share.
-pub fn share_rule(share: &ShareConfig, identity: &Identity, partners: &Partners) -> ShareRule {
-    ShareRule {
-        metadata: metadata(share, identity.node_name().as_str()),
-        policy: policy(share, identity, partners),
+/// What the machine needs to know of a share: a rule for each topic and each service that it is made of.
+pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Vec<ShareRule> {
+    let whole = metadata(share, identity.node_name().as_str());
+    let policy = policy(share, identity, partners);
+    let rule = |part: &Part| ShareRule {
+        metadata: Metadata {
+            kind: part.kind,
+            ros_name: part.name(&share.topic),
+            type_name: part.type_name(share.type_name.as_deref()).unwrap_or_default(),
+            ..whole.clone()
+        },
+        naming: share.naming.of_part(part),
+        policy: match part.kind {
+            // Who calls publishes; nobody hears what others ask.
+            Kind::Service => Policy { subscribe: Grantees::default(), publish: policy.subscribe.clone() },
+            _ => policy.clone(),
+        },
         suite: share.suite,
         class: share.priority,
-    }
+        shaping: share.shaping,
+        dedicated: share.dedicated,
+    };
+    share.interface.parts().iter().map(rule).collect()
 }
 
-/// What the name of a share of `owner` follows from.
+/// What the name of a share of `owner` follows from. One with a wildcard has as many names as there are topics that match.
 pub fn metadata(share: &ShareConfig, owner: &str) -> Metadata {
+    metadata_as(share, owner, &share.naming.renamed(&share.topic, &share.topic))
+}
+
+fn metadata_as(share: &ShareConfig, owner: &str, topic: &str) -> Metadata {
     let extra = share.metadata.clone();
     let type_name = share.type_name.clone().unwrap_or_default();
     Metadata {
@@ -75,7 +98,7 @@ pub fn metadata(share: &ShareConfig, owner: &str) -> Metadata {
         interface: extra.interface,
         description: extra.description,
         unique: extra.unique,
-        ..Metadata::topic(owner, &share.topic, &type_name)
+        ..Metadata::topic(owner, topic, &type_name)
     }
 }
 

@@ -114,6 +114,11 @@ impl<T> Queue<T> {
         self.drained.notify_waiters();
     }
 
+    /// True if nothing waits.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.items.is_empty()
+    }
+
     /// Bytes that wait.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {

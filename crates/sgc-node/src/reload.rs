@@ -9,10 +9,10 @@ use std::time::Duration;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_ros::{ShareRule, UseRule};
+use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
-use sgc_wire::UnixMillis;
+use sgc_wire::{Kind, UnixMillis};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tracing::{info, warn};
 
@@ -74,6 +74,11 @@ struct Prepared {
 }
 
 impl Reloader {
+    /// What runs.
+    pub(crate) async fn config(&self) -> Config {
+        self.running.lock().await.config.clone()
+    }
+
     /// Reads the configuration again. An error means that nothing was touched.
     pub(crate) async fn reload(&self, by: &str) -> Result<ReloadReport, String> {
         let result = self.try_reload().await;
@@ -201,7 +206,7 @@ impl Reloader {
 fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     let mut lines = Vec::new();
     let shares = |rules: &Rules| -> BTreeMap<String, ShareRule> {
-        rules.shares.iter().map(|s| (s.metadata.ros_name.clone(), s.clone())).collect()
+        rules.shares.iter().map(|s| (called(s.metadata.kind, &s.metadata.ros_name), s.clone())).collect()
     };
     let (before, after) = (shares(old), shares(new));
     for topic in before.keys().filter(|topic| !after.contains_key(*topic)) {
@@ -214,8 +219,11 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
             Some(known) => lines.push(share_change(topic, known, rule)),
         }
     }
-    let place =
-        |rule: &UseRule| (rule.owner_name.clone(), rule.topic.clone(), rule.token.clone().map(|t| t.0));
+    let place = |rule: &UseRule| {
+        let publishes = rule.direction == Direction::Publish;
+        let token = rule.token.clone().map(|t| t.0);
+        (rule.owner_name.clone(), called(rule.kind, &rule.topic), token, publishes)
+    };
     let uses = |rules: &Rules| -> BTreeMap<_, _> {
         rules.uses.iter().map(|rule| (place(rule), rule.clone())).collect()
     };
@@ -228,7 +236,7 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
         match before.get(key) {
             None => lines.push(format!("{} of {} is used{}", key.1, key.0, by(rule))),
             Some(known) if known == rule => {}
-            Some(_) => lines.push(format!("{} of {} is used with another type", key.1, key.0)),
+            Some(_) => lines.push(format!("{} of {} is used otherwise", key.1, key.0)),
         }
     }
     let trusted = |rules: &Rules| rules.partners.certificates.clone();
@@ -245,6 +253,11 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     lines
 }
 
+/// What is no topic says so.
+fn called(kind: Kind, name: &str) -> String {
+    if kind == Kind::Service { format!("service {name}") } else { name.to_owned() }
+}
+
 /// Whether the same CAs are in both, in whatever order.
 fn same(a: &[CertificateDer<'_>], b: &[CertificateDer<'_>]) -> bool {
     a.len() == b.len() && a.iter().all(|ca| b.contains(ca))
@@ -258,13 +271,16 @@ fn share_change(topic: &str, known: &ShareRule, rule: &ShareRule) -> String {
     if known.policy.publish != rule.policy.publish {
         what.push("who may publish");
     }
-    let changes_share =
-        (known.suite, known.class, &known.metadata) != (rule.suite, rule.class, &rule.metadata);
+    let changes_share = (known.suite, known.class, &known.metadata, &known.naming.rename)
+        != (rule.suite, rule.class, &rule.metadata, &rule.naming.rename);
     let end = if changes_share { "; it begins anew" } else { "" };
     for (is_changed, word) in [
         (known.suite != rule.suite, "its suite"),
+        (known.shaping != rule.shaping, "how much of it goes out"),
         (known.class != rule.class, "its priority"),
         (known.metadata != rule.metadata, "its type or metadata"),
+        (known.naming.rename != rule.naming.rename, "its name for others"),
+        (known.naming.except != rule.naming.except, "what it leaves out"),
     ] {
         if is_changed {
             what.push(word);
@@ -280,6 +296,7 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.identity != config.identity, "`identity`"),
         (now.routers != config.routers, "`routers`"),
         (now.resolver != config.resolver, "`resolver`"),
+        (now.keep_alive != config.keep_alive, "`keep_alive`"),
         (now.listen != config.listen, "`listen` in [router]"),
         (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
         (now.mapping != config.mapping, "`mapping` in [router]"),
@@ -287,9 +304,11 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         // Shares and uses join the default network where the file says nothing of it.
         (now.ros != config.ros, "[ros]"),
         (now.state != config.state, "`state`"),
+        (now.watch != config.watch, "`watch`"),
         (now.authority != config.authority, "[authority]"),
         (now.rotation != config.rotation, "[rotation]"),
         (now.audit != config.audit, "[audit]"),
+        (now.transport != config.transport, "[transport]"),
         (now.admin_socket != config.admin_socket, "`socket` in [admin]"),
     ]
     .into_iter()

@@ -6,12 +6,12 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use sgc_ros::{Direction, ShareRule, UseRule};
+use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
 use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
-use sgc_wire::{NodeId, UnixMillis};
+use sgc_wire::{Kind, NodeId, UnixMillis};
 
 use crate::audit::PeerNames;
-use crate::config::{Config, Recipient, RouterUrl, TokenSource, UseConfig};
+use crate::config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
 use crate::partners::{PartnerError, Partners};
 use crate::{policy, state};
 
@@ -41,24 +41,26 @@ impl Rules {
     ) -> Result<Self, RulesError> {
         let mut rules = Self { partners: Partners::load(config, state, now)?, ..Self::default() };
         let mut names = BTreeSet::new();
-        for source in &config.tokens {
-            let token = match source {
+        for one in &config.tokens {
+            let token = match &one.source {
                 TokenSource::File(path) => read_token(path)?,
                 TokenSource::Text(token) => ShareToken::clone(token),
             };
             if !names.insert(token.name()) {
                 return Err(RulesError::TokenTwice { topic: token.metadata.ros_name.clone() });
             }
-            rules.add_token(config, identity, token, now)?;
+            rules.add_token(config, identity, token, one, now)?;
         }
         let partners = &rules.partners;
-        rules.shares = config.shares.iter().map(|s| policy::share_rule(s, identity, partners)).collect();
-        let of_fleet = config.uses.iter().filter_map(|u| use_rule(u, identity));
+        rules.shares =
+            config.shares.iter().flat_map(|s| policy::share_rules(s, identity, partners)).collect();
+        let of_fleet = config.uses.iter().flat_map(|u| use_rules(u, identity));
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
         for grant in &rules.partners.tokens {
             let is_shared = |s: &crate::config::ShareConfig| {
-                s.topic == grant.topic && s.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
+                (s.interface, &s.topic) == (Interface::Topic, &grant.topic)
+                    && s.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
             };
             if !config.shares.iter().any(is_shared) {
                 rules.warnings.push(format!(
@@ -75,14 +77,19 @@ impl Rules {
         config: &Config,
         identity: &Identity,
         token: ShareToken,
+        wanted: &TokenConfig,
         now: UnixMillis,
     ) -> Result<(), RulesError> {
         let topic = token.metadata.ros_name.clone();
         if token.owner == identity.node_id() {
             return Err(RulesError::OwnToken { topic });
         }
-        if config.shares.iter().any(|share| share.topic == topic) {
-            return Err(RulesError::SharedAndUsed { topic });
+        let here = wanted.naming.renamed(&topic, &topic);
+        if config.shares.iter().any(|share| (share.interface, &share.topic) == (Interface::Topic, &here)) {
+            return Err(RulesError::SharedAndUsed { topic: here });
+        }
+        if !is_topic_name(&here) {
+            return Err(RulesError::TokenName { topic: here });
         }
         if token.expires < now {
             let (owner, expires) = (&token.owner_name, token.expires);
@@ -107,9 +114,15 @@ impl Rules {
             direction: Direction::Bring,
             owner: token.owner,
             owner_name: token.owner_name.to_string(),
+            kind: Kind::Topic,
             topic,
+            naming: wanted.naming.clone(),
+            frame_prefix: wanted.frame_prefix.clone(),
             type_name: Some(token.metadata.type_name.clone()),
             token: Some((token.name(), token.metadata)),
+            class: None,
+            shaping: Shaping::default(),
+            dedicated: wanted.dedicated,
         });
         Ok(())
     }
@@ -127,15 +140,29 @@ pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
     ShareToken::parse(&text).map_err(|source| RulesError::Token { path: path.to_owned(), source })
 }
 
-fn use_rule(rule: &UseConfig, identity: &Identity) -> Option<UseRule> {
-    Some(UseRule {
-        direction: if rule.publish { Direction::Publish } else { Direction::Bring },
-        owner: identity.node_id_of(rule.from.as_str())?,
+/// A rule for each topic and each service that is used.
+fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
+    let Some(owner) = identity.node_id_of(rule.from.as_str()) else { return Vec::new() };
+    let part = |part: &Part| UseRule {
+        direction: match part.kind {
+            // What is called is sent requests.
+            Kind::Service => Direction::Publish,
+            _ if rule.publish => Direction::Publish,
+            _ => Direction::Bring,
+        },
+        owner,
         owner_name: rule.from.to_string(),
-        topic: rule.topic.clone(),
-        type_name: rule.type_name.clone(),
+        kind: part.kind,
+        topic: part.name(&rule.topic),
+        naming: rule.naming.of_part(part),
+        frame_prefix: rule.frame_prefix.clone(),
+        type_name: part.type_name(rule.type_name.as_deref()),
         token: None,
-    })
+        class: rule.priority,
+        shaping: rule.shaping,
+        dedicated: rule.dedicated,
+    };
+    rule.interface.parts().iter().map(part).collect()
 }
 
 /// What the configuration calls peers.
@@ -187,6 +214,14 @@ pub enum RulesError {
     #[error("the token for {topic} is this node's own: it is for a partner")]
     OwnToken {
         /// The topic.
+        topic: String,
+    },
+    /// What a token brings has no name here.
+    #[error(
+        "a token brings {topic:?} here, which is no name for a topic of ROS 2, or too long a one: give another with `as`"
+    )]
+    TokenName {
+        /// The name here.
         topic: String,
     },
     /// What would come back.

@@ -3,28 +3,39 @@
 //! [`LocalSink::deliver`] opens packets on the task that received them. Writing may block, so each local
 //! writer has a thread, behind a bounded queue.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use arc_swap::ArcSwap;
-use sgc_endpoint::{AskAgain, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
-use sgc_ros::{RosError, RosWriter, SampleKind};
+use arc_swap::{ArcSwap, ArcSwapOption};
+use sgc_endpoint::{AskAgain, Decompressor, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
+use sgc_ros::{
+    EndpointSpec, Guid, RosError, RosWriter, SampleKind, Shaping, of_all_instances, prefix_frames,
+};
 use sgc_router::LinkId;
-use sgc_wire::{MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
+use sgc_wire::{History, MessageHead, MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
 use tokio::sync::mpsc;
+use tokio::time::{sleep_until, timeout_at};
 use tracing::{debug, warn};
 
 use crate::dataplane::DataPlane;
 use crate::queue::Queue;
+use crate::shaper::Shaper;
 use crate::stats::{DataDrop, Drops};
+use crate::tap::{Tapped, Taps};
 
 /// Messages that may wait for one local writer.
 const WRITER_MESSAGES_MAX: usize = 1024;
 /// Bytes that may wait for one local writer.
 const WRITER_BYTES_MAX: usize = 64 << 20;
+/// How long a burst waits for local readers to take what a writer keeps.
+const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
+/// How long nobody waits for a local reader that did not.
+const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
+/// Messages of a transient-local writer that are known again.
+const RECENT_MAX: usize = 4096;
 /// How long the network is held back by a local writer that takes nothing.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -42,8 +53,8 @@ struct State {
     sink: Option<Sink>,
     /// Messages, one or several that waited for a grant, that are not written yet.
     releases: u32,
-    /// True if something that can be asked for again was not taken, for want of a writer.
-    missed: bool,
+    /// Sources of which something that can be asked for again was not taken, for want of a writer.
+    missed: BTreeSet<SourceId>,
 }
 
 /// A joined name's end at this node.
@@ -57,7 +68,13 @@ pub(crate) struct LocalSink {
     writers: ArcSwap<BTreeMap<Option<SourceId>, Arc<WriterQueue>>>,
     requests: mpsc::Sender<SinkRequest>,
     delivered: AtomicU64,
+    shaping: Mutex<Shaping>,
+    taps: Taps,
+    frames: FramePrefix,
 }
+
+/// What the names of frames get in front, if anything; shared with the writers.
+pub(crate) type FramePrefix = Arc<ArcSwapOption<String>>;
 
 impl LocalSink {
     /// A sink without a grant.
@@ -70,7 +87,20 @@ impl LocalSink {
             writers: ArcSwap::default(),
             requests,
             delivered: AtomicU64::new(0),
+            shaping: Mutex::default(),
+            taps: Taps::default(),
+            frames: FramePrefix::default(),
         }
+    }
+
+    /// Who looks at what is given to the local network.
+    pub(crate) fn taps(&self) -> &Taps {
+        &self.taps
+    }
+
+    /// Local readers that its writers are matched with: the most of any of them.
+    pub(crate) fn matched(&self) -> u32 {
+        self.writers.load().values().map(|writer| (writer.behind.matched)()).max().unwrap_or(0)
     }
 
     /// Takes a grant. Packets that waited for it are written by a task of their own, since that may take a
@@ -157,19 +187,65 @@ impl LocalSink {
         let opened = writers.contains_key(&source);
         self.writers.store(Arc::new(writers));
         if opened {
-            let state = &mut *self.lock();
-            if let (Some(sink), true) = (&mut state.sink, std::mem::take(&mut state.missed)) {
-                sink.suspect();
-            }
+            self.ask_for_missed(&mut self.lock());
         }
         if let Some(old) = old {
             old.queue.close();
         }
     }
 
+    /// Gives a writer to another source of the same publisher; false if there is none. What it wrote already and the new
+    /// source has in its history is not written again.
+    pub(crate) fn move_writer(&self, from: SourceId, to: SourceId) -> bool {
+        let mut writers = BTreeMap::clone(&self.writers.load());
+        let Some(writer) = writers.remove(&Some(from)) else { return false };
+        writer.begin_again();
+        writers.insert(Some(to), writer);
+        self.writers.store(Arc::new(writers));
+        let state = &mut *self.lock();
+        if let Some(sink) = &mut state.sink {
+            sink.forget(&from);
+        }
+        self.ask_for_missed(state);
+        true
+    }
+
+    /// What was not taken for want of a writer has to be asked for where there is one now.
+    fn ask_for_missed(&self, state: &mut State) {
+        for source in std::mem::take(&mut state.missed) {
+            match &mut state.sink {
+                Some(sink) if self.has_writer(&source) => sink.suspect(&source),
+                Some(sink) if sink.recovers(&source) => drop(state.missed.insert(source)),
+                _ => {}
+            }
+        }
+    }
+
+    /// Sets how much is written from here on.
+    pub(crate) fn set_shaping(&self, shaping: Shaping) {
+        *self.shaping.lock().unwrap_or_else(PoisonError::into_inner) = shaping;
+        self.writers.load().values().for_each(|writer| writer.set_shaping(shaping));
+    }
+
+    /// How much is written.
+    pub(crate) fn shaping(&self) -> Shaping {
+        *self.shaping.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What the names of frames in tf messages get in front from here on.
+    pub(crate) fn set_frames(&self, prefix: Option<String>) {
+        self.frames.store(prefix.map(Arc::new));
+    }
+
+    /// What the names of frames get in front, now and later.
+    pub(crate) fn frames(&self) -> FramePrefix {
+        self.frames.clone()
+    }
+
     /// Ends all writers after what is queued.
     pub(crate) fn close(&self) {
         self.writers.load().values().for_each(|w| w.close());
+        self.taps.close();
     }
 
     /// Messages given to the local network.
@@ -185,7 +261,8 @@ impl LocalSink {
             let Some(sink) = sink else { return Some((DataDrop::NotGranted, 1)) };
             let source = packet.header.source;
             if !self.has_writer(&source) && sink.recovers(&source) {
-                *missed = true;
+                // Of those that it knows, which are not many.
+                missed.insert(source);
                 return Some((DataDrop::NoWriter, 1));
             }
             let behind = *releases > 0;
@@ -245,10 +322,14 @@ impl LocalSink {
             Err(message) => message,
         };
         let Some(writer) = self.writer(&message.source) else { return Some((DataDrop::NoWriter, 1)) };
-        let bytes = message.payload.len();
+        let (bytes, head) = (message.payload.len(), message.head);
         self.delivered.fetch_add(1, Relaxed);
+        self.taps.offer(|| Tapped::of_message(&message));
         match writer.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await {
-            Ok(()) => None,
+            Ok(()) => {
+                writer.remember(&head);
+                None
+            }
             Err(_) => Some((DataDrop::Stalled, 1)),
         }
     }
@@ -256,14 +337,22 @@ impl LocalSink {
     /// Queues a message for its writer and says what was dropped; gives it back if it has to wait for room.
     fn write_now(&self, message: Message) -> Result<Option<(DataDrop, u64)>, Message> {
         let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
-        let bytes = message.payload.len();
+        let (bytes, head) = (message.payload.len(), message.head);
+        if writer.has_written(&head) {
+            return Ok(Some((DataDrop::Repeated, 1)));
+        }
         let mut evicted = 0;
+        let tapped = self.taps.is_any().then(|| Tapped::of_message(&message));
         if message.reliable {
             writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
         } else {
             writer.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
         }
+        writer.remember(&head);
         self.delivered.fetch_add(1, Relaxed);
+        if let Some(tapped) = tapped {
+            self.taps.offer(|| tapped);
+        }
         Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
     }
 
@@ -295,35 +384,211 @@ impl Drop for Releasing<'_> {
 /// The queue before a local writer's thread.
 pub(crate) struct WriterQueue {
     queue: Queue<Message>,
+    shaper: Mutex<Shaper>,
+    behind: Behind,
+}
+
+/// What is known of who takes the messages of a queue.
+pub(crate) struct Behind {
+    guid: Guid,
+    recent: Option<Mutex<Recent>>,
+    /// Local readers that it is matched with.
+    matched: Box<dyn Fn() -> u32 + Send + Sync>,
+}
+
+impl Default for Behind {
+    fn default() -> Self {
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0) }
+    }
+}
+
+/// What a transient-local writer wrote last: as much as its publisher gives late joiners.
+struct Recent {
+    depth: usize,
+    heads: VecDeque<MessageHead>,
+    /// True while what comes may have been written before: the history of a source that took over from another.
+    again: bool,
+}
+
+impl Recent {
+    fn new(spec: &EndpointSpec) -> Option<Mutex<Self>> {
+        let history = spec.qos.history;
+        let depth = match if spec.keyless { history } else { of_all_instances(history) } {
+            _ if !spec.qos.is_transient_local() => return None,
+            History::KeepAll => RECENT_MAX,
+            History::KeepLast(n) => (n as usize).min(RECENT_MAX),
+        };
+        Some(Mutex::new(Self { depth, heads: VecDeque::new(), again: false }))
+    }
 }
 
 impl WriterQueue {
-    /// Starts the thread; it ends, and the writer with it, once the queue is closed and empty.
+    /// Starts the thread; it ends, and the writer with it, once the queue is closed and empty. `frames` is for tf messages.
     pub(crate) fn spawn<W: RosWriter>(
         writer: W,
-        topic: String,
+        spec: &EndpointSpec,
+        shaping: Shaping,
+        frames: Option<FramePrefix>,
         failures: Arc<Drops>,
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<Arc<Self>> {
-        let this = Arc::new(Self { queue: Queue::new(WRITER_MESSAGES_MAX) });
-        let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
-        thread::Builder::new().name("sgc-write".into()).spawn(move || {
-            let _alive = alive;
-            while let Some(message) = runtime.block_on(task.queue.pop()) {
-                let kind = match message.head.kind {
-                    MessageKind::Write => SampleKind::Write,
-                    MessageKind::Dispose => SampleKind::Dispose,
-                    MessageKind::Unregister => SampleKind::Unregister,
-                    MessageKind::Synced | MessageKind::Mark => continue,
-                };
-                if let Err(error) = writer.write(kind, message.head.source_timestamp_ns, message.payload)
-                    && failures.count(failure_key(&error))
-                {
-                    warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
+        let (counted, topic) = (failures.clone(), spec.topic.clone());
+        let writer = Arc::new(writer);
+        // The thread alone keeps it: it ends there, where it may block.
+        let weak = Arc::downgrade(&writer);
+        let mut burst = Burst::new(match spec.qos.history {
+            History::KeepLast(n) if spec.qos.is_reliable() => Some(n),
+            _ => None,
+        });
+        let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
+        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched };
+        let mut decompressor = Decompressor::default();
+        Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, is_alone| {
+            let kind = match message.head.kind {
+                MessageKind::Write => SampleKind::Write,
+                MessageKind::Dispose => SampleKind::Dispose,
+                MessageKind::Unregister => SampleKind::Unregister,
+                // Nobody calls a topic.
+                _ => return,
+            };
+            let payload = match decompressor.decompress(message.head.encoding, message.payload) {
+                Ok(payload) => payload,
+                Err(error) => {
+                    if counted.count("decompress") {
+                        warn!(%topic, %error, "a message is not given to the local network; counted from here on");
+                    }
+                    return;
                 }
+            };
+            let prefix = frames.as_ref().and_then(|frames| frames.load_full());
+            let payload = match prefix.filter(|_| kind == SampleKind::Write) {
+                None => payload,
+                Some(prefix) => match prefix_frames(&payload, &prefix) {
+                    Ok(rewritten) => rewritten.into(),
+                    Err(error) => {
+                        if counted.count("frames") {
+                            warn!(%topic, %error, "a message is not given to the local network; counted from here on");
+                        }
+                        return;
+                    }
+                },
+            };
+            burst.before_next(&*writer, is_alone);
+            if let Err(error) = writer.write(kind, message.head.source_timestamp_ns, payload)
+                && counted.count(failure_key(&error))
+            {
+                warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
+            }
+        })
+    }
+
+    /// The same with somebody else who takes the messages, one after the other, and hears whether none waits behind it; it may
+    /// block.
+    pub(crate) fn spawn_with(
+        thread_name: &str,
+        behind: Behind,
+        shaping: Shaping,
+        drops: Arc<Drops>,
+        alive: mpsc::Sender<()>,
+        mut take: impl FnMut(Message, bool) + Send + 'static,
+    ) -> std::io::Result<Arc<Self>> {
+        let mut shaper = Shaper::default();
+        shaper.set(shaping);
+        let this = Arc::new(Self { queue: Queue::new(WRITER_MESSAGES_MAX), shaper: shaper.into(), behind });
+        let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
+        thread::Builder::new().name(thread_name.into()).spawn(move || {
+            let _alive = alive;
+            let mut behind = None;
+            while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
+                let is_alone = task.queue.is_empty();
+                take(message, is_alone);
             }
         })?;
         Ok(this)
+    }
+
+    /// The writer's.
+    pub(crate) fn guid(&self) -> Guid {
+        self.behind.guid
+    }
+
+    /// Sets how much is written from here on.
+    pub(crate) fn set_shaping(&self, shaping: Shaping) {
+        self.shaper().set(shaping);
+    }
+
+    /// The next message whose time has come; the newest of those that came meanwhile where one gives way to the next.
+    /// `behind` is what was taken after it and may not overtake it.
+    async fn next(&self, behind: &mut Option<Message>, drops: &Drops) -> Option<Message> {
+        let mut message = match behind.take() {
+            Some(message) => message,
+            None => self.queue.pop().await?,
+        };
+        loop {
+            let now = Instant::now();
+            let (due, gives_way) = {
+                let mut shaper = self.shaper();
+                let is_shaped = message.head.kind == MessageKind::Write;
+                if !is_shaped || shaper.is_due(now) || self.queue.is_closed() {
+                    if is_shaped {
+                        shaper.takes(now, message.payload.len());
+                    }
+                    return Some(message);
+                }
+                (shaper.due().unwrap_or(now), shaper.gives_way(now, message.reliable))
+            };
+            if !gives_way {
+                sleep_until(due.into()).await;
+                continue;
+            }
+            match timeout_at(due.into(), self.queue.pop()).await {
+                Ok(Some(newer)) if newer.head.kind == MessageKind::Write => {
+                    drops.count(DataDrop::Thinned.key());
+                    message = newer;
+                }
+                // The end of an instance is not left out, nor is what was said before it.
+                Ok(Some(end)) => {
+                    *behind = Some(end);
+                    return Some(message);
+                }
+                Ok(None) => return Some(message),
+                Err(_) => {}
+            }
+        }
+    }
+
+    /// From here on what was written before may come once more.
+    fn begin_again(&self) {
+        self.with_recent(|recent| recent.again = true);
+    }
+
+    /// Whether a message was written before. Told by its time: a publisher dates no two messages alike. Behind the first that
+    /// was not only news come.
+    fn has_written(&self, head: &MessageHead) -> bool {
+        let is_known = |recent: &mut Recent| {
+            recent.again = recent.again && recent.heads.contains(head);
+            recent.again
+        };
+        self.with_recent(is_known).unwrap_or(false)
+    }
+
+    fn remember(&self, head: &MessageHead) {
+        self.with_recent(|recent| {
+            if recent.heads.len() >= recent.depth {
+                recent.heads.pop_front();
+            }
+            recent.heads.push_back(*head);
+        });
+    }
+
+    /// Nothing if its publisher keeps nothing for late joiners.
+    fn with_recent<T>(&self, look: impl FnOnce(&mut Recent) -> T) -> Option<T> {
+        let recent = self.behind.recent.as_ref()?;
+        Some(look(&mut recent.lock().unwrap_or_else(PoisonError::into_inner)))
+    }
+
+    fn shaper(&self) -> std::sync::MutexGuard<'_, Shaper> {
+        self.shaper.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Ends the thread after what is queued.
@@ -332,10 +597,95 @@ impl WriterQueue {
     }
 }
 
-fn failure_key(error: &RosError) -> &'static str {
+/// Keeps what comes at once, after a way was interrupted, from overwriting itself in a reliable writer that keeps the last
+/// samples, which never blocks. Its publisher said it in its own time, and its readers would have had it.
+struct Burst {
+    /// Samples that the writer keeps; `None` if it blocks by itself, or nobody acknowledges.
+    depth: Option<u32>,
+    unacknowledged: u32,
+    /// A reader that stands still is not waited for again before.
+    not_before: Option<Instant>,
+}
+
+impl Burst {
+    fn new(depth: Option<u32>) -> Self {
+        Self { depth, unacknowledged: 0, not_before: None }
+    }
+
+    /// Waits before a sample would take the place of one that somebody may lack. One that comes alone is written at once, as
+    /// its publisher did.
+    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool) {
+        let Some(depth) = self.depth else { return };
+        if is_alone || self.not_before.is_some_and(|at| Instant::now() < at) {
+            // By the next that comes with others it will have been acknowledged, or waited for.
+            self.unacknowledged = self.unacknowledged.saturating_add(1).min(depth);
+            return;
+        }
+        if self.unacknowledged >= depth {
+            let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
+            self.not_before = (!acknowledged).then(|| Instant::now() + STALLED_READER_PAUSE);
+            self.unacknowledged = 0;
+        }
+        self.unacknowledged += 1;
+    }
+}
+
+/// A short, stable name of a failure for counters.
+pub(crate) fn failure_key(error: &RosError) -> &'static str {
     match error {
         RosError::Payload { .. } => "write_payload",
         RosError::WriteTimeout { .. } => "write_timeout",
+        RosError::NoPeer { .. } => "no_local_peer",
         _ => "write_failed",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicBool, AtomicUsize};
+
+    use bytes::Bytes;
+
+    use super::*;
+
+    #[derive(Default)]
+    struct Slow {
+        waited: AtomicUsize,
+        stands_still: AtomicBool,
+    }
+
+    impl RosWriter for Slow {
+        fn write(&self, _: SampleKind, _: i64, _: Bytes) -> Result<(), RosError> {
+            Ok(())
+        }
+
+        fn wait_acknowledged(&self, _: Duration) -> bool {
+            self.waited.fetch_add(1, Relaxed);
+            !self.stands_still.load(Relaxed)
+        }
+
+        fn matched_readers(&self) -> u32 {
+            1
+        }
+
+        fn guid(&self) -> Guid {
+            Guid([0; 16])
+        }
+    }
+
+    #[test]
+    fn a_burst_waits_for_its_readers_but_not_for_one_that_stands_still() {
+        let writer = Slow::default();
+        let mut burst = Burst::new(Some(10));
+        (0..100).for_each(|_| burst.before_next(&writer, true));
+        assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
+        (0..100).for_each(|_| burst.before_next(&writer, false));
+        assert_eq!(writer.waited.load(Relaxed), 10);
+        writer.stands_still.store(true, Relaxed);
+        (0..1000).for_each(|_| burst.before_next(&writer, false));
+        assert!(writer.waited.load(Relaxed) <= 12, "once in a while");
+        let mut other = Burst::new(None);
+        (0..100).for_each(|_| other.before_next(&writer, false));
+        assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
     }
 }

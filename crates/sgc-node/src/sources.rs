@@ -7,19 +7,25 @@
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{Marks, PublishError, Source, SourceProgress};
-use sgc_ros::{Guid, Sample, SampleKind};
+use bytes::Bytes;
+use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
+use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
-use sgc_wire::{MessageHead, MessageKind, Name, Packet, Recover, SourceId, TopicGrant};
+use sgc_wire::{
+    MessageHead, MessageKind, Name, Packet, PayloadEncoding, Recover, SinkId, SourceId, TopicGrant,
+};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
+use tracing::warn;
 
 use crate::dataplane::DataPlane;
+use crate::shaper::Shaper;
 use crate::stats::DataDrop;
+use crate::tap::{Tapped, Taps};
 
 /// Samples that may wait for their writer to be discovered.
 const EARLY_SAMPLES_MAX: usize = 256;
@@ -37,20 +43,22 @@ pub(crate) struct SourceSlot {
     pub keeps_history: bool,
     /// True if its packets are reliable.
     pub reliable: bool,
+    /// How long its messages are of use.
+    pub lifespan: Option<Duration>,
 }
 
 impl SourceSlot {
     /// A source for a share.
     pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
         let (id, progress) = (source.id(), source.progress());
-        Self { id, source: Arc::new(Mutex::new(source)), progress, keeps_history, reliable }
+        Self { id, source: Arc::new(Mutex::new(source)), progress, keeps_history, reliable, lifespan: None }
     }
 }
 
 /// Which source publishes for which writer.
 #[derive(Default)]
 pub(crate) struct SourceMap {
-    /// For writers that have none of their own.
+    /// For all, where writers are not told apart.
     pub shared: Option<SourceSlot>,
     /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until
     /// it is.
@@ -76,6 +84,24 @@ impl SourceMap {
     }
 }
 
+/// What is held back of a topic that is not to go out as it comes.
+#[derive(Default)]
+struct Held {
+    shaper: Shaper,
+    /// The newest that waits for its time.
+    sample: Option<Sample>,
+    /// Whether a task is to let it go.
+    is_timed: bool,
+}
+
+/// How messages are made shorter.
+#[derive(Default)]
+struct Compression {
+    encoding: Mutex<(PayloadEncoding, Compressor)>,
+    before: AtomicU64,
+    after: AtomicU64,
+}
+
 /// What is between the local reader and the sources.
 #[derive(Default)]
 struct Inbox {
@@ -94,6 +120,14 @@ pub(crate) struct LocalShare {
     alive: mpsc::Sender<()>,
     pub map: ArcSwap<SourceMap>,
     inbox: Mutex<Inbox>,
+    /// Whether anything is set of how much goes out, to be seen without the lock.
+    is_shaped: AtomicBool,
+    held: Mutex<Held>,
+    compression: Compression,
+    /// Told when it is closed, for who waits for his time.
+    ended: Condvar,
+    /// Whether it was said that reliable messages do not age.
+    aged: AtomicBool,
     /// How many those are, to be seen without the lock, which a publisher holds while it is pushed back.
     waiting: AtomicUsize,
     closed: AtomicBool,
@@ -110,6 +144,7 @@ pub(crate) struct LocalShare {
     /// True while there is nothing to see: the next message says that there is.
     quiet: AtomicBool,
     published: AtomicU64,
+    taps: Taps,
 }
 
 impl LocalShare {
@@ -133,6 +168,11 @@ impl LocalShare {
             alive,
             map: ArcSwap::default(),
             inbox: Mutex::default(),
+            is_shaped: AtomicBool::new(false),
+            held: Mutex::default(),
+            compression: Compression::default(),
+            ended: Condvar::new(),
+            aged: AtomicBool::new(false),
             waiting: AtomicUsize::new(0),
             closed: AtomicBool::new(false),
             epoch_messages_max,
@@ -142,11 +182,97 @@ impl LocalShare {
             marks: Mutex::default(),
             quiet: AtomicBool::new(true),
             published: AtomicU64::new(0),
+            taps: Taps::default(),
         }
     }
 
-    /// Publishes a sample; called on the reader's thread.
-    pub(crate) fn publish(&self, sample: Sample) {
+    /// Who looks at what is published.
+    pub(crate) fn taps(&self) -> &Taps {
+        &self.taps
+    }
+
+    /// Sets how much goes out from here on.
+    pub(crate) fn set_shaping(&self, shaping: Shaping) {
+        lock(&self.held).shaper.set(shaping);
+        lock(&self.compression.encoding).0 = shaping.compression;
+        let limits = Shaping { compression: PayloadEncoding::Plain, ..shaping };
+        self.is_shaped.store(limits != Shaping::default(), SeqCst);
+    }
+
+    /// How much goes out.
+    pub(crate) fn shaping(&self) -> Shaping {
+        *lock(&self.held).shaper.shaping()
+    }
+
+    /// Publishes a sample, now or when its time has come; called on the reader's thread.
+    pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
+        if !self.is_shaped.load(Relaxed) {
+            return self.publish_now(sample);
+        }
+        let ends_batch = !sample.more;
+        match self.shape(sample) {
+            Some(sample) => self.publish_now(sample),
+            // What came before it is not to wait for what may never come.
+            None if ends_batch => self.flush(&mut lock(&self.inbox)),
+            None => {}
+        }
+    }
+
+    /// A sample that may go now; others are held back until their time has come, or until there is a newer one. Waits
+    /// with one that may be neither dropped nor overtaken.
+    fn shape(self: &Arc<Self>, sample: Sample) -> Option<Sample> {
+        let mut held = lock(&self.held);
+        if sample.kind != SampleKind::Write {
+            // The end of an instance comes behind what was said of it last, and is never left out.
+            if let Some(before) = held.sample.take() {
+                drop(held);
+                self.publish_now(Sample { more: true, ..before });
+            }
+            return Some(sample);
+        }
+        let reliable = self.map.load().slots().any(|slot| slot.reliable);
+        if held.shaper.shaping().max_age.is_some() && reliable {
+            if !self.aged.swap(true, Relaxed) {
+                let topic = self.name.short();
+                warn!(%topic, "`max_age` is set for a topic that is reliable: none of its messages may be left out, and it has no effect");
+            }
+        } else if held.shaper.is_too_old(unix_ns(), sample.source_timestamp_ns) {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooOld);
+            return None;
+        }
+        let mut now = Instant::now();
+        while !held.shaper.is_due(now) && !self.closed.load(Relaxed) {
+            if held.shaper.gives_way(now, reliable) {
+                if held.sample.replace(sample).is_some() {
+                    self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+                }
+                if !std::mem::replace(&mut held.is_timed, true) {
+                    self.runtime.spawn(let_go(Arc::downgrade(self)));
+                }
+                return None;
+            }
+            let wait = held.shaper.due().map_or(Duration::ZERO, |due| due.saturating_duration_since(now));
+            held = self.ended.wait_timeout(held, wait).unwrap_or_else(PoisonError::into_inner).0;
+            now = Instant::now();
+        }
+        if held.sample.take().is_some() {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+        }
+        held.shaper.takes(now, sample.payload.len());
+        Some(sample)
+    }
+
+    /// The sample that was held back, if its time has come.
+    fn take_held(&self) -> Option<Sample> {
+        let mut held = lock(&self.held);
+        let now = Instant::now();
+        let sample = if held.shaper.is_due(now) { held.sample.take() } else { None }?;
+        held.shaper.takes(now, sample.payload.len());
+        Some(Sample { more: false, ..sample })
+    }
+
+    /// Publishes a sample.
+    fn publish_now(&self, sample: Sample) {
         let more = sample.more;
         let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
         self.publish_early(&mut inbox);
@@ -207,7 +333,8 @@ impl LocalShare {
             match sample.writer.and_then(|w| map.own.get(&w)) {
                 Some(slot) => Some(slot.clone()),
                 None if map.per_writer && sample.writer.is_some() => return Err(sample),
-                None => map.shared.clone(),
+                // Its writer was gone before anybody asked who it is.
+                None => map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned(),
             }
         };
         match slot {
@@ -228,7 +355,14 @@ impl LocalShare {
     }
 
     fn seal_and_send(&self, slot: &SourceSlot, sample: Sample, more: bool, wanted: bool) {
+        self.taps.offer(|| Tapped::of_sample(&sample));
+        // What may never leave is not worth the time.
+        let (encoding, payload) = match wanted || slot.keeps_history {
+            true => self.compress(sample.kind, sample.payload),
+            false => (PayloadEncoding::Plain, sample.payload),
+        };
         let head = MessageHead {
+            encoding,
             kind: match sample.kind {
                 SampleKind::Write => MessageKind::Write,
                 SampleKind::Dispose => MessageKind::Dispose,
@@ -238,11 +372,31 @@ impl LocalShare {
         };
         let result = if wanted {
             // Fragments leave as they are sealed: a large message is under way before its end is read.
-            lock(&slot.source).publish(&head, sample.payload, more, self.emit())
+            lock(&slot.source).publish(&head, payload, more, self.emit())
         } else {
             // For who joins later, or is on another way here.
-            lock(&slot.source).record(&head, sample.payload)
+            lock(&slot.source).record(&head, payload)
         };
+        self.note_published(slot, result);
+    }
+
+    /// Publishes a message about a call: what is asked and what is answered have one source each. Nothing becomes of it
+    /// while nobody would get it. May block.
+    pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) {
+        let Some(slot) = self.map.load().shared.clone() else { return };
+        if self.closed.load(Relaxed) || !self.data.is_wanted(&self.name) {
+            return;
+        }
+        let mut source = lock(&slot.source);
+        let result = match to {
+            Some(sink) => source.publish_to(sink, head, payload, self.emit()),
+            None => source.publish(head, payload, false, self.emit()),
+        };
+        drop(source);
+        self.note_published(&slot, result);
+    }
+
+    fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) {
         match result {
             Ok(()) => {
                 self.published.fetch_add(1, Relaxed);
@@ -259,10 +413,35 @@ impl LocalShare {
             Err(PublishError::TooLarge { .. }) => {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
             }
-            Err(PublishError::Exhausted) => {
+            Err(PublishError::Exhausted | PublishError::Keeps) => {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
             }
         }
+    }
+
+    /// The payload as it leaves, and what that is written in.
+    fn compress(&self, kind: SampleKind, payload: Bytes) -> (PayloadEncoding, Bytes) {
+        let mut compression = lock(&self.compression.encoding);
+        let (encoding, compressor) = &mut *compression;
+        if *encoding == PayloadEncoding::Plain || kind != SampleKind::Write {
+            return (PayloadEncoding::Plain, payload);
+        }
+        let packed = compressor.compress(*encoding, &payload);
+        let encoding = if packed.is_some() { *encoding } else { PayloadEncoding::Plain };
+        drop(compression);
+        let left = packed.unwrap_or_else(|| payload.clone());
+        self.compression.before.fetch_add(payload.len() as u64, Relaxed);
+        self.compression.after.fetch_add(left.len() as u64, Relaxed);
+        if self.is_shaped.load(Relaxed) {
+            lock(&self.held).shaper.gives_back(payload.len() - left.len());
+        }
+        (encoding, left)
+    }
+
+    /// Bytes that were to be compressed, and what came of them; nothing while none were.
+    pub(crate) fn compressed(&self) -> Option<(u64, u64)> {
+        let before = self.compression.before.load(Relaxed);
+        (before > 0).then(|| (before, self.compression.after.load(Relaxed)))
     }
 
     /// Lets go what waits for more, which does not come.
@@ -304,7 +483,11 @@ impl LocalShare {
     /// Sends a sink what it asks for, in order with what is published meanwhile. Takes as long as that takes.
     pub(crate) fn replay(&self, recover: &Recover) {
         let Some(slot) = self.map.load().slot(&recover.source) else { return };
-        lock(&slot.source).replay(recover.sink, recover.from, recover.to, |packet| {
+        let mut source = lock(&slot.source);
+        if let Some(lifespan) = slot.lifespan {
+            source.expire(unix_ns().saturating_sub(lifespan.as_nanos().try_into().unwrap_or(i64::MAX)));
+        }
+        source.replay(recover.sink, recover.from, recover.to, |packet| {
             if !self.closed.load(Relaxed) {
                 self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
             }
@@ -361,6 +544,9 @@ impl LocalShare {
     /// Ends it: a reader's thread that is publishing stops at the next packet.
     pub(crate) fn close(&self) {
         self.closed.store(true, Relaxed);
+        self.taps.close();
+        let _held = lock(&self.held);
+        self.ended.notify_all();
     }
 
     /// Signatures that its present sources made: one for each batch of packets.
@@ -374,15 +560,46 @@ impl LocalShare {
     }
 }
 
-fn lock(source: &Mutex<Source>) -> std::sync::MutexGuard<'_, Source> {
+/// Publishes what is held back when its time comes, until nothing is.
+async fn let_go(share: Weak<LocalShare>) {
+    loop {
+        let due = {
+            let Some(share) = share.upgrade() else { return };
+            let mut held = lock(&share.held);
+            held.is_timed = held.sample.is_some() && !share.closed.load(Relaxed);
+            if !held.is_timed {
+                return;
+            }
+            held.shaper.due()
+        };
+        if let Some(due) = due {
+            tokio::time::sleep_until(due.into()).await;
+        }
+        let Some(share) = share.upgrade() else { return };
+        let (runtime, alive) = (share.runtime.clone(), share.alive.clone());
+        let publish = move || {
+            let _alive = alive;
+            if let Some(sample) = share.take_held() {
+                share.publish_now(sample);
+            }
+        };
+        // Pushing back takes its time.
+        let _ = runtime.spawn_blocking(publish).await;
+    }
+}
+
+/// The clock that publishers date by.
+fn unix_ns() -> i64 {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    unix.as_nanos().try_into().unwrap_or(i64::MAX)
+}
+
+fn lock<T>(source: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     source.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
-    use bytes::Bytes;
     use sgc_endpoint::{RecoveryLimits, SourceConfig};
     use sgc_router::FibEntry;
     use sgc_trust::{MessageKey, Suite};
@@ -453,6 +670,77 @@ mod tests {
         share.closed.store(true, Relaxed);
         share.publish(sample(KNOWN, false));
         assert_eq!(unflushed(&slot), 0);
+    }
+
+    /// Until it is so, which has a bound.
+    fn wait_until(is_so: impl Fn() -> bool) {
+        let end = Instant::now() + Duration::from_secs(30);
+        while !is_so() {
+            assert!(Instant::now() < end, "it does not come");
+            std::thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn of_a_topic_with_a_rate_the_newest_goes_and_the_last_is_not_forgotten() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.set_shaping(Shaping { interval: Some(Duration::from_millis(200)), ..Shaping::default() });
+        let begin = Instant::now();
+        for _ in 0..50 {
+            share.publish(sample(KNOWN, false));
+        }
+        wait_until(|| share.published() == 2);
+        assert!(begin.elapsed() >= Duration::from_millis(200));
+        assert_eq!(share.data.drops().snapshot()["thinned"], 48);
+        assert_eq!(unflushed(&slot), 0);
+        // The end of an instance is said at once, behind what is held back of it.
+        share.publish(sample(KNOWN, false));
+        share.publish(Sample { kind: SampleKind::Dispose, ..sample(KNOWN, false) });
+        assert_eq!(share.published(), 4);
+        // What has no shape passes.
+        share.set_shaping(Shaping::default());
+        (0..10).for_each(|_| share.publish(sample(KNOWN, false)));
+        assert_eq!(share.published(), 14);
+    }
+
+    #[test]
+    fn reliable_messages_wait_for_their_bandwidth_until_it_is_closed() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, _) = share();
+        share.set_shaping(Shaping { bits_per_s: Some(8 * 80), ..Shaping::default() });
+        let begin = Instant::now();
+        // 8 bytes each, at 80 a second.
+        (0..4).for_each(|_| share.publish(sample(KNOWN, false)));
+        assert!(share.published() == 4 && begin.elapsed() >= Duration::from_millis(250));
+        share.set_shaping(Shaping { bits_per_s: Some(1), ..Shaping::default() });
+        share.publish(sample(KNOWN, false));
+        let waits = share.clone();
+        let thread = std::thread::spawn(move || waits.publish(sample(KNOWN, false)));
+        share.close();
+        thread.join().unwrap();
+        assert!(!share.data.drops().snapshot().contains_key("thinned"));
+    }
+
+    #[test]
+    fn what_is_too_old_is_left_out_unless_it_is_reliable() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let dated = |age_s: i64| Sample {
+            source_timestamp_ns: unix_ns() - age_s * 1_000_000_000,
+            ..sample(KNOWN, false)
+        };
+        for reliable in [true, false] {
+            let (share, mut slot) = share();
+            slot.reliable = reliable;
+            let own = HashMap::from([(KNOWN, slot)]);
+            share.set_map(SourceMap { shared: None, per_writer: true, own });
+            share.set_shaping(Shaping { max_age: Some(Duration::from_secs(5)), ..Shaping::default() });
+            [0, 60, 0].into_iter().for_each(|age| share.publish(dated(age)));
+            assert_eq!(share.published(), if reliable { 3 } else { 2 });
+        }
     }
 
     #[test]

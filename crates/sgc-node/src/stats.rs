@@ -14,6 +14,8 @@ pub(crate) struct NameStats {
     pub bytes: AtomicU64,
     /// Packets dropped.
     pub dropped: AtomicU64,
+    /// Packets and messages dropped, by reason.
+    reasons: [AtomicU64; DataDrop::ALL.len()],
 }
 
 impl NameStats {
@@ -21,6 +23,20 @@ impl NameStats {
     pub(crate) fn count(&self, bytes: usize) {
         self.packets.fetch_add(1, Relaxed);
         self.bytes.fetch_add(bytes as u64, Relaxed);
+    }
+
+    /// Counts drops by their reason.
+    pub(crate) fn count_drops(&self, reason: DataDrop, several: u64) {
+        if let Some(count) = self.reasons.get(reason as usize) {
+            count.fetch_add(several, Relaxed);
+        }
+    }
+
+    /// Drops by reason, without those that there were none of.
+    pub(crate) fn reasons(&self) -> BTreeMap<String, u64> {
+        let all = DataDrop::ALL.into_iter().zip(&self.reasons);
+        let all = all.map(|(reason, count)| (reason.key().to_owned(), count.load(Relaxed)));
+        all.filter(|(_, count)| *count > 0).collect()
     }
 }
 
@@ -53,9 +69,34 @@ pub(crate) enum DataDrop {
     NoWriter,
     /// Too large to be carried.
     TooLarge,
+    /// More of it came than the user lets on: a newer one took its place.
+    Thinned,
+    /// Older than the user lets on.
+    TooOld,
+    /// The publisher's history once more, after its node started anew.
+    Repeated,
 }
 
 impl DataDrop {
+    /// All, in the order of their numbers.
+    const ALL: [Self; 15] = [
+        Self::NoTree,
+        Self::WrongWay,
+        Self::HopLimit,
+        Self::NoSuchSink,
+        Self::Stalled,
+        Self::Stale,
+        Self::LinkClosed,
+        Self::Malformed,
+        Self::UnknownLabel,
+        Self::NotGranted,
+        Self::Sink,
+        Self::NoWriter,
+        Self::TooLarge,
+        Self::Thinned,
+        Self::TooOld,
+    ];
+
     /// A short, stable name for counters.
     pub(crate) fn key(self) -> &'static str {
         match self {
@@ -72,6 +113,9 @@ impl DataDrop {
             Self::Sink => "sink",
             Self::NoWriter => "no_writer",
             Self::TooLarge => "too_large",
+            Self::Thinned => "thinned",
+            Self::TooOld => "too_old",
+            Self::Repeated => "repeated",
         }
     }
 }
@@ -134,6 +178,18 @@ impl Drops {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_reason_has_a_counter_of_its_own() {
+        let stats = NameStats::default();
+        for (place, reason) in DataDrop::ALL.into_iter().enumerate() {
+            assert_eq!(reason as usize, place);
+            stats.count_drops(reason, place as u64 + 1);
+        }
+        let reasons = stats.reasons();
+        assert_eq!(reasons.len(), DataDrop::ALL.len());
+        assert_eq!(reasons["too_old"], DataDrop::ALL.len() as u64);
+    }
 
     #[test]
     fn culprits_are_bounded_and_totals_are_not_lost() {

@@ -25,6 +25,8 @@ pub struct Status {
     pub routers: Vec<RouterStatus>,
     /// Shares and uses, and where each stands.
     pub routes: Vec<RouteLine>,
+    /// What is wrong between local endpoints and the other side, with both values and the fix; gone when it is.
+    pub problems: Vec<String>,
     /// Names that carry data through this node.
     pub names: Vec<NameStatus>,
     /// What was dropped or refused, by kind.
@@ -56,10 +58,14 @@ pub struct LinkStatus {
     pub cost: u32,
     /// True while nothing comes over it although something should.
     pub silent: bool,
+    /// After how long without anything from the peer it is asked whether it is there, milliseconds.
+    pub keep_alive_ms: u64,
     /// Bytes sent.
     pub sent_bytes: u64,
     /// Bytes received.
     pub received_bytes: u64,
+    /// Connections beside it that carry one name each.
+    pub lanes: usize,
     /// Names that this node sends packets of under labels.
     pub labels_sent: u32,
     /// Names that the peer may send packets of under labels.
@@ -91,11 +97,20 @@ pub struct RouteLine {
     /// Signatures made for what its present publishers published; less than messages under load, since one covers a
     /// batch. 0 in the `group` suites.
     pub signatures: u64,
+    /// Of a topic that is compressed here: bytes of payload before, and after.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub compressed: Option<(u64, u64)>,
 }
 
 impl RouteLine {
-    pub(crate) fn new(route: RouteStatus, messages: Option<u64>, signatures: u64) -> Self {
+    pub(crate) fn new(
+        route: RouteStatus,
+        messages: Option<u64>,
+        signatures: u64,
+        compressed: Option<(u64, u64)>,
+    ) -> Self {
         Self {
+            compressed,
             direction: route.direction,
             topic: route.topic,
             type_name: route.type_name,

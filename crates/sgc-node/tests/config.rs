@@ -4,13 +4,17 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use sgc_node::config::{
-    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Origin, Recipient,
-    RotationConfig, SHARES_MAX, SUITES, Table, TokenSource, load, load_args, parse,
+    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Naming, Origin, Recipient,
+    Rename, RotationConfig, SHARES_MAX, SUITES, Shaping, Table, TokenConfig, TokenSource, TransportConfig,
+    load, load_args, parse,
 };
+use sgc_transport::Congestion;
 use sgc_trust::Suite;
 use sgc_wire::Class;
+use sgc_wire::PayloadEncoding;
 
 /// The least that every node needs.
 const NODE: &str = "identity = 'x'\nnode.routers = ['quic://r:7447']\n";
@@ -102,6 +106,7 @@ fn every_key_is_taken_over() {
         discovery_range = "localhost"
         localhost_only = false
         static_peers = ["10.0.0.2", "arm-2.local", "fe80::1"]
+        graph = false
         [[share]]
         topic = "/a__b/_c"
         to = ["*"]
@@ -132,6 +137,7 @@ fn every_key_is_taken_over() {
     let ros = config.ros.as_ref().unwrap();
     assert_eq!((ros.domain_id, ros.discovery), (232, DiscoveryRange::Localhost));
     assert_eq!(ros.static_peers, ["10.0.0.2", "arm-2.local", "fe80::1"]);
+    assert!(!ros.graph);
     let share = &config.shares[0];
     assert_eq!(texts(&share.to), ["*"]);
     assert_eq!(share.type_name.as_deref(), Some("sensor_msgs/msg/Image"));
@@ -181,7 +187,9 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ("[ros]\ndomain = 3", &["node.toml:4: [ros] has no key `domain`; did you mean `domain_id`?"]),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
-            &["node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `type`, `publish`, `token`"],
+            &[
+                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `token`, `link`",
+            ],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
         ("[[user]]", &["node.toml:3: the top level has no key `user`; did you mean `use`?"]),
@@ -223,42 +231,203 @@ fn planned_keys_are_called_planned() {
             let text = match table {
                 Table::Share => format!("[[share]]\ntopic = '/a'\nto = ['b']\n{key} = 1"),
                 Table::Use => format!("[[use]]\nfrom = 'b'\ntopic = '/a'\n{key} = 1"),
+                Table::Ros => format!("\n\n[ros]\n{key} = 1"),
                 _ => format!("\n\n\n[{key}]"),
             };
             let expected = format!("node.toml:6: `{key}` is planned but not in this version; take it out");
             assert_eq!(said_about(&text), [expected]);
         }
     }
+}
+
+#[test]
+fn a_table_is_about_a_topic_a_service_an_action_or_parameters() {
+    let config = good(&format!(
+        "{NODE}[[share]]\ntopic = '/a'\nto = ['b']\n[[share]]\nservice = '/a'\nto = ['b']\ntype = \
+         'std_srvs::srv::dds_::Empty_'\n[[share]]\naction = '/a'\nto = ['b']\ntype = 'p/action/T'\n[[share]]\n\
+         parameters = '/n'\nto = ['b']\n[[use]]\nfrom = 'b'\nservice = '/s'\npriority = 'realtime'"
+    ));
+    let interfaces: Vec<_> =
+        config.shares.iter().map(|s| (s.interface.key(), s.type_name.as_deref())).collect();
+    let expected = [
+        ("topic", None),
+        ("service", Some("std_srvs/srv/Empty")),
+        ("action", Some("p/action/T")),
+        ("parameters", None),
+    ];
+    assert_eq!((&interfaces[..], config.uses[0].interface.key()), (&expected[..], "service"));
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nservice = '/b'\nto = ['b']",
+            &[
+                "node.toml:5: `service` stands beside `topic`: a table is about one of them; make it two tables",
+            ],
+        ),
+        (
+            "[[share]]\nto = ['b']",
+            &["node.toml:3: [[share]] has no `topic`; add one, such as topic = \"/camera/image\""],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\naction = '/a'\ntype = 'p/msg/T'\nmax_rate = '1Hz'\npublish = true",
+            &[
+                "node.toml:6: `type` is \"p/msg/T\"; the type of `action` is spelt like \
+                 \"nav2_msgs/action/NavigateToPose\"",
+                "node.toml:7: `max_rate` is for topics, and this is about `action`: take it out",
+                "node.toml:8: `publish` is for topics, and this is about `action`: take it out",
+            ],
+        ),
+        (
+            "[[share]]\nparameters = '/a'\nto = ['b']\ntype = 'p/srv/T'",
+            &["node.toml:6: `type` is for topics, and this is about `parameters`: take it out"],
+        ),
+        (
+            "[[share]]\nservice = '/a'\nto = ['b']\n[[share]]\nservice = '/a'\nto = ['c']",
+            &[
+                "node.toml:7: `service` is \"/a\", which line 4 shares already: make it one share and join the \
+                 recipients",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn a_topic_has_the_type_of_a_message() {
     check_all(&[(
-        "[[share]]\nservice = '/add'\nto = ['b']",
-        &["node.toml:4: `service` is planned but not in this version; take it out"],
+        "[[share]]\ntopic = '/a'\nto = ['b']\ntype = 'std_srvs/srv/Empty'",
+        &[
+            "node.toml:6: `type` is \"std_srvs/srv/Empty\"; the type of `topic` is spelt like \"std_msgs/msg/String\"",
+        ],
     )]);
 }
 
 #[test]
-fn planned_values_are_called_planned() {
+fn names_may_be_patterns_and_others_elsewhere() {
+    let config = good(&format!(
+        "{NODE}[[share]]\ntopic = '/camera/**'\nexcept = ['/camera/debug/**', '/camera/raw']\nas = '/r/cam/**'\nto = ['b']\n\
+         [[share]]\ntopic = '/a'\nnamespace = '/r'\nto = ['b']\n\
+         [[use]]\nfrom = 'b'\ntopic = '/**'\nnamespace = '/b'\nframe_prefix = 'b/'\n\
+         [[use]]\nfrom = 'b'\ntopic = '/a'\nas = '/b_a'\n\
+         [[use]]\nfrom = 'b'\ntopic = '/*/cmd'\n[[use]]\nfrom = 'b'\ntopic = '/*/cmd'\npublish = true"
+    ));
+    let expected = Naming {
+        except: vec!["/camera/debug/**".into(), "/camera/raw".into()],
+        rename: Rename::As("/r/cam/**".into()),
+    };
+    assert_eq!((config.shares[0].topic.as_str(), &config.shares[0].naming), ("/camera/**", &expected));
+    assert_eq!(config.shares[1].naming.rename, Rename::Namespace("/r".into()));
+    let share_of = |topic| config.share_of(topic).map(|share| share.topic.as_str());
+    assert_eq!((share_of("/a"), share_of("/camera/x")), (Some("/a"), Some("/camera/**")));
+    for topic in ["/camera/raw", "/camera/debug/x", "/camera/_action/status", "/camera", "/b"] {
+        assert_eq!(share_of(topic), None, "{topic}");
+    }
+    assert_eq!(config.uses[0].naming.rename, Rename::Namespace("/b".into()));
+    assert_eq!(config.uses[0].frame_prefix.as_deref(), Some("b/"));
+    assert_eq!(config.uses[1].naming.rename, Rename::As("/b_a".into()));
+}
+
+#[test]
+fn what_leaves_may_be_compressed_and_nothing_else() {
+    for (word, encoding) in
+        [("zstd", PayloadEncoding::Zstd), ("lz4", PayloadEncoding::Lz4), ("none", PayloadEncoding::Plain)]
+    {
+        let config = good(&format!(
+            "{NODE}[[share]]\ntopic = '/a'\nto = ['b']\ncompress = '{word}'\n\
+             [[use]]\nfrom = 'b'\ntopic = '/b'\npublish = true\ncompress = '{word}'"
+        ));
+        let found = (config.shares[0].shaping.compression, config.uses[0].shaping.compression);
+        assert_eq!(found, (encoding, encoding));
+    }
     check_all(&[
         (
-            "[[share]]\ntopic = '/camera/**'\nto = ['b']",
+            "[[share]]\ntopic = '/a'\nto = ['b']\ncompress = 'zst'",
             &[
-                "node.toml:4: `topic` is \"/camera/**\"; wildcards are planned but not in this version: name one topic",
+                "node.toml:6: `compress` is \"zst\"; did you mean \"zstd\"? It takes \"zstd\", \"lz4\", \"none\"",
             ],
         ),
         (
-            "[[share]]\ntopic = '/a'\nto = ['b']\ntype = 'std_srvs/srv/Empty'",
+            "[[use]]\nfrom = 'b'\ntopic = '/a'\ncompress = 'lz4'",
             &[
-                "node.toml:6: `type` is \"std_srvs/srv/Empty\"; services are planned but not in this version: name a \
-               message type, such as \"std_msgs/msg/String\"",
-            ],
-        ),
-        (
-            "[router]\nlisten = ['tls://0.0.0.0:443']",
-            &[
-                "node.toml:4: `listen` is \"tls://0.0.0.0:443\"; this transport is planned but not in this version: use \
-                 quic://",
+                "node.toml:6: `compress` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out",
             ],
         ),
     ]);
+}
+
+#[test]
+fn names_that_do_not_fit_together_are_told() {
+    let share = |keys: &str| format!("[[share]]\nto = ['b']\n{keys}");
+    let one = |keys: &str, said: &str| assert_eq!(said_about(&share(keys)), [format!("node.toml:{said}")]);
+    one(
+        "topic = '/cam*'",
+        "5: `topic` is \"/cam*\"; a wildcard is a whole word of a name: '*' for one word, '**' for any number: \"/*\"",
+    );
+    one("topic = '/a//**'", "5: `topic` is \"/a//**\"; a topic name has no '//'");
+    one(
+        "topic = '/a'\nexcept = ['/b']",
+        "6: `except` is for a `topic` with wildcards, and \"/a\" has none: take it out",
+    );
+    one(
+        "topic = '/a/*'\nexcept = ['/b/c']",
+        "6: `except` names \"/b/c\", which \"/a/*\" does not cover anyway: take it out, or correct it",
+    );
+    one("topic = '/a/*'\nexcept = ['/a/c', '/a/c']", "6: `except` names \"/a/c\" twice; once is enough");
+    let both = "both end in the same wildcard, or neither has one";
+    let needs = "another name needs a topic whose only wildcard is its last word; use `namespace`";
+    for (topic, other, right) in [
+        ("/a/**", "/b", format!("{both}: \"/b/**\"")),
+        ("/a/**", "/b/*", format!("{both}: \"/b/**\"")),
+        ("/a", "/b/**", format!("{both}: \"/b\"")),
+        ("/*/a", "/b/a", needs.to_owned()),
+        ("/*/a/*", "/b/*", needs.to_owned()),
+        ("/a/*", "/*/*", needs.to_owned()),
+    ] {
+        one(
+            &format!("topic = '{topic}'\nas = '{other}'"),
+            &format!("6: `as` is \"{other}\", but the topic is \"{topic}\": {right}"),
+        );
+    }
+    one(
+        "topic = '/a'\nas = '/b'\nnamespace = '/c'",
+        "7: `namespace` stands beside `as`, which gives the whole name: take one of them out",
+    );
+    one("topic = '/a'\nnamespace = 'c'", "6: `namespace` is \"c\"; a topic name starts with '/': \"/c\"");
+    one(
+        "topic = '/a/*'\ntype = 'p/msg/T'\npublish = ['b']",
+        "7: `publish` lets others publish, which needs the name of one topic, not \"/a/*\": add a [[share]] for it",
+    );
+    let long = "w".repeat(200);
+    let said = said_about(&share(&format!("topic = '/{long}'\nnamespace = '/{long}'")));
+    assert!(said.len() == 1 && said[0].contains("at most 247 bytes"), "{said:?}");
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\nas = '/c'\n[[share]]\ntopic = '/b'\nto = ['b']\nas = '/c'",
+            &[
+                "node.toml:8: `topic`: for others it would be \"/c\", as which line 4 is shared already: change one name",
+            ],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/tf'\nframe_prefix = '/b'",
+            &[
+                "node.toml:6: `frame_prefix` is \"/b\"; it takes 1 to 64 letters, digits, '_', '-', '.' and '/', and no '/' at the beginning: \"robot1/\"",
+            ],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/tf'\nframe_prefix = 'b/'\npublish = true",
+            &["node.toml:6: `frame_prefix` is for what comes here: take it out, or `publish`"],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/**'\n[[use]]\nfrom = 'b'\ntopic = '/**'",
+            &["node.toml:8: `topic` is \"/**\" from \"b\", which line 5 uses already: take one of them out"],
+        ),
+        (
+            "[[share]]\ntopic = '/b'\nto = ['b']\n[[use]]\nfrom = 'b'\ntopic = '/a'\nas = '/b'",
+            &[
+                "node.toml:8: `topic` is \"/b\", which line 4 shares: what is used here would be shared again, in a loop; keep one",
+            ],
+        ),
+    ]);
+    // It is the name here that would make a loop.
+    good(&format!("{NODE}[[share]]\ntopic = '/a'\nto = ['b']\n[[use]]\nfrom = 'b'\ntopic = '/a'\nas = '/b'"));
 }
 
 #[test]
@@ -389,7 +558,6 @@ fn addresses_are_checked() {
         ),
         ("quic://::1", "\"::1\" is neither a host name nor an IP address (IPv6 is written in brackets)"),
         ("quic://0.0.0.0:7447", "0.0.0.0 can be listened at but not dialled: name the router's host"),
-        ("dtls://router:1", "this transport is planned but not in this version: use quic://"),
         ("http://router/x", "http:// is not known: it takes quic://HOST:PORT, srv://DOMAIN and mdns://"),
         (
             "srv://",
@@ -431,6 +599,82 @@ fn addresses_are_checked() {
 }
 
 #[test]
+fn topics_say_how_much_of_them_goes_on() {
+    const SHARE: &str = "[[share]]\ntopic = '/a'\nto = ['b']\n";
+    let shaped = |text: &str| good(&format!("{NODE}{SHARE}{text}")).shares[0].shaping;
+    let shaping = shaped("max_rate = '10Hz'\nmax_bandwidth = '2Mbps'\nmax_age = '500ms'");
+    assert_eq!(shaping.interval, Some(Duration::from_millis(100)));
+    assert_eq!((shaping.bits_per_s, shaping.max_age), (Some(2_000_000), Some(Duration::from_millis(500))));
+    assert_eq!(shaped("max_rate = '0.5Hz'\nmax_age = '2s'").interval, Some(Duration::from_secs(2)));
+    assert_eq!(shaped(""), Shaping::default());
+    let used = "[[use]]\nfrom = 'b'\ntopic = '/a'\npublish = true\npriority = 'realtime'\nmax_rate = '50Hz'";
+    let one = &good(&format!("{NODE}{used}")).uses[0];
+    assert_eq!(
+        (one.priority, one.shaping.interval),
+        (Some(Class::Realtime), Some(Duration::from_millis(20)))
+    );
+    for (key, values) in [
+        ("max_rate", ["10", "0Hz", "-1Hz", "1e3Hz", "NaNHz", "infHz", "100000Hz"].as_slice()),
+        ("max_bandwidth", &["2", "0kbps", "2MB", "2000Gbps"]),
+        ("max_age", &["0ms", "5", "2h", "99999999999999999999999ms"]),
+    ] {
+        for value in values {
+            let said = said_about(&format!("{SHARE}{key} = '{value}'"));
+            assert!(
+                said.len() == 1 && said[0].contains(&format!("`{key}` is {value:?}; it takes")),
+                "{said:?}"
+            );
+        }
+    }
+    let said = said_about("[[use]]\nfrom = 'b'\ntopic = '/a'\npriority = 'bulk'");
+    assert!(said.len() == 1 && said[0].contains("set `publish = true`"), "{said:?}");
+    let said = said_about("[[use]]\ntoken = 'a.token'\nmax_rate = '1Hz'");
+    assert!(said.iter().any(|s| s.contains("`max_rate` cannot stand beside `token`")), "{said:?}");
+}
+
+#[test]
+fn transports_are_set_by_a_table_of_their_own() {
+    let set = |text: &str| good(&format!("{NODE}[transport]\n{text}")).transport;
+    assert_eq!((good(NODE).transport, set("")), (TransportConfig::default(), TransportConfig::default()));
+    let all =
+        "congestion = 'cubic'\noffload = false\nmtu_discovery = false\ndscp = 'CS1'\nlane_dscp = 'AF41'";
+    let expected = TransportConfig {
+        congestion: Congestion::Cubic,
+        offload: false,
+        mtu_discovery: false,
+        dscp: Some(8),
+        lane_dscp: Some(34),
+    };
+    assert_eq!(set(all), expected);
+    for (text, mark) in
+        [("EF", 46), ("CS0", 0), ("CS7", 56), ("AF11", 10), ("AF43", 38), ("0", 0), ("63", 63)]
+    {
+        assert_eq!(set(&format!("dscp = '{text}'")).dscp, Some(mark), "{text}");
+    }
+    for wrong in ["", "CS8", "AF40", "AF01", "AF14", "ef", "64", "007", "CS", "EF "] {
+        let said = said_about(&format!("[transport]\ndscp = '{wrong}'"));
+        assert!(
+            said.len() == 1 && said[0].contains("it takes a class of differentiated services"),
+            "{said:?}"
+        );
+    }
+    let said = said_about("[transport]\ncongestion = 'cubik'");
+    assert!(said[0].contains("did you mean \"cubic\"?"), "{said:?}");
+}
+
+#[test]
+fn keep_alive_is_a_time_or_left_to_the_node() {
+    let kept = |text: &str| good(&format!("{NODE}node.keep_alive = '{text}'")).keep_alive;
+    assert_eq!(good(NODE).keep_alive, None);
+    let seconds = |text: &str| kept(text).map(|time| time.as_secs());
+    assert_eq!((seconds("auto"), seconds("5s"), seconds("1min")), (None, Some(5), Some(60)));
+    for wrong in ["0s", "61s", "5", "often"] {
+        let said = said_about(&format!("node.keep_alive = '{wrong}'"));
+        assert!(said.len() == 1 && said[0].contains("keep_alive") && said[0].contains(wrong), "{said:?}");
+    }
+}
+
+#[test]
 fn routers_are_found_in_three_ways() {
     let config = good(
         "[node]\nidentity = 'a'\nrouters = ['quic://r', 'srv://Lab.Example.', 'mdns://', 'mdns://cloud']\n\
@@ -439,6 +683,12 @@ fn routers_are_found_in_three_ways() {
     let expected = ["quic://r:7447", "srv://lab.example", "mdns://", "mdns://cloud"];
     assert_eq!(texts(&config.routers), expected);
     assert_eq!(config.resolver, Some("10.0.0.53:53".parse().unwrap()));
+    let config = good("node.routers = [['quic://a', 'quic://b:443'], 'quic://c']\nidentity = 'a'");
+    assert_eq!(texts(&config.routers), ["quic://a:7447,quic://b:443", "quic://c:7447"]);
+    for wrong in ["[['quic://a', 1]]", "[[]]", "[['quic://a', 'mdns://']]", "[['quic://a', 'quic://a']]"] {
+        let errors = said_of_whole(&format!("identity = 'a'\nnode.routers = {wrong}"));
+        assert_eq!(errors.len(), 1, "{errors:?}");
+    }
     for (text, addr) in [("127.0.0.1:5353", "127.0.0.1:5353"), ("::1", "[::1]:53"), ("[::1]:5", "[::1]:5")] {
         let config = good(&format!("{NODE}node.resolver = '{text}'"));
         assert_eq!(config.resolver, Some(addr.parse().unwrap()), "{text}");
@@ -739,7 +989,13 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
 #[test]
 fn a_token_says_owner_and_topic_itself() {
     let config = good(&format!("{NODE}[[use]]\ntoken = 'tokens/pose.token'"));
-    assert_eq!(config.tokens, [TokenSource::File("/etc/sgc/tokens/pose.token".into())]);
+    let source = TokenSource::File("/etc/sgc/tokens/pose.token".into());
+    assert_eq!(
+        config.tokens,
+        [TokenConfig { source, naming: Default::default(), frame_prefix: None, dedicated: false }]
+    );
+    let config = good(&format!("{NODE}[[use]]\ntoken = 'tokens/pose.token'\nlink = 'dedicated'"));
+    assert!(config.tokens[0].dedicated);
     assert!(config.uses.is_empty() && !config.is_pure_router());
     check_all(&[
         (
@@ -942,6 +1198,24 @@ fn mistakes_in_the_environment_name_the_variable() {
     assert!(errors.unwrap_err().to_string().starts_with(
         "node.toml:4: `static_peers` is not empty, but `ROS_AUTOMATIC_DISCOVERY_RANGE` is \"OFF\": no peer"
     ));
+}
+
+#[test]
+fn a_network_that_enforces_security_is_refused_and_a_permissive_one_is_not() {
+    const ENABLE: (&str, &str) = ("ROS_SECURITY_ENABLE", "true");
+    let parse = |vars: &[(&str, &str)]| parse_with(&format!("{NODE}[ros]"), vars);
+    let said = parse(&[ENABLE, ("ROS_SECURITY_STRATEGY", "Enforce")]).unwrap_err().to_string();
+    assert!(
+        said.contains("`ROS_SECURITY_STRATEGY` is \"Enforce\"; networks secured by SROS2 are planned"),
+        "{said}"
+    );
+    for vars in [
+        &[ENABLE][..],
+        &[ENABLE, ("ROS_SECURITY_STRATEGY", "Permissive")],
+        &[("ROS_SECURITY_STRATEGY", "Enforce")],
+    ] {
+        assert!(parse(vars).is_ok(), "{vars:?}");
+    }
 }
 
 #[test]

@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 use dns::{DnsServer, Record};
 use lab::*;
 use serde_json::Value;
-use sgc_node::config::{Config, RouterUrl, TokenSource};
+use sgc_node::config::{Config, RouterUrl, TokenConfig, TokenSource};
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{ShareToken, TopicSecret};
 use sgc_wire::UnixMillis;
@@ -26,7 +26,7 @@ fn urls(urls: &[&str]) -> Vec<RouterUrl> {
 /// A router of the lab on a port of its own, or on this one.
 fn router(lab: &Lab, node: &str, port: u16, mdns: Option<u16>, change: impl FnOnce(&mut Config)) -> Node {
     let ip = if mdns.is_some() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
-    let listen = vec![ListenAddr { scheme: Scheme::Quic, addr: (ip, port).into() }];
+    let listen = vec![ListenAddr::new(Scheme::Quic, (ip, port).into())];
     let mut config = Config { routers: vec![], listen, announce: mdns.is_some(), ..lab.config(node) };
     change(&mut config);
     Node::start_near(config, lab.identity(node), None, mdns)
@@ -380,7 +380,12 @@ fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Nod
     let before = branches();
     let spy = a.start("spy", |config| {
         trusting(config);
-        config.tokens = vec![TokenSource::Text(Box::new(token))];
+        config.tokens = vec![TokenConfig {
+            source: TokenSource::Text(Box::new(token)),
+            naming: Default::default(),
+            frame_prefix: None,
+            dedicated: false,
+        }];
     });
     let stolen = a.listener("spy", "/chatter");
     wait("its request passes the router and not the owner", || is_refused(&robot, &spy));

@@ -10,7 +10,7 @@ use std::sync::mpsc::channel;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata};
+use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata};
 use sgc_trust::Suite;
 use sgc_wire::{Class, History, Qos, Reliability};
 use support::*;
@@ -142,11 +142,15 @@ fn commands_overtake_images_on_a_full_link() {
     let desk = trio.desk(&["/image", "/video", "/cmd_vel"]);
     trio.port = narrow(trio.port, 40_000_000);
     let share = |(topic, priority): (&str, Class)| ShareConfig {
+        interface: Default::default(),
         topic: topic.into(),
+        naming: Default::default(),
         type_name: None,
         to: vec![Recipient::Node("desk".parse().unwrap())],
         publish: vec![],
         priority,
+        shaping: Shaping::default(),
+        dedicated: false,
         suite: Suite::Group,
         metadata: ShareMetadata::default(),
     };

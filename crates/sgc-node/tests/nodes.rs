@@ -4,11 +4,12 @@
 
 mod support;
 
+use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_node::Status;
-use sgc_ros::EndpointKind;
+use sgc_ros::{EndpointKind, Shaping};
 use sgc_trust::Suite;
 use sgc_wire::{History, Qos};
 use support::*;
@@ -28,6 +29,35 @@ fn a_topic_crosses_a_router_and_leaves_no_loop() {
     // The desk's own writer is not shared back, nor is there a reader for it.
     assert_eq!((writers(&trio.robot_net, "/chatter"), writers(&trio.desk_net, "/chatter")), (1, 1));
     assert_eq!(trio.desk_net.count("rt/chatter", EndpointKind::Reader), 1);
+}
+
+#[test]
+fn a_topic_goes_on_as_often_as_both_ends_let_it() {
+    let slow = |ms| Shaping { interval: Some(Duration::from_millis(ms)), ..Shaping::default() };
+    let trio = Trio::new();
+    let (_cloud, robot, desk) = (trio.cloud(), trio.robot(&["/a", "/b"], "desk"), trio.desk(&["/a", "/b"]));
+    robot.reload(|config| config.shares[0].shaping = slow(100));
+    desk.reload(|config| config.uses[1].shaping = slow(100));
+    for topic in ["/a", "/b"] {
+        let talker = Talker::new(&trio.robot_net, topic, Qos::default());
+        let listener = Listener::new(&trio.desk_net, topic, Qos::default());
+        talker.wait_for_readers(1);
+        listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+        let begin = Instant::now();
+        (0..300).for_each(|n| talker.say(format!("{n}")));
+        let heard = RefCell::new(Vec::new());
+        wait("the last", || {
+            heard.borrow_mut().extend(listener.drain());
+            heard.borrow().last().is_some_and(|last| last == "299")
+        });
+        let most = begin.elapsed().as_millis() as usize / 100 + 3;
+        let heard = heard.borrow();
+        let heard = heard.iter().filter(|message| !message.starts_with(b"warm")).count();
+        assert!(heard <= most, "{topic}: {heard} of {most}");
+    }
+    for node in [robot, desk] {
+        assert!(node.status()["drops"]["thinned"].as_u64().unwrap() > 100, "{}", node.status()["drops"]);
+    }
 }
 
 #[test]

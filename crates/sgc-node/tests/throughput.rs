@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_node::{RunOptions, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_transport::{ListenAddr, Scheme};
@@ -137,25 +137,35 @@ impl Way {
             state: Some(dir.join(format!("{name}.state"))),
             ..Config::default()
         };
-        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], port).into() };
+        let addr = ListenAddr::new(Scheme::Quic, ([127, 0, 0, 1], port).into());
         let cloud = Config { routers: vec![], listen: vec![addr], ..config("cloud") };
         let cloud = Node::start(cloud, identity("cloud", true), None);
         let share = ShareConfig {
+            interface: Default::default(),
             topic: TOPIC.into(),
+            naming: Default::default(),
             type_name: None,
             to: vec![Recipient::Node("desk".parse().unwrap())],
             publish: vec![],
             priority: Class::Default,
+            shaping: Shaping::default(),
+            dedicated: false,
             suite,
             metadata: ShareMetadata::default(),
         };
         let robot = Config { shares: vec![share], ..config("robot") };
         let robot = Node::start(robot, identity("robot", false), Some(network(DOMAINS[0], Some("robot"))));
         let from = UseConfig {
+            interface: Default::default(),
             publish: false,
             from: "robot".parse().unwrap(),
             topic: TOPIC.into(),
+            naming: Default::default(),
+            frame_prefix: None,
             type_name: None,
+            priority: None,
+            shaping: Shaping::default(),
+            dedicated: false,
         };
         let desk = Config { uses: vec![from], ..config("desk") };
         let desk = Node::start(desk, identity("desk", false), Some(network(DOMAINS[1], Some("desk"))));

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, TokenSource};
+use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, TokenConfig, TokenSource};
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_node::{RunOptions, create_state_dir, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
@@ -122,17 +122,21 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         ..Config::default()
     };
     // The router of the owner's fleet lets nodes of the partner in.
-    let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], 0).into() };
+    let addr = ListenAddr::new(Scheme::Quic, ([127, 0, 0, 1], 0).into());
     let config = Config { listen: vec![addr], trust: vec![at("acme.pem")], ..base("cloud") };
     let cloud = Node::start(config, identity(&mut lab, "cloud", true), None);
     let url = format!("quic://{}", cloud.listens[0].addr);
 
     let share = ShareConfig {
+        interface: Default::default(),
         topic: TOPIC.into(),
+        naming: Default::default(),
         type_name: Some(TYPE.into()),
         to: vec![Recipient::Node("desk".parse().unwrap())],
         publish: vec![],
         priority: Class::Default,
+        shaping: Shaping::default(),
+        dedicated: false,
         suite: Suite::DEFAULT,
         metadata: ShareMetadata::default(),
     };
@@ -172,7 +176,12 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
     assert!(said.contains("who may subscribe changed") && said.contains("another CA may link"), "{said}");
     let cart_net = FakeDomain::default();
     let nowhere = "quic://127.0.0.1:9".parse().unwrap();
-    let tokens = vec![TokenSource::Text(Box::new(token.clone()))];
+    let tokens = vec![TokenConfig {
+        source: TokenSource::Text(Box::new(token.clone())),
+        naming: Default::default(),
+        frame_prefix: None,
+        dedicated: false,
+    }];
     let config = Config { routers: vec![nowhere], tokens, ..base("cart") };
     let _cart = Node::start(config, cart.clone(), Some(&cart_net));
 

@@ -15,7 +15,7 @@ use lab::*;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
 use sgc_node::audit::AuditRecord;
-use sgc_node::config::{Config, TokenSource, UseConfig};
+use sgc_node::config::{Config, TokenConfig, TokenSource, UseConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_trust::{Identity, ShareToken, Suite, TopicSecret, derive_name};
 use sgc_wire::{Metadata, UnixMillis};
@@ -445,7 +445,11 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     let (leaked, _) = token_for(&lab, "/private", &acme, Some("arm"), false);
     assert_eq!(robot.reload(|_| {})["changed"][0], "/pose: who may subscribe changed");
     let with = |tokens: &[&ShareToken]| {
-        let all: Vec<_> = tokens.iter().map(|t| TokenSource::Text(Box::new((*t).clone()))).collect();
+        let by = |t: &&ShareToken| {
+            let source = TokenSource::Text(Box::new((*t).clone()));
+            TokenConfig { source, naming: Default::default(), frame_prefix: None, dedicated: false }
+        };
+        let all: Vec<_> = tokens.iter().map(by).collect();
         move |c: &mut Config| c.tokens = all.clone()
     };
     let arm = acme.start("arm", with(&[&token, &leaked]));
@@ -523,7 +527,14 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
     let talker = lab.talker("robot", "/pose");
     warm_up(&talker, &[&listeners[0].1, &listeners[1].1, &listeners[2].1]);
     let (token, _) = token_for(&lab, "/pose", &acme, Some("arm"), false);
-    let arm = acme.start("arm", |c| c.tokens = vec![TokenSource::Text(Box::new(token.clone()))]);
+    let arm = acme.start("arm", |c| {
+        c.tokens = vec![TokenConfig {
+            source: TokenSource::Text(Box::new(token.clone())),
+            naming: Default::default(),
+            frame_prefix: None,
+            dedicated: false,
+        }]
+    });
     wait("a refusal", || arm.route_state().starts_with("refused"));
     robot.reload(|c| c.shares[0].to = nodes(&["desk1", "desk3"]));
     let list = lab.revoke("desk3");

@@ -1,21 +1,31 @@
 //! The ROS 2 side of SGC, without any DDS: the local network's seam, names, QoS mapping and routes.
 //!
 //! [`Routes`] is a pure machine that decides what has to exist on the local network; [`RosNetwork`] is the seam
-//! behind which a DDS implementation provides it (`sgc-dds`). No CDR is looked into.
+//! behind which a DDS implementation provides it (`sgc-dds`). No CDR is looked into but that of tf messages ([`prefix_frames`]).
 #![forbid(unsafe_code)]
 
+mod frames;
+pub mod graph;
+mod interface;
 mod names;
 mod network;
 mod qos;
 mod routes;
 
-pub use names::{dds_topic, dds_type, ros_topic, ros_type};
+pub use frames::{FrameError, TF_MESSAGE, prefix_frames};
+pub use interface::{Interface, Part};
+pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_name, ros_topic, ros_type};
 pub use network::{
-    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError,
-    RosNetwork, RosWriter, Sample, SampleHandler, SampleKind,
+    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
+    RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
+    SampleKind, ServiceSpec,
 };
-pub use qos::{RELIABLE_READER_DEPTH_MIN, reader_for, weakest};
+pub use qos::{
+    KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosPolicy, RELIABLE_READER_DEPTH_MIN,
+    SERVICE_DEPTH, mismatches, of_all_instances, reader_for, service_qos, weakest,
+};
 pub use routes::{
-    Command, Direction, Problem, RouteStatus, Routes, SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule,
-    WRITERLESS_HOLD,
+    Command, Direction, GLOBAL_TOPICS, LITERAL_TOPICS, Naming, OfferView, Problem, REDISCOVERY_HOLD,
+    ROUTES_PER_WILDCARD_MAX, Rename, RouteStatus, Routes, SINKLESS_HOLD, Shaping, ShareRouteView, ShareRule,
+    ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseView, WRITERLESS_HOLD, is_pattern, matches,
 };

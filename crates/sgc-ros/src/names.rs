@@ -2,6 +2,66 @@
 
 /// Prefix of DDS topics that carry ROS topics.
 const TOPIC_PREFIX: &str = "rt";
+/// Prefix and suffix of DDS topics that carry requests of services, and of their types.
+const REQUEST: (&str, &str, &str) = ("rq", "Request", "_Request_");
+/// The same for replies.
+const REPLY: (&str, &str, &str) = ("rr", "Reply", "_Response_");
+
+/// Which half of a service a DDS topic carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum ServiceTopic {
+    /// What clients write and servers read.
+    Request,
+    /// What servers write and clients read.
+    Reply,
+}
+
+impl ServiceTopic {
+    const ALL: [Self; 2] = [Self::Request, Self::Reply];
+
+    fn affixes(self) -> (&'static str, &'static str, &'static str) {
+        match self {
+            Self::Request => REQUEST,
+            Self::Reply => REPLY,
+        }
+    }
+
+    /// The DDS topic of a service: `/add` → `rq/addRequest`.
+    pub fn dds_topic(self, service: &str) -> String {
+        let (prefix, suffix, _) = self.affixes();
+        format!("{prefix}{service}{suffix}")
+    }
+
+    /// The DDS type of this half of a service's: `a/srv/B` → `a::srv::dds_::B_Request_`.
+    pub fn dds_type(self, ros_type: &str) -> String {
+        let (_, _, suffix) = self.affixes();
+        let whole = dds_type(ros_type);
+        format!("{}{suffix}", whole.strip_suffix('_').unwrap_or(&whole))
+    }
+
+    /// Which half of which service a DDS topic carries, and the service's ROS type; `None` for any other.
+    pub fn of<'a>(dds_topic: &'a str, dds_type: &str) -> Option<(Self, &'a str, String)> {
+        Self::ALL.into_iter().find_map(|half| {
+            let (prefix, suffix, type_suffix) = half.affixes();
+            let service = dds_topic.strip_prefix(prefix)?.strip_suffix(suffix)?;
+            let of_type = dds_type.strip_suffix(type_suffix)?;
+            (service.len() > 1 && service.starts_with('/'))
+                .then(|| (half, service, ros_type(&format!("{of_type}_"))))
+        })
+    }
+}
+
+/// The longest ROS topic: 256 bytes of DDS less a terminator and 8 for the prefixes that rmw adds.
+pub const TOPIC_BYTES_MAX: usize = 247;
+
+/// Whether it is a fully qualified name of ROS 2 (`rmw_validate_full_topic_name`).
+pub fn is_topic_name(name: &str) -> bool {
+    let is_word = |word: &str| {
+        word.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+            && word.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+    };
+    name.len() <= TOPIC_BYTES_MAX && name.strip_prefix('/').is_some_and(|words| words.split('/').all(is_word))
+}
 
 /// The DDS topic of an absolute ROS topic: `/chatter` → `rt/chatter`.
 pub fn dds_topic(ros_topic: &str) -> String {
@@ -40,6 +100,38 @@ pub fn ros_type(dds_type: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn services_are_two_topics() {
+        let request = ("rq/ns/addRequest", "a::srv::dds_::B_Request_");
+        let reply = ("rr/ns/addReply", "a::srv::dds_::B_Response_");
+        for (half, (topic, type_name)) in [(ServiceTopic::Request, request), (ServiceTopic::Reply, reply)] {
+            assert_eq!(
+                (half.dds_topic("/ns/add"), half.dds_type("a/srv/B")),
+                (topic.into(), type_name.into())
+            );
+            assert_eq!(ServiceTopic::of(topic, type_name), Some((half, "/ns/add", "a/srv/B".into())));
+        }
+        let goal = ServiceTopic::of("rq/go/_action/send_goalRequest", "a::action::dds_::B_SendGoal_Request_");
+        assert_eq!(
+            goal,
+            Some((ServiceTopic::Request, "/go/_action/send_goal", "a/action/B_SendGoal".into()))
+        );
+        for (topic, type_name) in
+            [("rt/a", request.1), ("rq/a", request.1), ("rq/Request", request.1), (request.0, reply.1)]
+        {
+            assert_eq!(ServiceTopic::of(topic, type_name), None);
+        }
+    }
+
+    #[test]
+    fn only_full_names_are_names() {
+        assert!(["/a", "/a/b_1", "/_a"].into_iter().all(is_topic_name));
+        let long = "/a".repeat(124);
+        for name in ["", "/", "a", "/a/", "//a", "/a//b", "/1", "/a b", "/a/*", "/ä", "~/a", &long] {
+            assert!(!is_topic_name(name), "{name}");
+        }
+    }
 
     #[test]
     fn names_map_there_and_back() {

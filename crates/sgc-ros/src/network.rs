@@ -5,9 +5,10 @@
 //! header (RTPS 2.5, 10.2) and the body, untouched.
 
 use std::fmt;
+use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_wire::Qos;
+use sgc_wire::{Qos, RosNode};
 
 /// GUID of a DDS entity: 12 bytes of prefix, 4 of entity id (RTPS 2.5, 9.3.1).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -18,6 +19,19 @@ impl Guid {
     /// (RTPS 2.5, table 9.1).
     pub fn is_keyless(&self) -> bool {
         matches!(self.0[15] & 0x0f, 3 | 4)
+    }
+
+    /// The prefix that all entities of one participant share.
+    pub fn prefix(&self) -> [u8; 12] {
+        let mut prefix = [0; 12];
+        prefix.copy_from_slice(&self.0[..12]);
+        prefix
+    }
+
+    /// Vendor of the DDS implementation, as RTPS 2.5 (9.3.1.1) asks it to begin its prefixes: `[1, 0x0f]` is Fast DDS,
+    /// `[1, 0x10]` Cyclone, `[1, 0x12]` RustDDS.
+    pub fn vendor(&self) -> [u8; 2] {
+        [self.0[0], self.0[1]]
     }
 }
 
@@ -62,7 +76,18 @@ pub struct DiscoveredEndpoint {
     pub qos: Qos,
 }
 
-/// What happens in the local graph. Endpoints made by SGC, this process's or another's, never appear.
+/// A ROS 2 node and its endpoints.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GraphNode {
+    /// Its names.
+    pub node: RosNode,
+    /// Its data readers.
+    pub readers: Vec<Guid>,
+    /// Its data writers.
+    pub writers: Vec<Guid>,
+}
+
+/// What happens in the local graph. Endpoints and nodes made by SGC, this process's or another's, never appear.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum DiscoveryEvent {
     /// An endpoint is there.
@@ -71,6 +96,13 @@ pub enum DiscoveryEvent {
     Vanished {
         /// Which.
         guid: Guid,
+    },
+    /// All nodes that a participant has from now on; none if it is gone. Their endpoints may appear before or after.
+    Nodes {
+        /// The participant.
+        participant: Guid,
+        /// Its nodes.
+        nodes: Vec<GraphNode>,
     },
 }
 
@@ -120,6 +152,55 @@ pub struct Sample {
 /// does nothing but that reader waits.
 pub type SampleHandler = Box<dyn FnMut(Sample) + Send>;
 
+/// Who asked a service, and the number of its request: the sample identity of RPC over DDS 1.0 (7.5.1.1.1).
+///
+/// It holds all that a reply needs, so that one server may answer what another of the same service was asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct RequestId {
+    /// The client: GUID of its request writer, or what stands in its place in the mapping that it uses.
+    pub client: [u8; 16],
+    /// Its number there.
+    pub number: i64,
+    /// At a server, the endpoint of the client that its end is to be noticed by, if the network tells: one that
+    /// discovery says is gone.
+    pub asker: Option<Guid>,
+}
+
+/// Both topics of a service, at its client or at its server.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServiceSpec {
+    /// Where requests go.
+    pub request: EndpointSpec,
+    /// Where replies go.
+    pub reply: EndpointSpec,
+}
+
+/// Receives requests at a server, replies at a client: encapsulation header and body, without the request's id, which
+/// vendors put in different places. On a thread of its own: it may block.
+pub type RequestHandler = Box<dyn FnMut(RequestId, Bytes) + Send>;
+
+/// A client of a local service; lives until dropped. Calls may block, like those of [`RosWriter`].
+pub trait RosClient: Send + Sync + 'static {
+    /// Sends a request; its reply comes to the handler under the id that this returns, maybe before this does. Waits
+    /// a little for a server, and is [`RosError::NoPeer`] if there is none.
+    fn request(&self, payload: Bytes) -> Result<RequestId, RosError>;
+
+    /// How many servers there are at present.
+    fn matched_servers(&self) -> u32;
+
+    /// GUIDs of its reader and its writer.
+    fn guids(&self) -> [Guid; 2];
+}
+
+/// A server for local clients; lives until dropped. Calls may block, like those of [`RosWriter`].
+pub trait RosServer: Send + Sync + 'static {
+    /// Answers the request of this id. Waits a little for the client to be able to hear it.
+    fn reply(&self, request: &RequestId, payload: Bytes) -> Result<(), RosError>;
+
+    /// GUIDs of its reader and its writer.
+    fn guids(&self) -> [Guid; 2];
+}
+
 /// Receives discovery events on a thread of the network; must not block.
 pub type DiscoveryHandler = Box<dyn FnMut(DiscoveryEvent) + Send>;
 
@@ -158,6 +239,12 @@ pub enum RosError {
         /// How long the write blocked.
         waited_ms: u64,
     },
+    /// Nobody is there to hear a request or a reply.
+    #[error("nobody on the local network was there to hear it for {waited_ms} ms")]
+    NoPeer {
+        /// How long was waited.
+        waited_ms: u64,
+    },
     /// Any other failure of a write.
     #[error("write failed: {reason}")]
     Write {
@@ -175,6 +262,10 @@ pub trait RosNetwork: Send + Sync + 'static {
     type Reader: Send + 'static;
     /// A writer; lives until dropped.
     type Writer: RosWriter;
+    /// A client of a service; lives until dropped.
+    type Client: RosClient;
+    /// A server of a service; lives until dropped.
+    type Server: RosServer;
 
     /// Starts discovery; each endpoint already there is told as an appearance. Call once.
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError>;
@@ -185,6 +276,18 @@ pub trait RosNetwork: Send + Sync + 'static {
 
     /// Creates a writer.
     fn create_writer(&self, spec: &EndpointSpec) -> Result<Self::Writer, RosError>;
+
+    /// Creates a client, which calls local servers; their replies go to `handler`. Servers made by SGC are none.
+    fn create_client(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<Self::Client, RosError>;
+
+    /// Creates a server; requests of local clients go to `handler`, those of clients made by SGC do not.
+    fn create_server(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<Self::Server, RosError>;
+
+    /// GUID of a reader made here.
+    fn reader_guid(&self, reader: &Self::Reader) -> Guid;
+
+    /// Has the local graph show these nodes, and no others, as this participant's. May block.
+    fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError>;
 }
 
 /// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.
@@ -192,6 +295,15 @@ pub trait RosWriter: Send + Sync + 'static {
     /// Writes, disposes or unregisters with the given source time stamp (nanoseconds since the Unix epoch).
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError>;
 
+    /// Waits until all reliable readers have what was written; false if they have not after `max`.
+    fn wait_acknowledged(&self, max: Duration) -> bool {
+        let _ = max;
+        true
+    }
+
     /// How many local readers are matched at present.
     fn matched_readers(&self) -> u32;
+
+    /// Its GUID.
+    fn guid(&self) -> Guid;
 }

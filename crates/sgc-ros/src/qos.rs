@@ -1,15 +1,43 @@
 //! QoS of several local writers as one offer, and the reader that matches them all.
 
 use std::collections::BTreeSet;
+use std::fmt;
+use std::time::Duration;
 
-use sgc_wire::{History, Liveliness, Qos, Reliability};
+use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
 /// Fewest samples that a reliable reader of ours keeps: a moment without the processor must not lose what
 /// the network would have carried.
 pub const RELIABLE_READER_DEPTH_MIN: u32 = 32;
 
+/// How many instances' worth of history is kept of a keyed topic, whose keys nobody here knows: a writer keeps its last
+/// samples of each instance, we keep as many of all together.
+pub const KEYED_INSTANCES_KEPT: u32 = 256;
+
+/// Most samples that are kept for that.
+pub const KEYED_SAMPLES_MAX: u32 = 4096;
+
+/// The history that holds what a writer of a keyed topic keeps, if it has not too many instances.
+pub fn of_all_instances(history: History) -> History {
+    match history {
+        History::KeepLast(n) => {
+            History::KeepLast(n.saturating_mul(KEYED_INSTANCES_KEPT).min(KEYED_SAMPLES_MAX.max(n)))
+        }
+        History::KeepAll => History::KeepAll,
+    }
+}
+
+/// Requests and replies that an endpoint of ours keeps for who reads slowly.
+pub const SERVICE_DEPTH: u32 = 1000;
+
+/// What both topics of a service offer and request: that of ROS 2 (`rmw_qos_profile_services_default`), deeper, so that
+/// calls which come at once are not lost.
+pub fn service_qos() -> Qos {
+    Qos { history: History::KeepLast(SERVICE_DEPTH), ..Qos::default() }
+}
+
 /// What a set of writers offers together: of each policy the weakest, so that every reader that matches the
-/// result would have matched each of them; of depth and lifespan the longest, of partitions all.
+/// result would have matched each of them; of depth and lifespan the longest, of partitions and data representations all.
 pub fn weakest<'a>(offers: impl IntoIterator<Item = &'a Qos>) -> Option<Qos> {
     let mut offers = offers.into_iter();
     let mut all = offers.next()?.clone();
@@ -29,6 +57,7 @@ pub fn weakest<'a>(offers: impl IntoIterator<Item = &'a Qos>) -> Option<Qos> {
             (Liveliness::ManualByTopic, other) | (other, Liveliness::ManualByTopic) => other,
             (same, _) => same,
         };
+        all.representations = all.representations.or(q.representations);
         partitions.extend(q.partitions.iter().cloned());
     }
     all.partitions = partitions.into_iter().take(Qos::PARTITIONS_MAX).collect();
@@ -51,8 +80,159 @@ pub fn reader_for(offer: &Qos, writers: usize) -> Qos {
         durability: offer.durability,
         history,
         partitions: offer.partitions.clone(),
+        representations: Representations::BOTH,
         ..Qos::default()
     }
+}
+
+/// A policy that a subscriber requests and a publisher offers (DDS 1.4, 2.2.3).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum QosPolicy {
+    /// Whether samples are acknowledged.
+    Reliability,
+    /// Whether late joiners get what was said before.
+    Durability,
+    /// How often something is said.
+    Deadline,
+    /// Who says that a publisher lives.
+    Liveliness,
+    /// How often it is said.
+    Lease,
+    /// Where both have to be.
+    Partition,
+    /// How samples are serialised.
+    Representation,
+}
+
+/// Where a subscriber asks for more than a publisher offers, so that DDS keeps them apart.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct QosMismatch {
+    /// In what.
+    pub policy: QosPolicy,
+    /// What is offered.
+    pub offered: String,
+    /// What is asked for.
+    pub requested: String,
+}
+
+impl QosMismatch {
+    /// What makes the two meet; `owner` is where the publisher is.
+    pub fn fix(&self, owner: &str) -> String {
+        let (subscriber, publisher) = match self.policy {
+            QosPolicy::Reliability => ("best effort", "reliable"),
+            QosPolicy::Durability => ("volatile", "transient local"),
+            QosPolicy::Deadline => ("a longer deadline, or none,", "a shorter deadline"),
+            QosPolicy::Liveliness => ("automatic liveliness", "the liveliness that is asked for"),
+            QosPolicy::Lease => ("a longer lease, or none,", "a shorter lease"),
+            QosPolicy::Partition => ("the publisher's partition", "the subscriber's partition"),
+            QosPolicy::Representation => {
+                ("the publisher's data representation", "the subscriber's data representation")
+            }
+        };
+        format!("Give the subscriber {subscriber} or the publisher at {owner} {publisher}")
+    }
+}
+
+impl fmt::Display for QosMismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let policy = match self.policy {
+            QosPolicy::Reliability => "reliability",
+            QosPolicy::Durability => "durability",
+            QosPolicy::Deadline => "deadline",
+            QosPolicy::Liveliness => "liveliness",
+            QosPolicy::Lease => "liveliness lease",
+            QosPolicy::Partition => "partition",
+            QosPolicy::Representation => "data representation",
+        };
+        let Self { offered, requested, .. } = self;
+        write!(f, "{policy} {offered}, but a local subscriber asks for {requested}")
+    }
+}
+
+/// All policies in which a request goes beyond an offer.
+pub fn mismatches(offer: &Qos, request: &Qos) -> Vec<QosMismatch> {
+    let mut found = Vec::new();
+    let mut differ = |policy, offered: String, requested: String| {
+        found.push(QosMismatch { policy, offered, requested });
+    };
+    if offer.reliability < request.reliability {
+        let name = |r| if r == Reliability::Reliable { "reliable" } else { "best effort" };
+        differ(QosPolicy::Reliability, name(offer.reliability).into(), name(request.reliability).into());
+    }
+    if offer.durability < request.durability {
+        let name = |d| match d {
+            Durability::Volatile => "volatile",
+            Durability::TransientLocal => "transient local",
+            Durability::Transient => "transient",
+            Durability::Persistent => "persistent",
+        };
+        differ(QosPolicy::Durability, name(offer.durability).into(), name(request.durability).into());
+    }
+    let time = |ns: Option<u64>| ns.map_or("none".into(), |ns| format!("{:?}", Duration::from_nanos(ns)));
+    let is_longer = |a: Option<u64>, b: Option<u64>| a.unwrap_or(u64::MAX) > b.unwrap_or(u64::MAX);
+    if is_longer(offer.deadline_ns, request.deadline_ns) {
+        differ(QosPolicy::Deadline, time(offer.deadline_ns), time(request.deadline_ns));
+    }
+    let rank = |kind| match kind {
+        Liveliness::Automatic => (0, "automatic"),
+        Liveliness::ManualByParticipant => (1, "manual by participant"),
+        Liveliness::ManualByTopic => (2, "manual by topic"),
+    };
+    let (offered, requested) = (rank(offer.liveliness), rank(request.liveliness));
+    if offered.0 < requested.0 {
+        differ(QosPolicy::Liveliness, offered.1.into(), requested.1.into());
+    }
+    if is_longer(offer.lease_ns, request.lease_ns) {
+        differ(QosPolicy::Lease, time(offer.lease_ns), time(request.lease_ns));
+    }
+    if !partitions_meet(&offer.partitions, &request.partitions) {
+        let list = |p: &[String]| if p.is_empty() { "\"\"".into() } else { format!("{p:?}") };
+        differ(QosPolicy::Partition, list(&offer.partitions), list(&request.partitions));
+    }
+    // What is written here is of one, whatever the publishers there offer together.
+    let (written, taken) = (offer.representations.written(), request.representations);
+    if !written.meets(taken) {
+        differ(QosPolicy::Representation, format!("{written:?}"), format!("{taken:?}"));
+    }
+    found
+}
+
+/// Whether two lists of partitions have one in common: a name of one that a pattern of the other fits, or the same
+/// name. None is the default partition, whose name is empty.
+fn partitions_meet(a: &[String], b: &[String]) -> bool {
+    let or_default = |list: &[String]| if list.is_empty() { vec![String::new()] } else { list.to_vec() };
+    let (a, b) = (or_default(a), or_default(b));
+    let is_pattern = |p: &str| p.contains(['*', '?', '[']);
+    let meet = |a: &str, b: &str| match (is_pattern(a), is_pattern(b)) {
+        (false, false) => a == b,
+        (true, false) => fits(a.as_bytes(), b.as_bytes()),
+        (false, true) => fits(b.as_bytes(), a.as_bytes()),
+        (true, true) => false,
+    };
+    a.iter().any(|a| b.iter().any(|b| meet(a, b)))
+}
+
+/// Whether a name fits a pattern of `*` and `?`. One step back is enough: what the last `*` takes is all that is open.
+fn fits(pattern: &[u8], name: &[u8]) -> bool {
+    let (mut p, mut n) = (0, 0);
+    let mut star: Option<(usize, usize)> = None;
+    while n < name.len() {
+        match pattern.get(p) {
+            Some(b'*') => {
+                star = Some((p, n));
+                p += 1;
+            }
+            Some(c) if *c == b'?' || *c == name[n] => (p, n) = (p + 1, n + 1),
+            _ => match star {
+                Some((at, from)) => {
+                    star = Some((at, from + 1));
+                    (p, n) = (at + 1, from + 1);
+                }
+                None => return false,
+            },
+        }
+    }
+    pattern[p..].iter().all(|c| *c == b'*')
 }
 
 fn longest(a: Option<u64>, b: Option<u64>) -> Option<u64> {
@@ -61,8 +241,6 @@ fn longest(a: Option<u64>, b: Option<u64>) -> Option<u64> {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::Durability;
-
     use super::*;
 
     #[test]
@@ -80,11 +258,13 @@ mod tests {
             reliability: Reliability::BestEffort,
             history: History::KeepLast(7),
             partitions: vec!["a".into()],
+            representations: Representations::XCDR2,
             ..Qos::default()
         };
         assert_eq!(weakest([&strong]), Some(strong.clone()));
         let both = weakest([&strong, &weak]).unwrap();
-        assert_eq!(both, Qos { partitions: vec!["a".into(), "b".into()], ..weak });
+        let representations = Representations::BOTH;
+        assert_eq!(both, Qos { partitions: vec!["a".into(), "b".into()], representations, ..weak });
         assert_eq!(weakest([]), None);
     }
 
@@ -102,5 +282,51 @@ mod tests {
         };
         let reader = reader_for(&sensor, 1);
         assert_eq!((reader.history, reader.deadline_ns), (History::KeepLast(5), None));
+    }
+
+    #[test]
+    fn every_policy_that_keeps_two_apart_is_named_with_both_values() {
+        let offer = Qos {
+            reliability: Reliability::BestEffort,
+            deadline_ns: Some(200_000_000),
+            lease_ns: None,
+            partitions: vec!["robot".into()],
+            ..Qos::default()
+        };
+        let request = Qos {
+            durability: Durability::TransientLocal,
+            deadline_ns: Some(100_000_000),
+            liveliness: Liveliness::ManualByTopic,
+            lease_ns: Some(1_500_000_000),
+            ..Qos::default()
+        };
+        let found = mismatches(&offer, &request);
+        let said: Vec<_> = found.iter().map(ToString::to_string).collect();
+        let expected = [
+            "reliability best effort, but a local subscriber asks for reliable",
+            "durability volatile, but a local subscriber asks for transient local",
+            "deadline 200ms, but a local subscriber asks for 100ms",
+            "liveliness automatic, but a local subscriber asks for manual by topic",
+            "liveliness lease none, but a local subscriber asks for 1.5s",
+            "partition [\"robot\"], but a local subscriber asks for \"\"",
+        ];
+        assert_eq!(said, expected);
+        assert!(found.iter().all(|m| m.fix("arm-1").contains("arm-1")));
+        assert_eq!(mismatches(&request, &request), []);
+        assert_eq!(mismatches(&request, &Qos { reliability: Reliability::BestEffort, ..Qos::default() }), []);
+    }
+
+    #[test]
+    fn partitions_meet_as_in_dds() {
+        let meet = |a: &[&str], b: &[&str]| {
+            let own = |list: &[&str]| list.iter().map(|p| (*p).to_owned()).collect::<Vec<_>>();
+            let (a, b) = (own(a), own(b));
+            assert_eq!(partitions_meet(&a, &b), partitions_meet(&b, &a));
+            partitions_meet(&a, &b)
+        };
+        assert!(meet(&[], &[]) && meet(&[], &["*"]) && meet(&["a", "b"], &["b", "c"]));
+        assert!(meet(&["r*"], &["robot"]) && meet(&["r?b*t"], &["robot"]) && meet(&["*o*o*"], &["robot"]));
+        assert!(!meet(&[], &["a"]) && !meet(&["a"], &["b"]) && !meet(&["a*"], &["a*b"]));
+        assert!(!meet(&["r?b"], &["robot"]) && !meet(&["*x*"], &["robot"]));
     }
 }

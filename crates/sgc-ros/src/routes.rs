@@ -10,11 +10,17 @@
 //! route whose one entry comes with the grant, from an owner of another fleet whose catalogue this node cannot read.
 
 mod command;
+mod graph;
+mod naming;
+mod problems;
 mod publish;
 mod reconfigure;
+mod services;
+mod settling;
 mod shares;
 mod tokens;
 mod uses;
+mod view;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -22,12 +28,23 @@ use std::time::{Duration, Instant};
 use rand_core::RngCore;
 use sgc_endpoint::{RefusedBy, ShareSpec};
 use sgc_trust::{FleetSecret, Policy, Suite};
-use sgc_wire::{Catalogue, CatalogueEntry, Class, Metadata, Name, NodeId, Qos, SinkId, SourceId};
+use sgc_wire::{
+    Catalogue, CatalogueEntry, Class, Kind, Metadata, Name, NodeId, PayloadEncoding, Qos, RosNode, SinkId,
+    SourceId,
+};
 
 use crate::names::ros_type;
-use crate::network::{DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, Guid};
+use crate::network::{DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, Guid, ServiceSpec};
+
+use problems::{Cause, Problems};
+use settling::Settling;
 
 pub use command::{Command, Problem};
+pub use naming::{
+    GLOBAL_TOPICS, LITERAL_TOPICS, Naming, ROUTES_PER_WILDCARD_MAX, Rename, is_pattern, matches,
+};
+pub use settling::REDISCOVERY_HOLD;
+pub use view::{OfferView, ShareRouteView, ShareView, UseRouteView, UseView};
 
 /// How long a share outlives its last local writer, so that a restarted program finds its subscribers.
 pub const WRITERLESS_HOLD: Duration = Duration::from_secs(2);
@@ -40,20 +57,38 @@ pub const UNREACHABLE_HOLD: Duration = Duration::from_secs(10);
 const ENTRIES_PER_RULE_MAX: usize = 8;
 /// Local endpoints remembered.
 const LOCAL_ENDPOINTS_MAX: usize = 65_536;
-/// Problems remembered so that each is told once.
-const PROBLEMS_MAX: usize = 4096;
 
 /// What the user shares.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShareRule {
-    /// Metadata; an empty type means whatever type local writers have.
+    /// Metadata, with the name or pattern of what it shares as that is called here; an empty type means whatever type
+    /// local writers have.
     pub metadata: Metadata,
+    /// What is left out, and what the rest is called for others.
+    pub naming: Naming,
     /// Who may join.
     pub policy: Policy,
     /// How payloads are protected.
     pub suite: Suite,
     /// Class of its traffic.
     pub class: Class,
+    /// How much of it goes out.
+    pub shaping: Shaping,
+    /// Whether it has a connection of its own to the next node.
+    pub dedicated: bool,
+}
+
+/// How much of a topic goes on. Nothing is set by default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Shaping {
+    /// The least time between two messages: the newest goes, the others are left out.
+    pub interval: Option<Duration>,
+    /// Most bits a second. What is best effort gives way to what is newer, what is reliable waits.
+    pub bits_per_s: Option<u64>,
+    /// How old a best-effort message may be when it leaves.
+    pub max_age: Option<Duration>,
+    /// What messages are written in when they leave, if that makes them shorter.
+    pub compression: PayloadEncoding,
 }
 
 /// Which way messages go.
@@ -75,15 +110,43 @@ pub struct UseRule {
     pub owner: NodeId,
     /// The owner's name, for people.
     pub owner_name: String,
-    /// Absolute ROS topic.
+    /// What kind of interface it asks for.
+    pub kind: Kind,
+    /// Absolute ROS topic or pattern, as its owner calls it.
     pub topic: String,
+    /// What is left out, and what the rest is called here.
+    pub naming: Naming,
+    /// What the names of frames in tf messages get in front.
+    pub frame_prefix: Option<String>,
     /// ROS type; `None` for whatever the owner shares.
     pub type_name: Option<String>,
     /// The name that a token leads to, and what it says of it; the catalogue is not looked at then.
     pub token: Option<(Name, Metadata)>,
+    /// Class of what this node publishes on it; `None` for that of the share.
+    pub class: Option<Class>,
+    /// How much of it goes on, whichever way.
+    pub shaping: Shaping,
+    /// Whether it has a connection of its own to the next node.
+    pub dedicated: bool,
+}
+
+impl ShareRule {
+    /// Whether those who may publish on it call it.
+    fn is_service(&self) -> bool {
+        self.metadata.kind == Kind::Service
+    }
+
+    /// Whether it is there for what others publish, without anybody here.
+    fn is_inbound(&self) -> bool {
+        !self.is_service() && !self.policy.publish.is_empty()
+    }
 }
 
 impl UseRule {
+    fn is_service(&self) -> bool {
+        self.kind == Kind::Service
+    }
+
     fn is_of_catalogue(&self, owner: &NodeId) -> bool {
         self.owner == *owner && self.token.is_none()
     }
@@ -93,6 +156,7 @@ impl UseRule {
         let name = |rule: &Self| rule.token.as_ref().map(|(name, _)| *name);
         self.direction == other.direction
             && self.owner == other.owner
+            && self.kind == other.kind
             && self.topic == other.topic
             && name(self) == name(other)
     }
@@ -101,9 +165,9 @@ impl UseRule {
 /// Where a route stands, for status.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RouteStatus {
-    /// `"share"`, `"use"` or `"publish"`.
+    /// `"share"`, `"use"`, `"publish"`, `"serve"` or `"call"`.
     pub direction: &'static str,
-    /// ROS topic.
+    /// ROS name of the topic or the service.
     pub topic: String,
     /// ROS type, once it is known.
     pub type_name: Option<String>,
@@ -119,44 +183,87 @@ pub struct RouteStatus {
 struct ShareRoute {
     name: Name,
     rule: usize,
+    /// What it is called on the local network.
+    local_name: String,
     type_name: String,
     keyless: bool,
     writers: BTreeMap<Guid, DiscoveredEndpoint>,
-    own: BTreeMap<Guid, SourceId>,
+    own: BTreeMap<Guid, OwnSource>,
     sinks: BTreeSet<SinkId>,
     reader: Option<EndpointSpec>,
     /// For what others publish on it.
     writer: Option<EndpointSpec>,
+    /// If it is a service: what others call its servers with, which are its writers here.
+    client: Option<ServiceSpec>,
     writerless_until: Option<Instant>,
     sinkless_until: Option<Instant>,
+}
+
+/// What publishes for a local writer.
+#[derive(Clone, Debug)]
+struct OwnSource {
+    source: SourceId,
+    /// What the writer offers, as far as it is carried.
+    qos: Qos,
+    /// Since when the writer is gone. A volatile one's source is kept a while: for what it wrote last, and for the
+    /// program that is restarted, whose subscribers then notice nothing.
+    gone: Option<Instant>,
 }
 
 #[derive(Debug)]
 struct UseRoute {
     rule: usize,
+    /// What it is called on the local network.
+    local_name: String,
     entry: CatalogueEntry,
     granted: bool,
+    /// False while its owner, which started anew, does not list it (yet).
+    is_listed: bool,
     refused: Option<RefusedBy>,
     /// Open writers, and what they offer.
     writers: BTreeMap<Option<SourceId>, EndpointSpec>,
+    /// Whose nodes they were said to be.
+    nodes: BTreeMap<Option<SourceId>, RosNode>,
     /// If it publishes: the local writers, and the reader of what they write.
     local: BTreeMap<Guid, DiscoveredEndpoint>,
     reader: Option<EndpointSpec>,
+    /// If it is a service: what local clients call.
+    server: Option<ServiceSpec>,
     unreachable_until: Option<Instant>,
 }
 
 impl ShareRoute {
+    /// Whether writers of this topic and DDS type belong to it.
+    fn fits(&self, local_name: &str, type_name: &str) -> bool {
+        self.local_name == local_name && self.type_name == type_name
+    }
+
+    /// Two local publishers that have different definitions of its type.
+    fn hashes_differ(&self) -> Option<Problem> {
+        let mut hashes = self.writers.values().filter_map(|writer| writer.type_hash.as_ref());
+        let one = hashes.next()?;
+        let other = hashes.find(|hash| *hash != one)?;
+        let (mut first, mut second) = (one.clone(), other.clone());
+        // In one order, whichever publisher came first.
+        if first > second {
+            std::mem::swap(&mut first, &mut second);
+        }
+        let (topic, type_name) = (self.local_name.clone(), ros_type(&self.type_name));
+        Some(Problem::ShareHash { topic, type_name, first, second })
+    }
+
     /// A share with this first writer, or with none.
     fn begin(
         name: Name,
         rule: usize,
         share: &ShareRule,
+        local_name: &str,
         type_name: &str,
         keyless: bool,
         writer: Option<DiscoveredEndpoint>,
     ) -> (ShareSpec, Self) {
         let spec = ShareSpec {
-            metadata: Metadata { type_name: ros_type(type_name), ..share.metadata.clone() },
+            metadata: share.metadata_of(local_name, &ros_type(type_name)),
             policy: share.policy.clone(),
             suite: share.suite,
             class: share.class,
@@ -168,6 +275,7 @@ impl ShareRoute {
         let route = Self {
             name,
             rule,
+            local_name: local_name.to_owned(),
             type_name: type_name.to_owned(),
             keyless,
             own: BTreeMap::new(),
@@ -175,6 +283,7 @@ impl ShareRoute {
             sinks: BTreeSet::new(),
             reader: None,
             writer: None,
+            client: None,
             writerless_until: None,
             sinkless_until: None,
         };
@@ -183,15 +292,19 @@ impl ShareRoute {
 }
 
 impl UseRoute {
-    fn new(rule: usize, entry: CatalogueEntry) -> Self {
+    fn new(rule: usize, local_name: String, entry: CatalogueEntry) -> Self {
         Self {
             rule,
+            local_name,
             entry,
             granted: false,
+            is_listed: true,
             refused: None,
             writers: BTreeMap::new(),
+            nodes: BTreeMap::new(),
             local: BTreeMap::new(),
             reader: None,
+            server: None,
             unreachable_until: None,
         }
     }
@@ -213,6 +326,8 @@ pub struct Routes<R> {
     share_rules: Vec<ShareRule>,
     use_rules: Vec<UseRule>,
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,
+    /// The endpoints of each local participant that belong to a node, and which.
+    nodes: BTreeMap<Guid, BTreeMap<Guid, RosNode>>,
     shares: BTreeMap<Name, ShareRoute>,
     uses: BTreeMap<Name, UseRoute>,
     /// Names of tokens; there is a route besides from the first grant on.
@@ -221,7 +336,13 @@ pub struct Routes<R> {
     catalogues: BTreeMap<NodeId, Catalogue>,
     /// Owners that are out of reach or refuse, for status.
     owners: BTreeMap<NodeId, String>,
-    told: BTreeSet<Problem>,
+    /// Owners that were out of reach, or have just come back.
+    settling: BTreeMap<NodeId, Settling>,
+    problems: Problems,
+    /// Something is not shared or brought for the sake of a route that runs.
+    waits: bool,
+    /// A route has ended since that was looked at.
+    freed: bool,
     commands: VecDeque<Command>,
 }
 
@@ -241,12 +362,16 @@ impl<R: RngCore> Routes<R> {
             share_rules,
             use_rules,
             endpoints: BTreeMap::new(),
+            nodes: BTreeMap::new(),
             shares: BTreeMap::new(),
             uses: BTreeMap::new(),
             tokens: BTreeMap::new(),
             catalogues: BTreeMap::new(),
             owners: BTreeMap::new(),
-            told: BTreeSet::new(),
+            settling: BTreeMap::new(),
+            problems: Problems::default(),
+            waits: false,
+            freed: false,
             commands: VecDeque::new(),
         };
         routes.join_tokens();
@@ -264,11 +389,14 @@ impl<R: RngCore> Routes<R> {
         match event {
             DiscoveryEvent::Appeared(endpoint) => {
                 if self.endpoints.len() >= LOCAL_ENDPOINTS_MAX {
-                    return self.report(Problem::TooManyEndpoints);
+                    return self.report(Cause::Network, Problem::TooManyEndpoints);
                 }
                 let guid = endpoint.guid;
                 if let Some(old) = self.endpoints.insert(guid, endpoint.clone()) {
                     self.writer_gone(now, &old);
+                }
+                if self.service_end_there(&endpoint) {
+                    return;
                 }
                 match endpoint.kind {
                     EndpointKind::Writer => self.writer_there(endpoint),
@@ -277,9 +405,14 @@ impl<R: RngCore> Routes<R> {
             }
             DiscoveryEvent::Vanished { guid } => {
                 if let Some(endpoint) = self.endpoints.remove(&guid) {
+                    self.service_end_gone(now, &endpoint);
+                    self.settle(Cause::Network, BTreeSet::new());
+                    self.settle(Cause::Endpoint(guid), BTreeSet::new());
+                    self.settle(Cause::Unshared(guid), BTreeSet::new());
                     self.writer_gone(now, &endpoint);
                 }
             }
+            DiscoveryEvent::Nodes { participant, nodes } => self.handle_nodes(participant, nodes),
         }
     }
 
@@ -290,40 +423,67 @@ impl<R: RngCore> Routes<R> {
             let Some(share) = self.shares.get_mut(&name) else { continue };
             if due(share.writerless_until) {
                 self.drop_share(name);
-            } else if due(share.sinkless_until) {
-                share.sinkless_until = None;
-                self.refresh_share(name);
+            } else {
+                let gone = |own: &OwnSource| due(own.gone.map(|at| at + WRITERLESS_HOLD));
+                let sinkless = share.sinkless_until.take_if(|at| *at <= now).is_some();
+                let sources = share.own.len();
+                share.own.retain(|_, own| !gone(own));
+                if sinkless || share.own.len() < sources {
+                    self.refresh_share(name);
+                }
             }
         }
+        self.owners_have_settled(now);
         for (name, route) in &mut self.uses {
             if due(route.unreachable_until) {
                 route.unreachable_until = None;
+                route.nodes.clear();
                 for source in std::mem::take(&mut route.writers).into_keys() {
                     self.commands.push_back(Command::CloseWriter { name: *name, source });
                 }
                 if route.reader.take().is_some() {
                     self.commands.push_back(Command::CloseReader { name: *name });
                 }
+                if route.server.take().is_some() {
+                    self.commands.push_back(Command::CloseServer { name: *name });
+                }
             }
         }
+        self.reconsider();
     }
 
     /// The next thing to do.
     pub fn poll_command(&mut self) -> Option<Command> {
+        if self.commands.is_empty() {
+            self.check_stale();
+        }
         self.commands.pop_front()
     }
 
     /// When time matters next.
     pub fn poll_timeout(&self) -> Option<Instant> {
         let shares = self.shares.values().flat_map(|s| [s.writerless_until, s.sinkless_until]);
+        let gone = self.shares.values().flat_map(|s| s.own.values()).filter_map(|own| own.gone);
         let uses = self.uses.values().map(|u| u.unreachable_until);
-        shares.chain(uses).flatten().min()
+        let owners = self.settling.keys().map(|owner| self.settles_at(owner));
+        let gone = gone.map(|at| Some(at + WRITERLESS_HOLD));
+        shares.chain(uses).chain(owners).chain(gone).flatten().min()
     }
 
     /// The ROS topic behind a name that is shared or used here.
     pub fn topic_of(&self, name: &Name) -> Option<&str> {
-        let share = self.shares.get(name).map(|s| self.share_rules[s.rule].metadata.ros_name.as_str());
-        share.or_else(|| Some(self.use_rules[self.uses.get(name)?.rule].topic.as_str()))
+        let share = self.shares.get(name).map(|s| s.local_name.as_str());
+        share.or_else(|| {
+            let token = || Some(self.use_rules[self.tokens.get(name)?.rule].topic.as_str());
+            self.uses.get(name).map(|u| u.local_name.as_str()).or_else(token)
+        })
+    }
+
+    /// Whether the user wants a connection of its own for a name that is shared or used here.
+    pub fn is_dedicated(&self, name: &Name) -> bool {
+        let share = self.shares.get(name).map(|share| self.share_rules[share.rule].dedicated);
+        let used = self.uses.get(name).map(|route| self.use_rules[route.rule].dedicated);
+        share.or(used).unwrap_or(false)
     }
 
     /// Where every rule stands.
@@ -331,9 +491,9 @@ impl<R: RngCore> Routes<R> {
         let mut all = Vec::new();
         for (index, rule) in self.share_rules.iter().enumerate() {
             let routes: Vec<_> = self.shares.values().filter(|s| s.rule == index).collect();
-            let status = |type_name, name, state| RouteStatus {
-                direction: "share",
-                topic: rule.metadata.ros_name.clone(),
+            let status = |topic: &str, type_name, name, state| RouteStatus {
+                direction: if rule.is_service() { "serve" } else { "share" },
+                topic: topic.to_owned(),
                 type_name,
                 name,
                 owner: rule.metadata.owner.clone(),
@@ -341,23 +501,43 @@ impl<R: RngCore> Routes<R> {
             };
             if routes.is_empty() {
                 let wanted = (!rule.metadata.type_name.is_empty()).then(|| rule.metadata.type_name.clone());
-                all.push(status(wanted, None, "waits for a local publisher".into()));
+                let awaited = if rule.is_service() { "server" } else { "publisher" };
+                all.push(status(
+                    &rule.metadata.ros_name,
+                    wanted,
+                    None,
+                    format!("waits for a local {awaited}"),
+                ));
             }
             for route in routes {
+                if rule.is_service() {
+                    let (servers, callers) = (route.writers.len(), route.sinks.len());
+                    let state = format!("{servers} local servers, {callers} remote nodes may call");
+                    let type_name = Some(ros_type(&route.type_name));
+                    all.push(status(&route.local_name, type_name, Some(route.name), state));
+                    continue;
+                }
                 let state = format!(
                     "{} local publishers, {} remote subscribers, {}",
                     route.writers.len(),
                     route.sinks.len(),
                     if route.reader.is_some() { "reading" } else { "not reading: nobody subscribes" }
                 );
-                all.push(status(Some(ros_type(&route.type_name)), Some(route.name), state));
+                let (local_name, type_name) = (&route.local_name, ros_type(&route.type_name));
+                let called = rule.naming.renamed(&rule.metadata.ros_name, local_name);
+                let state = also_called(local_name, "shared as", &called) + &state;
+                all.push(status(local_name, Some(type_name), Some(route.name), state));
             }
         }
         for (index, rule) in self.use_rules.iter().enumerate() {
             let routes: Vec<_> = self.uses.iter().filter(|(_, u)| u.rule == index).collect();
-            let status = |type_name, name, state| RouteStatus {
-                direction: if rule.direction == Direction::Publish { "publish" } else { "use" },
-                topic: rule.topic.clone(),
+            let status = |topic: &str, type_name, name, state| RouteStatus {
+                direction: match rule.direction {
+                    _ if rule.is_service() => "call",
+                    Direction::Publish => "publish",
+                    Direction::Bring => "use",
+                },
+                topic: topic.to_owned(),
                 type_name,
                 name,
                 owner: rule.owner_name.clone(),
@@ -369,19 +549,26 @@ impl<R: RngCore> Routes<R> {
                     Some(by) => format!("refused: {by}"),
                     None => "waits for the owner's grant".into(),
                 };
-                all.push(status(Some(metadata.type_name.clone()), Some(*name), state));
+                all.push(status(&rule.topic, Some(metadata.type_name.clone()), Some(*name), state));
             } else if routes.is_empty() {
                 let state = match self.owners.get(&rule.owner) {
                     Some(state) => format!("{} {state}", rule.owner_name),
+                    None if rule.is_pattern() => {
+                        format!("{} lists nothing that matches (yet)", rule.owner_name)
+                    }
+                    None if rule.is_service() => {
+                        format!("{} has no such service for this node (yet)", rule.owner_name)
+                    }
                     None if rule.direction == Direction::Publish => {
                         format!("{} does not let this node publish on it (yet)", rule.owner_name)
                     }
                     None => format!("{} does not share it with this node (yet)", rule.owner_name),
                 };
-                all.push(status(rule.type_name.clone(), None, state));
+                all.push(status(&rule.topic, rule.type_name.clone(), None, state));
             }
             for (name, route) in routes {
                 let state = match (route.granted, route.refused) {
+                    (true, _) if rule.is_service() => "granted".into(),
                     (true, _) if rule.direction == Direction::Publish => {
                         format!("granted, {} local publishers", route.local.len())
                     }
@@ -389,17 +576,19 @@ impl<R: RngCore> Routes<R> {
                     (false, Some(by)) => format!("refused: {by}"),
                     (false, None) => "waits for the owner's grant".into(),
                 };
-                all.push(status(Some(route.entry.metadata.type_name.clone()), Some(*name), state));
+                let Metadata { ros_name, type_name, .. } = &route.entry.metadata;
+                let there = format!("{} calls it", rule.owner_name);
+                let state = also_called(&route.local_name, &there, ros_name) + &state;
+                all.push(status(&route.local_name, Some(type_name.clone()), Some(*name), state));
             }
         }
         all
     }
+}
 
-    pub(super) fn report(&mut self, problem: Problem) {
-        if self.told.len() < PROBLEMS_MAX && self.told.insert(problem.clone()) {
-            self.commands.push_back(Command::Report(problem));
-        }
-    }
+/// What to say if it has another name elsewhere.
+fn also_called(here: &str, verb: &str, there: &str) -> String {
+    if here == there { String::new() } else { format!("{verb} {there}, ") }
 }
 
 /// A reader need not be made anew for a little more or less depth.
@@ -410,12 +599,13 @@ fn same_reader(a: Option<&EndpointSpec>, b: Option<&EndpointSpec>) -> bool {
     a.map(key) == b.map(key)
 }
 
-fn random_source(rng: &mut impl RngCore) -> SourceId {
-    let mut id = [0; 16];
-    rng.fill_bytes(&mut id);
-    SourceId(id)
+/// A fresh source for a local writer, known as its by who knows earlier ones.
+fn source_of(secret: &FleetSecret, writer: &Guid, rng: &mut impl RngCore) -> SourceId {
+    let mut random = [0; 8];
+    rng.fill_bytes(&mut random);
+    SourceId::of_publisher(secret.publisher_tag(&writer.0), random)
 }
 
 fn describe(qos: &Qos) -> String {
-    format!("{:?}, {:?}", qos.reliability, qos.durability)
+    format!("{:?}, {:?}, {:?}", qos.reliability, qos.durability, qos.representations)
 }

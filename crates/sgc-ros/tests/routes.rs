@@ -8,13 +8,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Problem, Routes,
-    SINKLESS_HOLD, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, GraphNode, Guid, Naming, Problem,
+    REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, Routes, SINKLESS_HOLD, Shaping, ShareRule,
+    UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
-    Catalogue, CatalogueEntry, CatalogueSource, Class, Durability, History, Metadata, Name, NodeId, Qos,
-    RefuseReason, Reliability, SinkId, SourceId,
+    Catalogue, CatalogueEntry, CatalogueSource, Class, Durability, History, Kind, Metadata, Name, NodeId,
+    Qos, RefuseReason, Reliability, RosNode, SinkId, SourceId,
 };
 
 const ME: NodeId = NodeId([1; 32]);
@@ -44,9 +45,12 @@ fn bench_of(shares: Vec<ShareRule>, uses: Vec<UseRule>) -> Bench {
 fn share(topic: &str, type_name: &str) -> ShareRule {
     ShareRule {
         metadata: Metadata::topic("me", topic, type_name),
+        naming: Naming::default(),
         policy: Policy::default(),
         suite: Suite::Group,
         class: Class::Default,
+        shaping: Shaping::default(),
+        dedicated: false,
     }
 }
 
@@ -55,9 +59,15 @@ fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
         direction: Direction::Bring,
         owner,
         owner_name: "owner".into(),
+        kind: Kind::Topic,
         topic: topic.into(),
+        naming: Naming::default(),
+        frame_prefix: None,
         type_name: type_name.map(Into::into),
+        dedicated: false,
         token: None,
+        class: None,
+        shaping: Shaping::default(),
     }
 }
 
@@ -102,7 +112,7 @@ fn theirs(topic: &str, type_name: &str) -> Name {
 }
 
 fn entry(topic: &str, type_name: &str, qos: Qos, sources: &[u8]) -> CatalogueEntry {
-    let source = |n: &u8| CatalogueSource { source: SourceId([*n; 16]), qos: qos.clone() };
+    let source = |n: &u8| CatalogueSource { source: SourceId([*n; 16]), qos: qos.clone(), node: None };
     CatalogueEntry {
         metadata: Metadata::topic("owner", topic, type_name),
         blind: TopicSecret::derive(&secret(), &Metadata::topic("owner", topic, type_name)).blind(),
@@ -129,7 +139,7 @@ impl Bench {
     }
 
     fn catalogue(&mut self, entries: Vec<CatalogueEntry>) -> Vec<Command> {
-        self.routes.handle_catalogue(OWNER, Catalogue { version: 1, entries });
+        self.routes.handle_catalogue(self.now, OWNER, Catalogue { version: 1, entries });
         self.commands()
     }
 
@@ -162,8 +172,8 @@ fn opens_reader(commands: &[Command]) -> bool {
     has(commands, |c| matches!(c, Command::OpenReader { .. }))
 }
 
-fn problems(commands: &[Command]) -> Vec<&Problem> {
-    commands.iter().filter_map(|c| if let Command::Report(p) = c { Some(p) } else { None }).collect()
+fn problems(commands: &[Command]) -> Vec<Problem> {
+    commands.iter().filter_map(|c| if let Command::Report(p) = c { Some(p.clone()) } else { None }).collect()
 }
 
 #[test]
@@ -268,10 +278,92 @@ fn a_local_subscriber_that_cannot_hear_the_far_publisher_is_named() {
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
     let wrong_type = endpoint(1, EndpointKind::Reader, "/a", "x_msgs/msg/Other", Qos::default());
     assert!(matches!(problems(&b.appears(wrong_type))[..], [Problem::LocalType { .. }]));
-    let wants_more = endpoint(2, EndpointKind::Reader, "/a", STRING, latched());
-    assert!(matches!(problems(&b.appears(wants_more))[..], [Problem::LocalQos { .. }]));
-    let content = endpoint(3, EndpointKind::Reader, "/a", STRING, Qos::default());
+    let wants_more = |n| endpoint(n, EndpointKind::Reader, "/a", STRING, latched());
+    let told = problems(&b.appears(wants_more(2)));
+    assert_eq!(
+        told[0].to_string(),
+        "/a: owner offers durability volatile, but a local subscriber asks for transient local; it receives nothing \
+         from there. Give the subscriber volatile or the publisher at owner transient local"
+    );
+    // Another one that asks the same: it holds, and is not told again until it has ended.
+    assert_eq!(b.appears(wants_more(3)), []);
+    b.vanishes(2);
+    assert_eq!(b.routes.problems().filter(|p| **p == told[0]).count(), 1);
+    b.vanishes(3);
+    assert!(b.routes.problems().all(|p| *p != told[0]));
+    assert_eq!(problems(&b.appears(wants_more(2))), told);
+    let content = endpoint(4, EndpointKind::Reader, "/a", STRING, Qos::default());
     assert_eq!(b.appears(content), []);
+    // The owner's publisher is made to offer more: nothing holds but the type.
+    b.catalogue(vec![entry("/a", STRING, latched(), &[7])]);
+    assert!(matches!(b.routes.problems().collect::<Vec<_>>()[..], [Problem::LocalType { .. }]));
+    b.catalogue(vec![]);
+    assert_eq!(b.routes.problems().count(), 0);
+}
+
+#[test]
+fn each_policy_and_each_publisher_is_compared() {
+    let mut b = bench(&[], &[("/a", None)]);
+    let mut listed = entry("/a", STRING, Qos::default(), &[1, 2]);
+    listed.sources[0].qos = Qos { deadline_ns: Some(1_000_000), ..Qos::default() };
+    listed.sources[1].qos = Qos { partitions: vec!["robot".into()], ..Qos::default() };
+    b.catalogue(vec![listed]);
+    let request = Qos { deadline_ns: Some(5_000_000), partitions: vec!["desk".into()], ..Qos::default() };
+    let told = problems(&b.appears(endpoint(1, EndpointKind::Reader, "/a", STRING, request)));
+    let told: Vec<_> = told.iter().map(ToString::to_string).collect();
+    assert_eq!(told.len(), 3, "{told:?}");
+    assert!(told.iter().any(|t| t.contains("deadline none") && t.contains("asks for 5ms")), "{told:?}");
+    assert!(told.iter().any(|t| t.contains("partition [\"robot\"]") && t.contains("[\"desk\"]")), "{told:?}");
+    assert!(told.iter().any(|t| t.contains("partition \"\"")), "{told:?}");
+}
+
+#[test]
+fn definitions_that_differ_are_named_by_their_hashes() {
+    let mut b = bench(&[("/mine", "")], &[("/a", None)]);
+    let with_hash = |hash: &str, e: DiscoveredEndpoint| DiscoveredEndpoint {
+        type_hash: (!hash.is_empty()).then(|| hash.to_owned()),
+        ..e
+    };
+    b.catalogue(vec![CatalogueEntry {
+        type_hash: Some("RIHS01_aa".into()),
+        ..entry("/a", STRING, Qos::default(), &[])
+    }]);
+    for (n, kind, end) in [(1, EndpointKind::Reader, "subscriber"), (2, EndpointKind::Writer, "publisher")] {
+        for hash in ["", "RIHS01_aa"] {
+            let same = with_hash(hash, endpoint(n, kind, "/a", STRING, Qos::default()));
+            assert_eq!(problems(&b.appears(same)), []);
+        }
+        let told =
+            problems(&b.appears(with_hash("RIHS01_bb", endpoint(n, kind, "/a", STRING, Qos::default()))));
+        assert!(
+            matches!(&told[..], [Problem::LocalHash { remote, end: e, local, .. }]
+            if (remote.as_str(), *e, local.as_str()) == ("RIHS01_aa", end, "RIHS01_bb")),
+            "{told:?}"
+        );
+        b.vanishes(n);
+        assert_eq!(b.routes.problems().count(), 0);
+    }
+    // Of one share.
+    b.appears(with_hash("RIHS01_bb", writer(3, "/mine", Qos::default())));
+    let told = problems(&b.appears(with_hash("RIHS01_aa", writer(4, "/mine", Qos::default()))));
+    assert!(
+        matches!(&told[..], [Problem::ShareHash { first, second, .. }]
+        if (first.as_str(), second.as_str()) == ("RIHS01_aa", "RIHS01_bb")),
+        "{told:?}"
+    );
+    b.vanishes(3);
+    assert_eq!(b.routes.problems().count(), 0);
+}
+
+#[test]
+fn what_the_rules_no_longer_ask_for_is_no_problem() {
+    let mut b = bench(&[("/t", "p/msg/Wanted")], &[("/a", Some("p/msg/Wanted"))]);
+    b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
+    let told = problems(&b.appears(writer(1, "/t", Qos::default())));
+    assert!(matches!(&told[..], [Problem::ShareType { .. }]), "{told:?}");
+    assert_eq!(b.routes.problems().count(), 2, "that, and the type of the use");
+    b.reconfigured(vec![share("/t", "")], vec![use_of(OWNER, "/a", None)]);
+    assert_eq!(b.routes.problems().count(), 0);
 }
 
 #[test]
@@ -325,6 +417,94 @@ fn each_far_latched_publisher_gets_a_writer_of_its_own() {
     assert_eq!(opened.len(), 3);
     let fewer = b.catalogue(vec![entry("/tf_static", STRING, latched(), &[1, 3])]);
     assert_eq!(fewer, [Command::CloseWriter { name, source: Some(SourceId([2; 16])) }]);
+}
+
+#[test]
+fn a_publisher_whose_node_started_anew_keeps_its_writer() {
+    let mut b = bench(&[], &[("/tf_static", None)]);
+    let name = theirs("/tf_static", STRING);
+    let source = |tag, run| SourceId::of_publisher([tag; 8], [run; 8]);
+    let list = |sources: &[SourceId]| {
+        let mut entry = entry("/tf_static", STRING, latched(), &vec![1; sources.len()]);
+        entry.sources.iter_mut().zip(sources).for_each(|(listed, source)| listed.source = *source);
+        vec![entry]
+    };
+    b.catalogue(list(&[source(1, 1), source(2, 1)]));
+    b.routes.handle_granted(&name, None);
+    assert_eq!(b.commands().len(), 2);
+    // The second ended while the node was away, a third began.
+    let after = b.catalogue(list(&[source(1, 2), source(3, 2)]));
+    assert_eq!(after[0], Command::MoveWriter { name, from: source(1, 1), to: source(1, 2) });
+    assert_eq!(after[1], Command::CloseWriter { name, source: Some(source(2, 1)) });
+    assert!(
+        matches!(after[2..], [Command::OpenWriter { source: Some(s), .. }] if s == source(3, 2)),
+        "{after:?}"
+    );
+    // One that offers something else is another writer; two that claim one predecessor get it once.
+    let mut other = list(&[source(1, 3)]);
+    other[0].sources[0].qos.deadline_ns = Some(7);
+    assert!(b.catalogue(other).iter().all(|c| !matches!(c, Command::MoveWriter { .. })));
+    let twice = b.catalogue(list(&[source(1, 4), source(1, 5)]));
+    assert!(twice.iter().all(|c| !matches!(c, Command::MoveWriter { .. })));
+    let thrice = b.catalogue(list(&[source(1, 6), source(1, 7), source(1, 8)]));
+    assert_eq!(thrice.iter().filter(|c| matches!(c, Command::MoveWriter { .. })).count(), 2, "{thrice:?}");
+}
+
+#[test]
+fn an_owner_that_started_anew_may_find_its_publishers_one_by_one() {
+    let (name, name_b) = (theirs("/tf_static", STRING), theirs("/b", STRING));
+    let source = |tag, run| SourceId::of_publisher([tag; 8], [run; 8]);
+    let list = |topic: &str, sources: &[SourceId]| {
+        let mut entry = entry(topic, STRING, latched(), &vec![1; sources.len()]);
+        entry.sources.iter_mut().zip(sources).for_each(|(listed, source)| listed.source = *source);
+        entry
+    };
+    let flowing = || {
+        let mut b = bench(&[], &[("/tf_static", None), ("/b", None)]);
+        b.catalogue(vec![
+            list("/tf_static", &[source(1, 1), source(2, 1), source(3, 1)]),
+            list("/b", &[source(4, 1)]),
+        ]);
+        [name, name_b].iter().for_each(|name| b.routes.handle_granted(name, None));
+        assert_eq!(b.commands().iter().filter(|c| matches!(c, Command::OpenWriter { .. })).count(), 4);
+        b
+    };
+    let away = |b: &mut Bench| {
+        b.routes.handle_owner_lost(OWNER, LostReason::Unreachable);
+        [name, name_b].iter().for_each(|name| b.routes.handle_lost(b.now, name));
+        assert_eq!(b.passes(UNREACHABLE_HOLD / 2), []);
+    };
+    let moved = |name, tag| Command::MoveWriter { name, from: source(tag, 1), to: source(tag, 2) };
+    let mut b = flowing();
+    away(&mut b);
+    b.routes.handle_granted(&name, None);
+    b.commands();
+    assert_eq!(b.catalogue(vec![list("/tf_static", &[source(1, 2)])]), [moved(name, 1)]);
+    // A topic that was not listed at all is asked for anew.
+    let found =
+        b.catalogue(vec![list("/tf_static", &[source(1, 2), source(2, 2)]), list("/b", &[source(4, 2)])]);
+    let again = Command::JoinAgain { name: name_b, owner: OWNER };
+    assert_eq!(found, [moved(name, 2), again]);
+    assert_eq!(b.granted(name_b, None), [moved(name_b, 4)]);
+    // What it has not found by then has ended.
+    assert_eq!(b.passes(REDISCOVERY_HOLD), [Command::CloseWriter { name, source: Some(source(3, 1)) }]);
+    // As soon as it is there, a publisher that ends is gone at once.
+    let ended = b.catalogue(vec![list("/tf_static", &[source(1, 2)])]);
+    assert_eq!(ended[0], Command::CloseWriter { name, source: Some(source(2, 2)) });
+    // An owner that was merely out of reach says what it means.
+    let mut b = flowing();
+    away(&mut b);
+    let lists = vec![list("/tf_static", &[source(1, 1)])];
+    let commands = b.catalogue(lists);
+    assert!(has(&commands, |c| *c == Command::Leave { name: name_b }), "{commands:?}");
+    assert_eq!(b.granted(name, None).len(), 2, "two writers closed");
+    // One that never finds a topic again does not share it.
+    let mut b = flowing();
+    away(&mut b);
+    assert_eq!(b.catalogue(vec![]), []);
+    let ended = b.passes(REDISCOVERY_HOLD);
+    assert_eq!(ended.iter().filter(|c| matches!(c, Command::CloseWriter { .. })).count(), 4, "{ended:?}");
+    assert_eq!(ended.iter().filter(|c| matches!(c, Command::Leave { .. })).count(), 2, "{ended:?}");
 }
 
 #[test]
@@ -440,6 +620,33 @@ fn what_cannot_change_in_a_running_share_ends_it_and_begins_it_anew() {
 }
 
 #[test]
+fn how_much_goes_on_changes_in_a_running_route() {
+    let slow = Shaping { interval: Some(Duration::from_secs(1)), ..Shaping::default() };
+    let shaped = |name, shaping| Command::Shape { name, shaping };
+    let mut b = bench_of(vec![ShareRule { shaping: slow, ..share("/a", "") }], vec![]);
+    let begun = b.appears(writer(1, "/a", Qos::default()));
+    assert_eq!(begun[1], shaped(mine("/a"), slow), "{begun:?}");
+    assert_eq!(b.reconfigured(vec![share("/a", "")], vec![]), [shaped(mine("/a"), Shaping::default())]);
+    assert_eq!(b.reconfigured(vec![share("/a", "")], vec![]), []);
+
+    let mut b = bench_of(vec![], vec![use_of(OWNER, "/a", None)]);
+    b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
+    let rule = UseRule { shaping: slow, ..use_of(OWNER, "/a", None) };
+    assert_eq!(b.reconfigured(vec![], vec![rule]), [shaped(theirs("/a", STRING), slow)]);
+
+    // What is published in another class begins anew.
+    let publish = |class| UseRule { class, shaping: slow, ..publish_rule("/cmd") };
+    let mut b = bench_of(vec![], vec![publish(None)]);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    let name = theirs("/cmd", STRING);
+    assert_eq!(b.catalogue(vec![listed])[1], shaped(name, slow));
+    let again = b.reconfigured(vec![], vec![publish(Some(Class::Realtime))]);
+    let begins = |c: &Command| matches!(c, Command::Publish { class: Class::Realtime, .. });
+    assert!(again[0] == Command::Leave { name } && begins(&again[1]), "{again:?}");
+}
+
+#[test]
 fn uses_begin_and_end_with_their_rules() {
     const OTHER: NodeId = NodeId([3; 32]);
     let mut b = bench(&[], &[("/a", None)]);
@@ -529,7 +736,8 @@ fn a_topic_that_its_owner_lets_us_publish_on_is_read_while_someone_here_writes_i
     assert_eq!(b.granted(name, None), [], "nobody here publishes yet");
     assert!(opens_reader(&b.appears(writer(1, "/cmd", Qos::default()))));
     assert_eq!(b.appears(writer(2, "/cmd", Qos::default())), []);
-    assert_eq!(b.appears(endpoint(3, EndpointKind::Writer, "/cmd", "p/msg/Other", Qos::default())), []);
+    let other = b.appears(endpoint(3, EndpointKind::Writer, "/cmd", "p/msg/Other", Qos::default()));
+    assert!(matches!(&other[..], [Command::Report(Problem::LocalType { .. })]), "{other:?}");
     b.vanishes(1);
     assert!(matches!(b.vanishes(2)[..], [Command::CloseReader { .. }]));
     b.appears(writer(4, "/cmd", Qos::default()));
@@ -583,4 +791,445 @@ fn a_running_share_keeps_its_name_when_the_secret_of_names_is_replaced() {
     assert!(has(&b.appears(writer(3, "/b", Qos::default())), |c| matches!(c, Command::Share(_))));
     assert!(b.routes.status().iter().any(|s| s.name == Some(mine("/a"))));
     assert!(b.routes.status().iter().all(|s| s.name != Some(mine("/b"))));
+}
+
+#[test]
+fn of_a_keyed_topic_as_much_is_kept_as_its_instances_may_have() {
+    let mut b = bench(&[("/a", ""), ("/b", "")], &[]);
+    let depth_of = |commands: &[Command]| {
+        let own = commands
+            .iter()
+            .find_map(|c| if let Command::MapSources { own, .. } = c { Some(own) } else { None });
+        own.unwrap()[0].2.history
+    };
+    let commands = b.appears(DiscoveredEndpoint { keyless: false, ..writer(1, "/a", latched()) });
+    assert_eq!(depth_of(&commands), History::KeepLast(sgc_ros::KEYED_INSTANCES_KEPT));
+    // What the far writer offers is what this one does: there it is made as deep again.
+    let offers =
+        |c: &Command| matches!(c, Command::UpdateShare { sources, .. } if sources[0].qos == latched());
+    assert!(has(&commands, offers), "{commands:?}");
+    assert_eq!(depth_of(&b.appears(writer(2, "/b", latched()))), History::KeepLast(1));
+}
+
+#[test]
+fn what_an_owner_lists_makes_nobody_use_what_it_did_not_ask_for() {
+    // This node may publish `/a`, uses `/used`, and shares `/own`.
+    let uses = vec![publish_rule("/a"), use_of(OWNER, "/used", Some(STRING))];
+    let mut b = bench_of(vec![share("/own", "")], uses);
+    for topic in ["/a", "/b", "/own", "/used"] {
+        b.appears(writer(topic.as_bytes()[1], topic, Qos::default()));
+    }
+    let as_service = |e: CatalogueEntry| CatalogueEntry {
+        metadata: Metadata { kind: Kind::Service, ..e.metadata.clone() },
+        ..e
+    };
+    let both = |topic: &str| CatalogueEntry { publish: true, ..entry(topic, STRING, Qos::default(), &[1]) };
+    let mut listed: Vec<_> = ["/b", "/own", "/", "", "/used/more", "a"].map(both).into();
+    listed.push(CatalogueEntry { publish: false, ..both("/a") });
+    listed.push(as_service(both("/a")));
+    listed.push(entry("/used", "p/msg/Other", Qos::default(), &[1]));
+    let commands = b.catalogue(listed);
+    assert!(commands.iter().all(|c| matches!(c, Command::Report(_))), "{commands:?}");
+    // Nor does a catalogue of somebody whom it did not ask.
+    b.routes.handle_catalogue(b.now, NodeId([7; 32]), Catalogue { version: 1, entries: vec![both("/used")] });
+    assert_eq!(b.commands(), []);
+    // What it asked for it gets, in the direction that it asked for.
+    let commands = b.catalogue(vec![both("/a"), both("/used")]);
+    assert_eq!(commands.iter().filter(|c| matches!(c, Command::Publish { .. })).count(), 1);
+    assert_eq!(commands.iter().filter(|c| matches!(c, Command::Join { .. })).count(), 1);
+    // A grant of what was never joined opens nothing.
+    assert_eq!(b.granted(theirs("/b", STRING), Some(both("/b"))), []);
+}
+
+fn naming(except: &[&str], rename: Rename) -> Naming {
+    Naming { except: except.iter().map(|name| (*name).into()).collect(), rename }
+}
+
+fn in_namespace(namespace: &str) -> Naming {
+    naming(&[], Rename::Namespace(namespace.into()))
+}
+
+fn shared(commands: &[Command]) -> Vec<String> {
+    let topic =
+        |c: &Command| if let Command::Share(s) = c { Some(s.metadata.ros_name.clone()) } else { None };
+    let mut topics: Vec<_> = commands.iter().filter_map(topic).collect();
+    topics.sort();
+    topics
+}
+
+/// What is joined, as its owner calls it.
+fn joined(commands: &[Command], topics: &[&'static str]) -> Vec<&'static str> {
+    let is_joined = |topic: &str| {
+        has(commands, |c| matches!(c, Command::Join { name, .. } if *name == theirs(topic, STRING)))
+    };
+    topics.iter().copied().filter(|topic| is_joined(topic)).collect()
+}
+
+fn written_as(commands: &[Command]) -> Vec<String> {
+    let topic = |c: &Command| match c {
+        Command::OpenWriter { spec, .. } => spec.topic.strip_prefix("rt").map(str::to_owned),
+        _ => None,
+    };
+    commands.iter().filter_map(topic).collect()
+}
+
+#[test]
+fn a_wildcard_shares_what_matches_while_it_is_there() {
+    let rule = ShareRule { naming: naming(&["/camera/debug/**"], Rename::Keep), ..share("/camera/**", "") };
+    let mut b = bench_of(vec![rule], vec![]);
+    assert_eq!(b.routes.status()[0].topic, "/camera/**");
+    for (n, topic) in ["/camera", "/camera/debug/x", "/camera/_action/status", "/other"].iter().enumerate() {
+        assert_eq!(b.appears(writer(n as u8 + 1, topic, Qos::default())), [], "{topic}");
+    }
+    assert_eq!(shared(&b.appears(writer(11, "/camera/image", Qos::default()))), ["/camera/image"]);
+    let typed = endpoint(12, EndpointKind::Writer, "/camera/info", "p/msg/Info", Qos::default());
+    assert_eq!(shared(&b.appears(typed)), ["/camera/info"], "of whatever type");
+    let topics: Vec<_> = b.routes.status().into_iter().map(|s| s.topic).collect();
+    assert_eq!(topics.len(), 2, "{topics:?}");
+    b.vanishes(11);
+    assert_eq!(b.passes(WRITERLESS_HOLD), [Command::Unshare { name: mine("/camera/image") }]);
+}
+
+#[test]
+fn the_rule_that_names_a_topic_counts_before_wildcards_and_those_in_their_order() {
+    let bulk = ShareRule { class: Class::Bulk, ..share("/a/**", "") };
+    let images = ShareRule { class: Class::Realtime, ..share("/**", "p/msg/Image") };
+    let mut b = bench_of(vec![images, bulk, share("/**", ""), share("/rosout", "")], vec![]);
+    let mut class = |endpoint| {
+        b.appears(endpoint)
+            .into_iter()
+            .find_map(|c| if let Command::Share(s) = c { Some(s.class) } else { None })
+    };
+    assert_eq!(class(writer(1, "/a/b", Qos::default())), Some(Class::Bulk));
+    let image = endpoint(2, EndpointKind::Writer, "/a/image", "p/msg/Image", Qos::default());
+    assert_eq!(class(image), Some(Class::Realtime), "wildcards may be for one type");
+    assert_eq!(class(writer(3, "/b", Qos::default())), Some(Class::Default));
+    assert_eq!(class(writer(4, "/rosout", Qos::default())), Some(Class::Default), "it is named");
+    assert_eq!(class(writer(5, "/parameter_events", Qos::default())), None);
+}
+
+#[test]
+fn a_share_may_have_another_name_for_others() {
+    let named = ShareRule { naming: naming(&[], Rename::As("/r/cam".into())), ..share("/cam", "") };
+    let spaced = ShareRule { naming: in_namespace("/r"), ..share("/b/*", "") };
+    let mut b = bench_of(vec![named, spaced, share("/r/**", "")], vec![]);
+    assert_eq!(shared(&b.appears(writer(1, "/cam", latched()))), ["/r/cam"]);
+    b.routes.handle_sink_joined(&mine("/r/b/c"), SinkId([7; 16]));
+    let begun = b.appears(writer(2, "/b/c", latched()));
+    assert_eq!(shared(&begun), ["/r/b/c"]);
+    let read = |c: &Command| matches!(c, Command::OpenReader { name, spec } if *name == mine("/r/b/c") && spec.topic == "rt/b/c");
+    assert!(has(&begun, read), "{begun:?}");
+    // Two topics cannot be one.
+    let twice = b.appears(writer(3, "/r/cam", Qos::default()));
+    assert!(matches!(problems(&twice)[..], [Problem::SharedAsOne { .. }]) && twice.len() == 1, "{twice:?}");
+    // Once the one has gone the other may have the name.
+    b.vanishes(1);
+    assert_eq!(shared(&b.passes(WRITERLESS_HOLD)), ["/r/cam"]);
+}
+
+#[test]
+fn a_wildcard_brings_what_is_listed_and_namespaces_it() {
+    let rule = UseRule {
+        naming: Naming { except: vec!["/x/**".into()], ..in_namespace("/r1") },
+        ..use_of(OWNER, "/**", None)
+    };
+    let mut b = bench_of(vec![], vec![rule]);
+    const TOPICS: [&str; 5] = ["/tf", "/a/b", "/clock", "/x/y", "/parameter_events"];
+    let list =
+        |topics: &[&str]| topics.iter().map(|t| entry(t, STRING, Qos::default(), &[])).collect::<Vec<_>>();
+    let begun = b.catalogue(list(&TOPICS));
+    assert_eq!(joined(&begun, &TOPICS), ["/tf", "/a/b", "/clock", "/parameter_events"]);
+    let here = |b: &mut Bench, topic| written_as(&b.granted(theirs(topic, STRING), None));
+    assert_eq!(here(&mut b, "/tf"), ["/tf"]);
+    assert_eq!(here(&mut b, "/a/b"), ["/r1/a/b"]);
+    assert_eq!(here(&mut b, "/clock"), ["/r1/clock"]);
+    assert_eq!(b.routes.topic_of(&theirs("/a/b", STRING)), Some("/r1/a/b"));
+    // It goes and comes with the catalogue.
+    let fewer = b.catalogue(list(&TOPICS[..1]));
+    assert!(has(&fewer, |c| *c == Command::Leave { name: theirs("/a/b", STRING) }), "{fewer:?}");
+    assert_eq!(joined(&b.catalogue(list(&TOPICS)), &TOPICS), ["/a/b", "/clock", "/parameter_events"]);
+    // A subscriber here is judged under the name here.
+    let wrong = endpoint(1, EndpointKind::Reader, "/r1/a/b", "x_msgs/msg/Other", Qos::default());
+    assert!(matches!(problems(&b.appears(wrong))[..], [Problem::LocalType { .. }]));
+}
+
+#[test]
+fn names_that_are_none_are_not_brought() {
+    let mut b = bench(&[], &[("/**", None)]);
+    let long = format!("/{}", "a".repeat(300));
+    for topic in ["no_slash", "/a b", "/a//b", "/1", &long, "/a/*"] {
+        let said = b.catalogue(vec![entry(topic, STRING, Qos::default(), &[])]);
+        let is_refused = matches!(&said[..], [Command::Report(Problem::NoName { .. })] | []);
+        assert!(is_refused && b.routes.status()[0].name.is_none(), "{topic}: {said:?}");
+    }
+    // A namespace may be what makes it too long.
+    let rule = UseRule { naming: in_namespace("/robot"), ..use_of(OWNER, "/**", None) };
+    let mut b = bench_of(vec![], vec![rule]);
+    let said = b.catalogue(vec![entry(&long[..245], STRING, Qos::default(), &[])]);
+    assert!(matches!(problems(&said)[..], [Problem::NoName { .. }]) && said.len() == 1, "{said:?}");
+}
+
+#[test]
+fn what_is_brought_is_not_shared_on_by_a_wildcard() {
+    // By a rule that names it, from the beginning.
+    let mut b = bench_of(vec![share("/**", "")], vec![use_of(OWNER, "/a", None)]);
+    let said = b.appears(writer(1, "/a", Qos::default()));
+    assert!(matches!(problems(&said)[..], [Problem::UsedNotShared { .. }]) && said.len() == 1, "{said:?}");
+    // By a wildcard, while it is brought.
+    let mut b = bench_of(vec![share("/**", "")], vec![use_of(OWNER, "/**", None)]);
+    b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
+    let said = b.appears(writer(1, "/a", Qos::default()));
+    assert!(matches!(problems(&said)[..], [Problem::UsedNotShared { .. }]) && said.len() == 1, "{said:?}");
+    let text = problems(&said)[0].to_string();
+    assert!(text.contains("except") && text.contains("owner"), "{text}");
+    assert_eq!(shared(&b.catalogue(vec![])), ["/a"], "it is brought no longer");
+    // What is shared is not brought, until it is shared no longer.
+    let listed = || vec![entry("/a", STRING, Qos::default(), &[]), entry("/b", STRING, Qos::default(), &[])];
+    let said = b.catalogue(listed());
+    assert!(matches!(problems(&said)[..], [Problem::SharedNotUsed { .. }]), "{said:?}");
+    assert_eq!(joined(&said, &["/a", "/b"]), ["/b"]);
+    b.vanishes(1);
+    assert_eq!(joined(&b.passes(WRITERLESS_HOLD), &["/a", "/b"]), ["/a"]);
+    // Under another name it is another topic.
+    let rule = UseRule { naming: in_namespace("/r"), ..use_of(OWNER, "/**", None) };
+    let mut b = bench_of(vec![share("/**", "")], vec![rule]);
+    assert_eq!(shared(&b.appears(writer(1, "/a", Qos::default()))), ["/a"]);
+    assert_eq!(joined(&b.catalogue(listed()), &["/a", "/b"]), ["/a", "/b"]);
+}
+
+#[test]
+fn topics_of_two_owners_become_one_and_of_two_types_are_named() {
+    const OTHER: NodeId = NodeId([3; 32]);
+    let mut b = bench_of(
+        vec![],
+        vec![
+            use_of(OWNER, "/tf", None),
+            UseRule { owner_name: "other".into(), ..use_of(OTHER, "/tf", None) },
+        ],
+    );
+    b.catalogue(vec![entry("/tf", STRING, latched(), &[1, 2])]);
+    let other_type = |type_name: &str| {
+        let metadata = Metadata::topic("other", "/tf", type_name);
+        let blind = TopicSecret::derive(&secret(), &metadata).blind();
+        CatalogueEntry { metadata, blind, ..entry("/tf", type_name, latched(), &[3]) }
+    };
+    let mut from_other = |entry: CatalogueEntry| {
+        let name = sgc_trust::name_of(&OTHER, &entry.blind);
+        b.routes.handle_catalogue(b.now, OTHER, Catalogue { version: 1, entries: vec![entry] });
+        (name, b.commands())
+    };
+    let (name, commands) = from_other(other_type(STRING));
+    assert_eq!(problems(&commands), [] as [Problem; 0]);
+    let (_, commands) = from_other(other_type("p/msg/Other"));
+    let text = problems(&commands)[0].to_string();
+    assert!(text.contains(STRING) && text.contains("p/msg/Other") && text.contains("namespace"), "{text}");
+    from_other(other_type(STRING));
+    let both = [b.granted(theirs("/tf", STRING), None), b.granted(name, None)].concat();
+    assert_eq!(written_as(&both), ["/tf", "/tf", "/tf"], "each latched publisher has a writer of its own");
+}
+
+#[test]
+fn a_wildcard_carries_so_many_and_says_so_once() {
+    let topic = |n: usize| format!("/t{n}");
+    let entries = |topics: std::ops::Range<usize>| -> Vec<_> {
+        topics.map(|n| entry(&topic(n), STRING, Qos::default(), &[])).collect()
+    };
+    let mut b = bench(&[], &[("/**", None)]);
+    let all = b.catalogue(entries(0..ROUTES_PER_WILDCARD_MAX + 5));
+    let joins = |commands: &[Command]| commands.iter().filter(|c| matches!(c, Command::Join { .. })).count();
+    assert_eq!(joins(&all), ROUTES_PER_WILDCARD_MAX);
+    assert!(matches!(problems(&all)[..], [Problem::TooManyMatches { .. }]));
+    // Those that come later find the room of those that went.
+    let later = b.catalogue(entries(3..ROUTES_PER_WILDCARD_MAX + 5));
+    let again = b.catalogue(entries(3..ROUTES_PER_WILDCARD_MAX + 5));
+    assert_eq!((joins(&later) + joins(&again), problems(&later).len()), (3, 0));
+
+    let mut b = bench(&[("/**", "")], &[]);
+    let mut begun = Vec::new();
+    for n in 0..ROUTES_PER_WILDCARD_MAX + 2 {
+        let mut local = writer(0, &topic(n), Qos::default());
+        local.guid.0[..8].copy_from_slice(&(n as u64).to_be_bytes());
+        begun.extend(b.appears(local));
+    }
+    assert_eq!(shared(&begun).len(), ROUTES_PER_WILDCARD_MAX);
+    assert!(matches!(problems(&begun)[..], [Problem::TooManyMatches { .. }]));
+}
+
+#[test]
+fn a_route_goes_on_under_whichever_rule_covers_it_now() {
+    let mut b = bench_of(vec![share("/a", ""), share("/**", "")], vec![use_of(OWNER, "/c", None)]);
+    b.appears(writer(1, "/a", Qos::default()));
+    b.appears(writer(2, "/b", Qos::default()));
+    b.catalogue(vec![entry("/c", STRING, Qos::default(), &[]), entry("/d", STRING, Qos::default(), &[])]);
+    b.granted(theirs("/c", STRING), None);
+    let uses = || vec![use_of(OWNER, "/**", None)];
+    let wider = b.reconfigured(vec![share("/*", "")], uses());
+    assert_eq!(joined(&wider, &["/c", "/d"]), ["/d"], "{wider:?}");
+    assert_eq!(wider.len(), 1, "{wider:?}");
+    // With an exception only what it is about ends.
+    let fewer = ShareRule { naming: naming(&["/b"], Rename::Keep), ..share("/*", "") };
+    assert_eq!(b.reconfigured(vec![fewer.clone()], uses()), [Command::Unshare { name: mine("/b") }]);
+    // Under another name it is another writer.
+    let name = theirs("/c", STRING);
+    let spaced = vec![UseRule { naming: in_namespace("/r"), ..use_of(OWNER, "/**", None) }];
+    let moved = b.reconfigured(vec![fewer.clone()], spaced.clone());
+    let ends = [Command::CloseWriter { name, source: None }, Command::Leave { name }];
+    assert!(ends.iter().all(|end| moved.contains(end)), "{moved:?}");
+    assert_eq!(joined(&moved, &["/c", "/d"]), ["/c", "/d"]);
+    // What prefixes frames changes while it runs.
+    let framed = vec![UseRule { frame_prefix: Some("r/".into()), ..spaced[0].clone() }];
+    let told = b.reconfigured(vec![fewer.clone()], framed);
+    let tells = |c: &Command| matches!(c, Command::Frames { prefix: Some(prefix), .. } if prefix == "r/");
+    assert!(told.len() == 2 && told.iter().all(tells), "{told:?}");
+    // A rule that now names what is brought by a wildcard takes it over.
+    b.reconfigured(vec![fewer.clone()], uses());
+    let claimed = b.reconfigured(vec![fewer, share("/c", "")], uses());
+    assert!(has(&claimed, |c| *c == Command::Leave { name }), "{claimed:?}");
+    assert!(matches!(problems(&claimed)[..], [Problem::SharedNotUsed { .. }]), "{claimed:?}");
+}
+
+/// What the last command of its kind says of a share's publishers: in the catalogue, and by local writer.
+fn published(commands: &[Command]) -> (Vec<CatalogueSource>, Vec<(Guid, SourceId)>) {
+    let listed = commands.iter().rev().find_map(|c| match c {
+        Command::UpdateShare { sources, .. } => Some(sources.clone()),
+        _ => None,
+    });
+    let own = commands.iter().rev().find_map(|c| match c {
+        Command::MapSources { own, .. } => {
+            Some(own.iter().map(|(guid, source, _)| (*guid, *source)).collect())
+        }
+        _ => None,
+    });
+    (listed.unwrap(), own.unwrap())
+}
+
+fn node(name: &str) -> RosNode {
+    RosNode::new("/robot", name, None).unwrap()
+}
+
+fn participant(n: u8) -> Guid {
+    Guid([n; 16])
+}
+
+#[test]
+fn each_publisher_is_listed_with_what_it_offers_and_its_node() {
+    let mut b = bench(&[("/a", "")], &[]);
+    let fast = Qos { deadline_ns: Some(5), history: History::KeepLast(3), ..Qos::default() };
+    let first = published(&b.appears(writer(1, "/a", fast.clone())));
+    assert_eq!(first.0.len(), 1);
+    assert_eq!((&first.0[0].qos, &first.0[0].node), (&fast, &None));
+    let second = published(&b.appears(writer(2, "/a", Qos::default())));
+    assert_eq!((second.0.len(), second.1.len()), (2, 2));
+    assert!(second.1.contains(&first.1[0]), "the first keeps its source");
+    let named = |b: &mut Bench, nodes| {
+        let event = DiscoveryEvent::Nodes { participant: participant(2), nodes };
+        b.routes.handle_discovery(b.now, event);
+        b.commands()
+    };
+    let talker = |name| GraphNode { node: node(name), readers: vec![], writers: vec![Guid([2; 16])] };
+    let told = published(&named(&mut b, vec![talker("talker")]));
+    let of = |told: &(Vec<CatalogueSource>, Vec<(Guid, SourceId)>), n: u8| {
+        let source = told.1.iter().find(|(guid, _)| *guid == Guid([n; 16])).unwrap().1;
+        told.0.iter().find(|s| s.source == source).unwrap().clone()
+    };
+    assert_eq!((of(&told, 1).node, of(&told, 2).node), (None, Some(node("talker"))));
+    assert_eq!((of(&told, 1).qos, of(&told, 2).qos), (fast, Qos::default()));
+    // What concerns no share is nobody's business.
+    assert_eq!(
+        named(&mut b, vec![talker("talker"), GraphNode { writers: vec![Guid([9; 16])], ..talker("x") }]),
+        []
+    );
+    // Nodes may be known before their endpoints are.
+    let third = published(&b.appears(writer(9, "/a", Qos::default())));
+    assert_eq!(of(&third, 9).node, None, "another participant's word counts for nothing");
+    let gone = published(&named(&mut b, vec![]));
+    assert_eq!(of(&gone, 2).node, None);
+}
+
+#[test]
+fn a_restarted_volatile_publisher_takes_its_source_over_and_a_gone_one_is_listed_no_more() {
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    let before = published(&b.appears(writer(2, "/a", Qos::default())));
+    // What it wrote last is still published as its own.
+    let left = published(&b.vanishes(2));
+    assert_eq!(left, before);
+    let back = published(&b.appears(writer(3, "/a", Qos::default())));
+    assert_eq!(back.0, before.0, "the far side notices nothing");
+    let source = |told: &[(Guid, SourceId)], n: u8| told.iter().find(|(g, _)| *g == Guid([n; 16])).unwrap().1;
+    assert_eq!(source(&back.1, 3), source(&before.1, 2));
+    // One that offers something else is another.
+    b.vanishes(3);
+    let other =
+        published(&b.appears(writer(4, "/a", Qos { history: History::KeepLast(1), ..Qos::default() })));
+    assert_eq!(other.0.len(), 3);
+    let later = published(&b.passes(WRITERLESS_HOLD));
+    assert_eq!((later.0.len(), later.1.len()), (2, 2));
+    assert_eq!(b.routes.poll_timeout(), None);
+    // Alone, too: it is found as it was until the share ends.
+    let mut b = bench(&[("/a", "")], &[]);
+    let alone = published(&b.appears(writer(1, "/a", Qos::default())));
+    assert_eq!(b.vanishes(1), []);
+    assert_eq!(published(&b.appears(writer(2, "/a", Qos::default()))).0, alone.0);
+    assert!(!has(&b.passes(WRITERLESS_HOLD), |c| matches!(c, Command::Unshare { .. })));
+}
+
+#[test]
+fn what_is_read_of_a_publisher_is_what_is_said_of_it() {
+    let mut b = bench(&[("/a", "")], &[]);
+    let reliable = published(&b.appears(writer(1, "/a", Qos::default())));
+    let best_effort = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
+    let mixed = published(&b.appears(writer(2, "/a", best_effort.clone())));
+    assert!(mixed.0.iter().all(|s| s.qos.reliability == Reliability::BestEffort), "{mixed:?}");
+    assert!(!mixed.0.iter().any(|s| s.source == reliable.0[0].source), "another kind of source");
+    let mixed = published(&b.appears(writer(3, "/a", latched())));
+    assert!(mixed.0.iter().all(|s| !s.qos.is_transient_local()));
+}
+
+#[test]
+fn many_short_lived_publishers_never_take_more_sources_than_can_be_listed() {
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(255, "/a", Qos::default()));
+    for n in 0..250 {
+        let qos = Qos { history: History::KeepLast(u32::from(n) + 100), ..Qos::default() };
+        let told = published(&b.appears(writer(n, "/a", qos)));
+        assert!(told.0.len() <= sgc_wire::ENTRY_SOURCES_MAX);
+        assert!(told.0.iter().any(|s| s.qos.history == History::KeepLast(u32::from(n) + 100)), "{n}");
+        b.vanishes(n);
+    }
+}
+
+#[test]
+fn the_far_node_of_a_writer_is_told_when_it_is_known_and_changes_no_writer() {
+    let mut b = bench(&[], &[("/a", None)]);
+    let name = theirs("/a", STRING);
+    let listed = |node: Option<RosNode>| {
+        let mut listed = entry("/a", STRING, Qos::default(), &[1]);
+        listed.sources[0].node = node;
+        vec![listed]
+    };
+    b.catalogue(listed(None));
+    assert!(matches!(&b.granted(name, None)[..], [Command::OpenWriter { source: Some(_), .. }]));
+    let (source, owner) = (Some(SourceId([1; 16])), OWNER);
+    let set = |node: Option<RosNode>| Command::SetNode { name, source, owner, node };
+    assert_eq!(b.catalogue(listed(Some(node("talker")))), [set(Some(node("talker")))]);
+    assert_eq!(b.catalogue(listed(Some(node("talker")))), []);
+    assert_eq!(b.catalogue(listed(Some(node("other")))), [set(Some(node("other")))]);
+    assert_eq!(b.catalogue(listed(None)), [set(None)]);
+    b.catalogue(listed(Some(node("talker"))));
+    // With the writer goes what was said of it.
+    b.routes.handle_lost(b.now, &name);
+    assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source }]);
+    let again = b.granted(name, None);
+    assert!(matches!(&again[..], [Command::OpenWriter { .. }, Command::SetNode { .. }]), "{again:?}");
+    let mut other = listed(Some(node("talker")));
+    other[0].sources[0].qos.history = History::KeepLast(2);
+    let changed = b.catalogue(other);
+    assert!(
+        matches!(
+            &changed[..],
+            [Command::CloseWriter { .. }, Command::OpenWriter { .. }, Command::SetNode { .. }]
+        ),
+        "{changed:?}"
+    );
 }

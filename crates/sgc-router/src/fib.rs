@@ -51,8 +51,12 @@ impl FibEntry {
         })
     }
 
-    /// The link that a packet for one sink goes out on.
-    pub fn egress_to(&self, sink: &SinkId) -> Option<LinkId> {
+    /// The link that a packet for one sink goes out on, having come in over `ingress`: only what comes from the owner's
+    /// side goes to one.
+    pub fn egress_to(&self, ingress: LinkId, sink: &SinkId) -> Option<LinkId> {
+        if self.trees.iter().all(|t| t.up != ingress) {
+            return None;
+        }
         self.sinks.binary_search_by(|(s, _)| s.cmp(sink)).ok().map(|i| self.sinks[i].1)
     }
 
@@ -89,6 +93,16 @@ mod tests {
         assert_eq!(egress(&trees, 1), [2, 3]);
         assert_eq!(egress(&trees, 4), [3, 5]);
         assert_eq!(egress(&trees, 2), [0; 0]);
+    }
+
+    #[test]
+    fn what_is_for_one_sink_comes_from_the_owners_side() {
+        let sink = SinkId([7; 16]);
+        let entry = FibEntry { trees: [tree(1, &[], &[2, 3])].into(), sinks: vec![(sink, LinkId(2))] };
+        assert_eq!(entry.egress_to(LinkId(1), &sink), Some(LinkId(2)));
+        assert_eq!(entry.egress_to(LinkId(3), &sink), None);
+        assert_eq!(entry.egress_to(LinkId(1), &SinkId([8; 16])), None);
+        assert_eq!(entry.links()[..], [LinkId(1), LinkId(2)]);
     }
 
     #[test]

@@ -367,6 +367,10 @@ impl Router {
             Control::Label { .. } | Control::LabelAck { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "label" });
             }
+            Control::Pulse { .. } => self.drop_frame(link, DropReason::Unknown { what: "pulse" }),
+            Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
+                self.drop_frame(link, DropReason::Unknown { what: "lane" });
+            }
             Control::Goodbye => {
                 self.outputs.push_back(Output::Close { link, reason: LinkClose::Goodbye });
                 self.forget_link(link);

@@ -74,9 +74,8 @@ impl Tree {
         for (sink, branch) in self.branches.iter().filter(|(_, b)| b.carries()) {
             // What still comes over an old link is of no use, but not wrong.
             trees.entry(branch.up).or_insert_with(|| tree(branch.up));
-            if branch.role == Role::Subscribe {
-                entry.sinks.push((*sink, branch.link));
-            }
+            // Publishers, too: what a service replies is for one of them.
+            entry.sinks.push((*sink, branch.link));
         }
         for ((link, role), up) in &self.feeds {
             let tree = trees.entry(*up).or_insert_with(|| tree(*up));

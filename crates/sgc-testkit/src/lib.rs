@@ -6,7 +6,8 @@
 //! [`Model`] says what should have come of it, from the configuration alone. [`mesh`] has bare routers by the thousand.
 //!
 //! There is no socket, no thread and no sleep here, and no ROS: what a node publishes is a numbered message.
-//! Sealing is as in production; the provider's own randomness in signatures decides nothing.
+//! Sealing is as in production; the provider's own randomness in signatures decides nothing. [`netsim`] alone is
+//! different: it is a bad network for real processes, in real time.
 //!
 //! ```
 //! use std::time::Duration;
@@ -30,6 +31,7 @@ mod clock;
 mod evil;
 pub mod mesh;
 mod model;
+pub mod netsim;
 mod node;
 mod publishers;
 mod record;
@@ -46,5 +48,5 @@ pub use model::Model;
 pub use node::{NodeKey, Sharing};
 pub use record::{DataDrop, Logged, MessageId, Published, Received, What};
 pub use rng::Dice;
-pub use ros::{FakeDomain, FakeReader, FakeRos, FakeWriter};
+pub use ros::{FakeClient, FakeDomain, FakeReader, FakeRos, FakeServer, FakeWriter};
 pub use world::{World, WorldConfig};

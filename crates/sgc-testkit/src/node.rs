@@ -18,7 +18,7 @@ use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, Ro
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
-    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
+    Name, NodeId, Now, Packet, PayloadEncoding, Qos, Reliability, SourceId,
 };
 
 use crate::cast::{Member, identity};
@@ -350,7 +350,7 @@ impl Running {
         let source_id = self.endpoint.new_source_id();
         let sources = match sharing.depth {
             0 => Vec::new(),
-            _ => vec![CatalogueSource { source: source_id, qos: sharing.qos() }],
+            _ => vec![CatalogueSource { source: source_id, qos: sharing.qos(), node: None }],
         };
         let spec = ShareSpec {
             metadata: metadata(self.identity.node_name().as_str(), topic),
@@ -649,7 +649,7 @@ impl Running {
             }
         }
         let links: Vec<_> = match packet.header.to {
-            Some(sink) => entry.egress_to(&sink).into_iter().collect(),
+            Some(sink) => entry.egress_to(ingress, &sink).into_iter().collect(),
             None => entry.egress(ingress).collect(),
         };
         if links.is_empty() && packet.header.to.is_some() {
@@ -708,7 +708,8 @@ impl Running {
 pub(crate) fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Packet> {
     let mut payload = id.0.to_be_bytes().to_vec();
     payload.resize(bytes.max(8), 0x5a);
-    let head = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 0 };
+    let head =
+        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
     let mut packets = Vec::new();
     source.publish(&head, payload.into(), false, |p| packets.push(p)).expect("tests publish what fits");
     packets

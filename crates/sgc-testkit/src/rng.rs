@@ -36,6 +36,16 @@ impl Dice {
         self.below(100) < percent
     }
 
+    /// A number of at least 0 and less than 1.
+    pub fn fraction(&mut self) -> f64 {
+        (self.0.next_u64() >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// True with this probability; 0 is never, 1 always.
+    pub fn likely(&mut self, probability: f64) -> bool {
+        probability > 0.0 && self.fraction() < probability
+    }
+
     /// One of them; `None` of an empty slice.
     pub fn pick<T: Copy>(&mut self, of: &[T]) -> Option<T> {
         (!of.is_empty()).then(|| of[self.below(of.len())])

@@ -5,14 +5,24 @@
 //! not do: depth of volatile history, loss, partitions, or anything that takes time.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
-use bytes::Bytes;
+use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError,
-    RosNetwork, RosWriter, Sample, SampleHandler, SampleKind,
+    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
+    RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
+    SampleKind, ServiceSpec,
 };
-use sgc_wire::History;
+use sgc_wire::{History, Qos};
+
+/// How often, and how many milliseconds apart, it is looked for who is to hear a request.
+const PEER_LOOKS: u64 = 100;
+const PEER_LOOK_MS: u64 = 10;
+/// Encapsulation header, then client and number, then the body.
+const HEADER_BYTES: usize = 4;
+const ID_BYTES: usize = 24;
 
 /// A domain: clone it to let several networks meet.
 #[derive(Clone, Default)]
@@ -22,6 +32,8 @@ pub struct FakeDomain(Arc<Mutex<DomainState>>);
 struct DomainState {
     next: u32,
     endpoints: BTreeMap<Guid, Endpoint>,
+    /// What each network announces, and whether it is a proxy.
+    nodes: BTreeMap<u32, (bool, Vec<GraphNode>)>,
     watchers: Vec<Watcher>,
 }
 
@@ -60,10 +72,31 @@ pub struct FakeReader {
     guid: Guid,
 }
 
+impl FakeReader {
+    /// Its GUID.
+    pub fn guid(&self) -> Guid {
+        self.guid
+    }
+}
+
 /// A writer; ends when dropped.
 pub struct FakeWriter {
     domain: FakeDomain,
     guid: Guid,
+}
+
+/// A client; ends when dropped.
+pub struct FakeClient {
+    requests: FakeWriter,
+    answers: FakeReader,
+    client: [u8; 16],
+    next: AtomicI64,
+}
+
+/// A server; ends when dropped.
+pub struct FakeServer {
+    replies: FakeWriter,
+    asked: FakeReader,
 }
 
 impl FakeDomain {
@@ -83,6 +116,32 @@ impl FakeDomain {
             .count()
     }
 
+    /// The endpoints on a topic, of a kind: which are still there, and which were made anew.
+    pub fn guids(&self, topic: &str, kind: EndpointKind) -> Vec<Guid> {
+        let state = self.lock();
+        let wanted = |e: &&Endpoint| e.discovered.topic == topic && e.discovered.kind == kind;
+        state.endpoints.values().filter(wanted).map(|e| e.discovered.guid).collect()
+    }
+
+    /// What the writers on a topic offer.
+    pub fn offers(&self, topic: &str) -> Vec<Qos> {
+        let state = self.lock();
+        let all = state.endpoints.values().map(|e| &e.discovered);
+        let writers = all.filter(|e| e.topic == topic && e.kind == EndpointKind::Writer);
+        writers.map(|e| e.qos.clone()).collect()
+    }
+
+    /// The nodes that proxies announce, by full name, each with how many readers and writers of it are there.
+    pub fn mirrored(&self) -> Vec<(String, usize, usize)> {
+        let state = self.lock();
+        let here = |all: &[Guid]| all.iter().filter(|guid| state.endpoints.contains_key(guid)).count();
+        let nodes = state.nodes.values().filter(|(tagged, _)| *tagged).flat_map(|(_, nodes)| nodes);
+        let mut all: Vec<_> =
+            nodes.map(|n| (n.node.to_string(), here(&n.readers), here(&n.writers))).collect();
+        all.sort();
+        all
+    }
+
     fn lock(&self) -> MutexGuard<'_, DomainState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -93,7 +152,10 @@ impl FakeDomain {
             state.next += 1;
             let kind = if reader.is_some() { EndpointKind::Reader } else { EndpointKind::Writer };
             let mut guid = [0; 16];
-            guid[..4].copy_from_slice(&state.next.to_be_bytes());
+            // The prefix is the participant's.
+            guid[..4].copy_from_slice(&network.network.to_be_bytes());
+            guid[11..15].copy_from_slice(&state.next.to_be_bytes());
+            guid[11] = 0;
             guid[15] = if kind == EndpointKind::Reader { 4 } else { 3 };
             let discovered = DiscoveredEndpoint {
                 kind,
@@ -138,6 +200,25 @@ impl FakeDomain {
         guid
     }
 
+    fn announce(&self, network: u32, tagged: bool, nodes: Vec<GraphNode>) {
+        let watchers = {
+            let mut state = self.lock();
+            let gone = nodes.is_empty() && state.nodes.remove(&network).is_none();
+            if gone {
+                return;
+            }
+            if !nodes.is_empty() {
+                state.nodes.insert(network, (tagged, nodes.clone()));
+            }
+            state.watchers_of(network, tagged)
+        };
+        for watcher in watchers {
+            let (participant, nodes) = (participant(network), nodes.clone());
+            let event = DiscoveryEvent::Nodes { participant, nodes };
+            (watcher.lock().unwrap_or_else(PoisonError::into_inner))(event);
+        }
+    }
+
     fn remove(&self, guid: Guid) {
         let watchers = {
             let mut state = self.lock();
@@ -164,12 +245,19 @@ impl DomainState {
 impl RosNetwork for FakeRos {
     type Reader = FakeReader;
     type Writer = FakeWriter;
+    type Client = FakeClient;
+    type Server = FakeServer;
 
     fn discover(&self, mut handler: DiscoveryHandler) -> Result<(), RosError> {
         let mut state = self.domain.lock();
         for endpoint in state.endpoints.values() {
             if endpoint.network != self.network && !(endpoint.tagged && self.tagged) {
                 handler(DiscoveryEvent::Appeared(endpoint.discovered.clone()));
+            }
+        }
+        for (network, (tagged, nodes)) in &state.nodes {
+            if *network != self.network && !(*tagged && self.tagged) {
+                handler(DiscoveryEvent::Nodes { participant: participant(*network), nodes: nodes.clone() });
             }
         }
         let handler = Arc::new(Mutex::new(handler));
@@ -186,11 +274,93 @@ impl RosNetwork for FakeRos {
         let guid = self.domain.add(self, spec, None);
         Ok(FakeWriter { domain: self.domain.clone(), guid })
     }
+
+    fn create_client(&self, spec: &ServiceSpec, mut handler: RequestHandler) -> Result<FakeClient, RosError> {
+        let requests = self.create_writer(&spec.request)?;
+        let client = requests.guid.0;
+        let replies = self.create_reader(
+            &spec.reply,
+            Box::new(move |sample| {
+                if let Some((id, payload)) = split(&sample.payload, None)
+                    && id.client == client
+                {
+                    handler(id, payload);
+                }
+            }),
+        )?;
+        Ok(FakeClient { requests, answers: replies, client, next: AtomicI64::new(1) })
+    }
+
+    fn create_server(&self, spec: &ServiceSpec, mut handler: RequestHandler) -> Result<FakeServer, RosError> {
+        let replies = self.create_writer(&spec.reply)?;
+        let requests = self.create_reader(
+            &spec.request,
+            Box::new(move |sample| {
+                if let Some((id, payload)) = split(&sample.payload, sample.writer) {
+                    handler(id, payload);
+                }
+            }),
+        )?;
+        Ok(FakeServer { replies, asked: requests })
+    }
+
+    fn reader_guid(&self, reader: &FakeReader) -> Guid {
+        reader.guid
+    }
+
+    fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
+        self.domain.announce(self.network, self.tagged, nodes.to_vec());
+        Ok(())
+    }
+}
+
+impl RosClient for FakeClient {
+    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+        let id = RequestId { client: self.client, number: self.next.fetch_add(1, Relaxed), asker: None };
+        self.requests.write_with(&id, &payload)?;
+        Ok(id)
+    }
+
+    fn matched_servers(&self) -> u32 {
+        self.requests.matched_readers()
+    }
+
+    fn guids(&self) -> [Guid; 2] {
+        [self.answers.guid, self.requests.guid]
+    }
+}
+
+impl RosServer for FakeServer {
+    fn reply(&self, request: &RequestId, payload: Bytes) -> Result<(), RosError> {
+        self.replies.write_with(request, &payload)
+    }
+
+    fn guids(&self) -> [Guid; 2] {
+        [self.asked.guid, self.replies.guid]
+    }
+}
+
+/// Stands for a network among nodes.
+fn participant(network: u32) -> Guid {
+    let mut guid = [0; 16];
+    guid[..4].copy_from_slice(&network.to_be_bytes());
+    guid[12..].copy_from_slice(&[0, 0, 1, 0xc1]);
+    Guid(guid)
+}
+
+/// Id and payload of a request or a reply.
+fn split(sample: &Bytes, asker: Option<Guid>) -> Option<(RequestId, Bytes)> {
+    let id = sample.get(HEADER_BYTES..HEADER_BYTES + ID_BYTES)?;
+    let (client, number) = (id[..16].try_into().ok()?, i64::from_be_bytes(id[16..].try_into().ok()?));
+    let mut payload = BytesMut::from(&sample[..HEADER_BYTES]);
+    payload.put_slice(&sample[HEADER_BYTES + ID_BYTES..]);
+    Some((RequestId { client, number, asker }, payload.freeze()))
 }
 
 impl Drop for FakeRos {
     fn drop(&mut self) {
         self.domain.lock().watchers.retain(|w| w.network != self.network);
+        self.domain.announce(self.network, self.tagged, Vec::new());
     }
 }
 
@@ -213,6 +383,25 @@ impl FakeWriter {
         while let Some(payload) = payloads.next() {
             self.give(SampleKind::Write, 1, payload, payloads.peek().is_some());
         }
+    }
+
+    /// Writes a request or a reply once there is somebody to read it.
+    fn write_with(&self, id: &RequestId, payload: &Bytes) -> Result<(), RosError> {
+        let Some((header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else {
+            return Err(RosError::Payload { bytes: payload.len() });
+        };
+        let mut sample = BytesMut::from(&header[..]);
+        sample.put_slice(&id.client);
+        sample.put_i64(id.number);
+        sample.put_slice(body);
+        for _ in 0..PEER_LOOKS {
+            if self.matched_readers() > 0 {
+                self.give(SampleKind::Write, 1, sample.freeze(), false);
+                return Ok(());
+            }
+            std::thread::sleep(Duration::from_millis(PEER_LOOK_MS));
+        }
+        Err(RosError::NoPeer { waited_ms: PEER_LOOKS * PEER_LOOK_MS })
     }
 
     fn give(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes, more: bool) {
@@ -254,9 +443,13 @@ impl RosWriter for FakeWriter {
         let matched = state
             .endpoints
             .values()
-            .filter(|r| r.network != writer.network)
+            .filter(|r| writer.reaches(r.network, r.tagged))
             .filter(|r| r.reader.is_some() && matches(&writer.discovered, &r.discovered));
         matched.count() as u32
+    }
+
+    fn guid(&self) -> Guid {
+        self.guid
     }
 }
 

@@ -9,26 +9,18 @@
     reason = "a bench measures and prints"
 )]
 
-use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+mod support;
 
-use rand_core::{OsRng, TryRngCore as _};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
 use sgc_transport::{CloseReason, Dialer, Link as _, LinkOptions, Listener};
-use sgc_trust::{EnrollRequest, Fleet, Identity};
-use sgc_wire::UnixMillis;
+use sgc_trust::Identity;
 
 const ROUNDS: usize = 500;
 
 fn main() {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-    let now = UnixMillis(now.as_millis().try_into().unwrap());
-    let mut rng = OsRng.unwrap_err();
-    let fleet = Fleet::create("bench".parse().unwrap(), now, &mut rng).unwrap();
-    let mut enroll = |node: &str| {
-        let request = EnrollRequest::new(node.parse().unwrap(), now);
-        Arc::new(fleet.issue(&request, &mut rng).unwrap())
-    };
-    let (router, arm) = (enroll("router"), enroll("arm-1"));
+    let (router, arm) = support::identities();
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     println!("{:<36}{:>10}{:>10}{:>10}{:>10}", "", "median ms", "p99 ms", "sent B", "received B");
     for (what, dials, listens) in [

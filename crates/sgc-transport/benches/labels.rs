@@ -9,14 +9,13 @@
     reason = "a bench measures and prints"
 )]
 
-use std::sync::Arc;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+mod support;
 
-use bytes::Bytes;
-use rand_core::{OsRng, TryRngCore as _};
+use std::sync::Arc;
+use std::time::Instant;
+
 use sgc_transport::{AnyLink, CloseReason, Dialer, Link as _, LinkOptions, Listener};
-use sgc_trust::{EnrollRequest, Fleet};
-use sgc_wire::{Class, HOP_LIMIT, Label, Name, Packet, PacketHeader, SourceId, UnixMillis};
+use sgc_wire::{Class, Label, Name};
 
 /// Packets of a round; those of both forms take turns.
 const PACKETS: u64 = 100_000;
@@ -24,34 +23,8 @@ const ROUNDS: usize = 15;
 /// What the suite `group` adds to the first fragment: message head and tag.
 const SEALED: usize = 12 + 16;
 
-fn packet(seq: u64, message: usize) -> Packet {
-    let header = PacketHeader {
-        reliable: true,
-        class: Class::Default,
-        hops: HOP_LIMIT,
-        suite: 1,
-        epoch: 1,
-        name: Name([1; 32]),
-        source: SourceId([2; 16]),
-        seq,
-        total: message as u32,
-        index: 0,
-        grid: 16_384,
-        to: None,
-    };
-    Packet::new(header, Bytes::from(vec![7; message + SEALED]).into()).unwrap()
-}
-
 fn main() {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-    let now = UnixMillis(now.as_millis().try_into().unwrap());
-    let mut rng = OsRng.unwrap_err();
-    let fleet = Fleet::create("bench".parse().unwrap(), now, &mut rng).unwrap();
-    let mut enroll = |node: &str| {
-        let request = EnrollRequest::new(node.parse().unwrap(), now);
-        Arc::new(fleet.issue(&request, &mut rng).unwrap())
-    };
-    let (router, arm) = (enroll("router"), enroll("arm-1"));
+    let (router, arm) = support::identities();
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     runtime.block_on(async {
         let addr = "quic://127.0.0.1:0".parse().unwrap();
@@ -92,7 +65,7 @@ fn cpu_ns() -> f64 {
 
 /// Bytes of a packet, packets a second, and CPU time of a packet at both ends, over a flow of its own.
 async fn measure(near: &AnyLink, far: &AnyLink, message: usize, label: Option<Label>) -> (f64, f64, f64) {
-    let (packet, before, cpu) = (packet(1, message), near.stats().sent_bytes, cpu_ns());
+    let (packet, before, cpu) = (support::packet(1, message, SEALED), near.stats().sent_bytes, cpu_ns());
     let begun = Instant::now();
     let mut flow = near.open_flow(Class::Default).await.unwrap();
     let sender = tokio::spawn(async move {

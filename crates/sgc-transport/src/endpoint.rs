@@ -3,13 +3,20 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
+
+use sgc_wire::LaneToken;
 
 use crate::credentials::CredentialStore;
+use crate::dtls::{DtlsDialer, DtlsListener};
 use crate::error::{CloseReason, DialError, Refusal};
+use crate::framing::Greeting;
 use crate::link::AnyLink;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::quic::{QuicDialer, QuicListener};
+use crate::quic::{Flavor, QuicDialer, QuicListener};
+use crate::race;
+use crate::stream::{StreamDialer, StreamListener};
 use crate::url::{LinkUrl, ListenAddr, Scheme};
 
 /// Awaits links at one address.
@@ -20,6 +27,8 @@ pub struct Listener {
 
 enum Kind {
     Quic(QuicListener),
+    Stream(StreamListener),
+    Dtls(DtlsListener),
 }
 
 impl Listener {
@@ -30,13 +39,23 @@ impl Listener {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> io::Result<Self> {
-        match addr.scheme {
-            Scheme::Quic => {
-                let listener = QuicListener::bind(addr.addr, credentials.into(), options, metrics)?;
-                let addr = ListenAddr { addr: listener.local_addr(), ..addr.clone() };
-                Ok(Self { addr, kind: Kind::Quic(listener) })
+        let credentials = credentials.into();
+        let (local, kind) = match addr.scheme {
+            Scheme::Quic | Scheme::Udp => {
+                let flavor = if addr.scheme == Scheme::Udp { Flavor::Udp } else { Flavor::Quic };
+                let listener = QuicListener::bind(flavor, addr.addr, credentials, options, metrics)?;
+                (listener.local_addr(), Kind::Quic(listener))
             }
-        }
+            Scheme::Dtls => {
+                let listener = DtlsListener::bind(addr.addr, credentials, options, metrics)?;
+                (listener.local_addr(), Kind::Dtls(listener))
+            }
+            Scheme::Tls | Scheme::Tcp | Scheme::Ws | Scheme::Wss => {
+                let listener = StreamListener::bind(addr, credentials, options, metrics)?;
+                (listener.local_addr(), Kind::Stream(listener))
+            }
+        };
+        Ok(Self { addr: ListenAddr { addr: local, ..addr.clone() }, kind })
     }
 
     /// The next link, or the next peer that was refused and why; `None` once closed.
@@ -45,12 +64,12 @@ impl Listener {
     /// [`LinkOptions::handshakes_max`] at once, each for at most [`LinkOptions::handshake_timeout`]. Refusals are
     /// counted already; logging them is the caller's. Dropping the future loses nothing.
     pub async fn accept(&mut self) -> Option<Result<AnyLink, RefusedPeer>> {
-        match &mut self.kind {
-            Kind::Quic(listener) => Some(match listener.accept().await? {
-                Ok(link) => Ok(AnyLink::Quic(link)),
-                Err((remote, reason)) => Err(RefusedPeer { remote, reason }),
-            }),
-        }
+        let result = match &mut self.kind {
+            Kind::Quic(listener) => listener.accept().await?.map(AnyLink::Quic),
+            Kind::Dtls(listener) => listener.accept().await?.map(AnyLink::Quic),
+            Kind::Stream(listener) => listener.accept().await.map(AnyLink::Stream),
+        };
+        Some(result.map_err(|(remote, reason)| RefusedPeer { remote, reason }))
     }
 
     /// Where it listens, with the port that the system chose if it was to.
@@ -62,6 +81,8 @@ impl Listener {
     pub async fn close(mut self, reason: CloseReason) {
         match &mut self.kind {
             Kind::Quic(listener) => listener.close(&reason).await,
+            Kind::Stream(listener) => listener.close(&reason).await,
+            Kind::Dtls(listener) => listener.close(&reason).await,
         }
     }
 }
@@ -78,7 +99,11 @@ pub struct RefusedPeer {
 
 /// Dials links.
 pub struct Dialer {
+    resolve_timeout: Duration,
     quic: QuicDialer,
+    udp: QuicDialer,
+    stream: StreamDialer,
+    dtls: DtlsDialer,
 }
 
 impl Dialer {
@@ -89,26 +114,71 @@ impl Dialer {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> Self {
-        Self { quic: QuicDialer::new(credentials.into(), options, metrics) }
+        let (credentials, resolve_timeout) = (credentials.into(), options.resolve_timeout);
+        let quic =
+            |flavor| QuicDialer::new(flavor, credentials.clone(), options.clone(), Arc::clone(&metrics));
+        let (quic, udp) = (quic(Flavor::Quic), quic(Flavor::Udp));
+        let dtls = DtlsDialer::new(credentials.clone(), options.clone(), Arc::clone(&metrics));
+        let stream = StreamDialer::new(credentials, options, metrics);
+        Self { resolve_timeout, quic, udp, dtls, stream }
     }
 
     /// Makes a link: looks the host up, tries its addresses, and returns once the far node has accepted. It tries
     /// once; trying again is the caller's. Needs a tokio runtime around it.
     pub async fn dial(&self, url: &LinkUrl) -> Result<AnyLink, DialError> {
-        match url.scheme {
-            Scheme::Quic => self.quic.dial(url).await.map(AnyLink::Quic),
-        }
+        let addresses = race::resolve(url, self.resolve_timeout).await?;
+        self.dial_at(url, addresses).await
     }
 
     /// Makes a link to these addresses, at most 8 of them, which the caller knows to be those of `url`.
     pub async fn dial_at(&self, url: &LinkUrl, addresses: Vec<SocketAddr>) -> Result<AnyLink, DialError> {
+        self.connect(url, addresses, Greeting::default()).await
+    }
+
+    /// Dials a lane of a link that leads to this address, with the token that was agreed on there.
+    pub async fn dial_lane(
+        &self,
+        url: &LinkUrl,
+        address: SocketAddr,
+        token: LaneToken,
+    ) -> Result<AnyLink, DialError> {
+        self.connect(url, vec![address], Greeting { lane: Some(token) }).await
+    }
+
+    async fn connect(
+        &self,
+        url: &LinkUrl,
+        addresses: Vec<SocketAddr>,
+        greeting: Greeting,
+    ) -> Result<AnyLink, DialError> {
+        if addresses.is_empty() {
+            return Err(DialError::NoAddress(url.clone()));
+        }
         match url.scheme {
-            Scheme::Quic => self.quic.dial_at(url, addresses).await.map(AnyLink::Quic),
+            Scheme::Quic => self.quic.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
+            Scheme::Udp => self.udp.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
+            Scheme::Dtls => self.dtls.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
+            Scheme::Tls | Scheme::Tcp | Scheme::Ws | Scheme::Wss => {
+                self.stream.dial_at(url, addresses, greeting).await.map(AnyLink::Stream)
+            }
         }
     }
 
     /// Closes every link that it dialled, and gives their peers up to a second to hear of it.
     pub async fn close(&self, reason: CloseReason) {
-        self.quic.close(&reason).await;
+        tokio::join!(
+            self.quic.close(&reason),
+            self.udp.close(&reason),
+            self.dtls.close(&reason),
+            self.stream.close(&reason)
+        );
+    }
+
+    /// Moves every link over datagrams to a fresh socket, so that it leaves by the interface that the system would choose
+    /// now: for when addresses or routes have changed. Links live on, and what is under way is sent again where it was
+    /// lost. Every socket is tried; the first error is returned, and its links stay where they are.
+    pub fn rebind(&self) -> io::Result<()> {
+        let results = [self.quic.rebind(), self.udp.rebind(), self.dtls.rebind()];
+        results.into_iter().collect()
     }
 }

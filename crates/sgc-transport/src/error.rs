@@ -15,6 +15,7 @@ use sgc_wire::DecodeError;
 
 use crate::framing::CONTROL_FRAME_BYTES_MAX;
 use crate::metrics::RefusalKind;
+use crate::stream::StreamViolation;
 use crate::url::LinkUrl;
 
 const TEXT_CHARS_MAX: usize = 200;
@@ -43,6 +44,9 @@ pub enum CloseReason {
     /// The certificate of the node that is told so is over.
     #[error("the certificate expired")]
     Expired,
+    /// The node that is told so did not answer.
+    #[error("no answer came")]
+    Silent,
     /// A reason that this version does not know.
     #[error("reason {code}: {text}")]
     Other {
@@ -68,6 +72,7 @@ impl CloseReason {
             Self::Overloaded => (4, ""),
             Self::Revoked => (5, ""),
             Self::Expired => (6, ""),
+            Self::Silent => (7, ""),
             Self::Other { code, text } => (u32::try_from(*code).unwrap_or(u32::MAX), text.as_str()),
         };
         (code, printable(text.as_bytes()))
@@ -82,6 +87,7 @@ impl CloseReason {
             4 => Self::Overloaded,
             5 => Self::Revoked,
             6 => Self::Expired,
+            7 => Self::Silent,
             code => Self::Other { code, text: printable(text) },
         }
     }
@@ -184,18 +190,23 @@ impl PeerRefusal {
         match u64::from(code) {
             0x02 => Self::Overloaded,
             0x00 | 0x0c => Self::GaveUp,
-            raw if raw & !0xff == TLS_ALERT => match raw as u8 {
-                116 => Self::NoCertificate,
-                48 => Self::OtherCa,
-                45 => Self::Expired,
-                44 => Self::Revoked,
-                49 => Self::NotAdmitted,
-                alert @ (42 | 43 | 46 | 51) => Self::BadCertificate(alert),
-                70 | 120 => Self::Version,
-                40 => Self::KeyExchange,
-                alert => Self::Other(format!("TLS alert {alert}")),
-            },
+            raw if raw & !0xff == TLS_ALERT => Self::from_alert(raw as u8),
             _ => Self::Other(format!("{code}: {}", printable(text))),
+        }
+    }
+
+    /// From an alert of TLS or DTLS (RFC 8446, 6.2).
+    pub(crate) fn from_alert(alert: u8) -> Self {
+        match alert {
+            116 => Self::NoCertificate,
+            48 => Self::OtherCa,
+            45 => Self::Expired,
+            44 => Self::Revoked,
+            49 => Self::NotAdmitted,
+            42 | 43 | 46 | 51 => Self::BadCertificate(alert),
+            70 | 120 => Self::Version,
+            40 => Self::KeyExchange,
+            alert => Self::Other(format!("TLS alert {alert}")),
         }
     }
 }
@@ -215,6 +226,12 @@ pub enum ProtocolError {
     /// The first control frame is no greeting.
     #[error("the greeting is malformed: {0}")]
     Greeting(#[source] DecodeError),
+    /// It broke the rules of a multiplexed stream.
+    #[error("{0}")]
+    Stream(#[source] StreamViolation),
+    /// The certificates of DTLS and of the TLS inside are not of one node.
+    #[error("its certificate in DTLS is not that of the node inside")]
+    OtherNode,
 }
 
 /// Why a link ended or could not be made.
@@ -235,11 +252,24 @@ pub enum LinkError {
         after: Duration,
     },
     /// The peer did not finish its part of connecting.
-    #[error("no answer within {} s: is a node listening there, and does UDP get through?", after.as_secs_f32())]
+    #[error(
+        "no answer within {} s: is a node listening there, and does UDP get through, or TCP for tls, tcp, ws and wss?",
+        after.as_secs_f32()
+    )]
     HandshakeTimedOut {
         /// How long.
         after: Duration,
     },
+    /// The host is there, and no program listens on that port for TCP.
+    #[error(
+        "the host is there and nobody listens for TCP on that port: is the node running, with this transport?"
+    )]
+    NobodyListens,
+    /// The connection ended without a word: its peer was killed or restarted, or something between the two cut it.
+    #[error(
+        "the connection was cut: the peer was stopped or restarted, or something between the two ended it"
+    )]
+    Cut,
     /// The peer is there and has forgotten the link.
     #[error("the peer restarted and no longer knows this link")]
     PeerRestarted,
@@ -269,6 +299,11 @@ pub enum LinkError {
         /// The most that fits now; 0 if this link has no datagrams.
         max: usize,
     },
+    /// DTLS cannot sign with the key of this node's identity.
+    #[error(
+        "DTLS needs an identity with a P-256 or P-384 key, which this node's is not; quic:// and tls:// can use it"
+    )]
+    KeyUnsupported,
     /// The socket failed.
     #[error("socket: {0}")]
     Io(#[source] Arc<io::Error>),

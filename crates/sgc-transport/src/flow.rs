@@ -10,7 +10,7 @@ use sgc_wire::{Label, Packet};
 use crate::error::{FlowEnd, FlowError, LinkError};
 use crate::framing::{Pieces, packet_head};
 use crate::labels::Labels;
-use crate::quic;
+use crate::{quic, stream};
 
 /// Payloads up to this are copied behind their header: what that costs is less than what a transport takes to keep
 /// another piece (quinn looks through all that are not acknowledged for each that it sends).
@@ -26,6 +26,17 @@ pub struct FlowTx {
 #[derive(Debug)]
 pub(crate) enum Outlet {
     Quic(quic::Outlet),
+    Stream(stream::Outlet),
+}
+
+/// The halves of all transports' flows can do the same.
+macro_rules! each {
+    ($half:ident, $self:expr, $inner:ident => $body:expr) => {
+        match $self {
+            $half::Quic($inner) => $body,
+            $half::Stream($inner) => $body,
+        }
+    };
 }
 
 impl FlowTx {
@@ -46,37 +57,29 @@ impl FlowTx {
     pub async fn send_as(&mut self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
         let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
         let pieces = packet.payload.0.iter().filter(|p| !joined && !p.is_empty()).cloned();
-        match &mut self.outlet {
-            Outlet::Quic(outlet) => {
-                outlet.flush().await?;
-                let head = packet_head(packet, label, !self.has_begun, joined);
-                self.has_begun = true;
-                outlet.queue(std::iter::once(head).chain(pieces));
-                outlet.flush().await
-            }
-        }
+        each!(Outlet, &mut self.outlet, outlet => {
+            outlet.flush().await?;
+            let head = packet_head(packet, label, !self.has_begun, joined);
+            self.has_begun = true;
+            outlet.queue(std::iter::once(head).chain(pieces));
+            outlet.flush().await
+        })
     }
 
     /// Ends the flow after what was sent, which the transport still delivers.
     pub async fn finish(mut self) -> Result<(), LinkError> {
-        match &mut self.outlet {
-            Outlet::Quic(outlet) => outlet.finish().await,
-        }
+        each!(Outlet, &mut self.outlet, outlet => outlet.finish().await)
     }
 
     /// Ends the flow after what was sent; the result waits until the far side has all of it, or wants no more.
     pub async fn finish_slowly(mut self) -> Result<Delivery, LinkError> {
-        match &mut self.outlet {
-            Outlet::Quic(outlet) => outlet.finish().await?,
-        }
+        each!(Outlet, &mut self.outlet, outlet => outlet.finish().await?);
         Ok(Delivery { outlet: self.outlet })
     }
 
     /// Ends the flow at once; what has not arrived will not.
     pub fn reset(mut self, end: FlowEnd) {
-        match &mut self.outlet {
-            Outlet::Quic(outlet) => outlet.reset(end),
-        }
+        each!(Outlet, &mut self.outlet, outlet => outlet.reset(end));
     }
 }
 
@@ -89,9 +92,7 @@ pub struct Delivery {
 impl Delivery {
     /// Waits until the far side's transport has all of it, or refused the rest.
     pub async fn done(&mut self) -> Result<(), LinkError> {
-        match &mut self.outlet {
-            Outlet::Quic(outlet) => outlet.delivered().await,
-        }
+        each!(Outlet, &mut self.outlet, outlet => outlet.delivered().await)
     }
 }
 
@@ -107,6 +108,7 @@ pub struct FlowRx {
 #[derive(Debug)]
 pub(crate) enum Inlet {
     Quic(quic::Inlet),
+    Stream(stream::Inlet),
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -160,9 +162,7 @@ impl FlowRx {
                     }
                 }
             }
-            let has_more = match &mut self.inlet {
-                Inlet::Quic(inlet) => inlet.fill(&mut self.pieces).await?,
-            };
+            let has_more = each!(Inlet, &mut self.inlet, inlet => inlet.fill(&mut self.pieces).await?);
             if !has_more {
                 return if self.pieces.is_empty() { Ok(None) } else { Err(FlowError::Truncated) };
             }
@@ -170,9 +170,7 @@ impl FlowRx {
     }
 
     fn tell(&mut self, end: FlowEnd) {
-        match &mut self.inlet {
-            Inlet::Quic(inlet) => inlet.stop(end),
-        }
+        each!(Inlet, &mut self.inlet, inlet => inlet.stop(end));
     }
 }
 

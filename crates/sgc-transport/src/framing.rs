@@ -9,8 +9,8 @@ use std::collections::VecDeque;
 
 use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use sgc_wire::{
-    Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
-    Reader, Writer,
+    Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, LaneToken, PAYLOAD_BYTES_MAX, Packet, PacketHeader,
+    Payload, Reader, Writer,
 };
 
 use crate::error::{FlowError, ProtocolError};
@@ -28,6 +28,7 @@ pub const FLOW_PACKET_BYTES_MAX: usize = HEADER_BYTES_MAX + PAYLOAD_BYTES_MAX;
 const LENGTH_BYTES: usize = 4;
 const EXTENSIONS_MAX: usize = 16;
 const EXTENSION_BYTES_MAX: usize = 1024;
+const EXTENSION_LANE: u16 = 1;
 
 /// Bytes of a stream that were received and not yet consumed.
 #[derive(Debug, Default)]
@@ -184,15 +185,20 @@ pub(crate) fn datagram(packet: &Packet, label: Option<Label>) -> Bytes {
     out.freeze()
 }
 
-/// The first control frame in each direction: the version, then extensions, of which this version has none and
-/// skips all.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Greeting;
+/// The first control frame in each direction: the version, then extensions, of which unknown ones are skipped.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Greeting {
+    /// This connection is no link but a lane of one, agreed on there.
+    pub(crate) lane: Option<LaneToken>,
+}
 
 impl Encode for Greeting {
     fn encode(&self, w: &mut Writer) {
         w.u16(LINK_VERSION);
-        w.list(&[], |_, (): &()| ());
+        w.list(self.lane.as_slice(), |w, lane| {
+            w.u16(EXTENSION_LANE);
+            w.bytes(&lane.0);
+        });
     }
 }
 
@@ -202,11 +208,16 @@ impl Decode for Greeting {
         if found != LINK_VERSION {
             return Err(DecodeError::Version { what: "link", found, known: LINK_VERSION });
         }
+        let mut greeting = Self::default();
         r.list("extensions", EXTENSIONS_MAX, |r| {
-            r.u16()?;
-            r.bytes("extension", EXTENSION_BYTES_MAX).map(drop)
+            let id = r.u16()?;
+            let content = r.bytes("extension", EXTENSION_BYTES_MAX)?;
+            if id == EXTENSION_LANE {
+                greeting.lane = Some(LaneToken::from_slice(content)?);
+            }
+            Ok(())
         })?;
-        Ok(Self)
+        Ok(greeting)
     }
 }
 
@@ -317,14 +328,23 @@ mod tests {
 
     #[test]
     fn greetings_leave_room() {
-        assert_eq!(Greeting::from_slice(&Greeting.to_vec()), Ok(Greeting));
+        for greeting in [Greeting::default(), Greeting { lane: Some(LaneToken([7; 16])) }] {
+            assert_eq!(Greeting::from_slice(&greeting.to_vec()), Ok(greeting));
+        }
         let mut later = Writer::default();
         later.u16(LINK_VERSION);
         later.list(&[7u16, 8], |w, id| {
             w.u16(*id);
             w.bytes(b"something");
         });
-        assert_eq!(Greeting::from_slice(&later.into_vec()), Ok(Greeting));
+        assert_eq!(Greeting::from_slice(&later.into_vec()), Ok(Greeting::default()));
+        let mut short = Writer::default();
+        short.u16(LINK_VERSION);
+        short.list(&[EXTENSION_LANE], |w, id| {
+            w.u16(*id);
+            w.bytes(b"short");
+        });
+        assert!(Greeting::from_slice(&short.into_vec()).is_err());
         assert!(matches!(Greeting::from_slice(&[0, 2]), Err(DecodeError::Version { found: 2, .. })));
     }
 }

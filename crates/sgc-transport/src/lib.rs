@@ -5,10 +5,13 @@
 //! certificates of their [`sgc_trust::Identity`]. [`Listener`] and [`Dialer`] make links.
 //!
 //! What is *not* here: routing, queues, reconnecting, policy. A link says who is at the other end and why it
-//! ended; what follows from that is the node's. QUIC is the one transport so far.
+//! ended; what follows from that is the node's. QUIC is below, by itself, inside of DTLS or with packets that are
+//! authenticated only, or a stream of bytes: TLS, TCP, WebSocket.
 #![forbid(unsafe_code)]
 
+mod congestion;
 mod credentials;
+mod dtls;
 mod endpoint;
 mod error;
 mod flow;
@@ -17,10 +20,24 @@ mod labels;
 mod link;
 mod metrics;
 mod options;
+mod overload;
 mod quic;
+mod race;
+mod socket;
+mod stream;
+mod tls;
 mod url;
 
+/// Entry points for fuzzing: each panics if what it is given shows a defect.
+#[cfg(feature = "fuzzing")]
+pub mod fuzzing {
+    pub use crate::stream::{fuzz_bytes, fuzz_operations};
+}
+
+pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
+#[doc(hidden)]
+pub use dtls::exercise_front;
 pub use endpoint::{Dialer, Listener, RefusedPeer};
 pub use error::{
     CloseReason, DialError, FlowEnd, FlowError, LabelError, LinkError, PeerRefusal, ProtocolError, Refusal,
@@ -31,4 +48,5 @@ pub use link::{AnyLink, KeyExchange, Link, LinkStats};
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;
-pub use url::{COST_MS_MAX, DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};
+pub use stream::{StreamLink, StreamViolation};
+pub use url::{COST_MS_MAX, DEFAULT_PATH, DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};

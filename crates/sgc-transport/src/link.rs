@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, Name, Packet};
+use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
 
 use crate::error::{CloseReason, LabelError, LinkError};
 use crate::flow::{FlowRx, FlowTx};
 use crate::quic::QuicLink;
+use crate::stream::StreamLink;
 
 /// An authenticated connection to one node. Clones share it; when the last is dropped it closes.
 ///
@@ -24,6 +25,10 @@ pub trait Link: Clone + Send + Sync + 'static {
 
     /// True if this node dialled.
     fn is_dialer(&self) -> bool;
+
+    /// What it showed if it is no link but a lane of one, as the nodes agreed on that link. Whoever accepts it judges it:
+    /// only its peer is proven here.
+    fn lane(&self) -> Option<LaneToken>;
 
     /// Sends a control frame of at most [`crate::CONTROL_FRAME_BYTES_MAX`]: reliable, in order, not copied. If the
     /// future is dropped, the frame is either not sent or sent as a whole.
@@ -127,12 +132,15 @@ pub struct LinkStats {
 pub enum AnyLink {
     /// Over QUIC.
     Quic(QuicLink),
+    /// Over a stream of bytes: TLS, TCP, WebSocket.
+    Stream(StreamLink),
 }
 
 macro_rules! each {
     ($self:ident, $link:ident => $body:expr) => {
         match $self {
             AnyLink::Quic($link) => $body,
+            AnyLink::Stream($link) => $body,
         }
     };
 }
@@ -148,6 +156,10 @@ impl Link for AnyLink {
 
     fn is_dialer(&self) -> bool {
         each!(self, l => l.is_dialer())
+    }
+
+    fn lane(&self) -> Option<LaneToken> {
+        each!(self, l => l.lane())
     }
 
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {

@@ -1,10 +1,9 @@
 //! What can be set of links. Every number is a bound; none can be infinite.
 
 use std::fmt;
-use std::sync::Arc;
 use std::time::Duration;
 
-use quinn::congestion::ControllerFactory;
+use crate::congestion::Congestion;
 
 /// Settings of the links of one listener or dialer. The default is meant for all.
 #[derive(Clone)]
@@ -32,14 +31,23 @@ pub struct LinkOptions {
     pub datagram_receive_bytes: usize,
     /// Most handshakes that a listener works on at once.
     pub handshakes_max: usize,
-    /// From how many on a peer first has to prove that it receives at its address (QUIC Retry).
+    /// From how many on a peer first has to prove that it receives at its address (QUIC Retry; a ticket, over DTLS).
     pub handshakes_unvalidated_max: usize,
     /// Key exchange that also stands against quantum computers (X25519MLKEM768). True: nothing else is offered or
     /// accepted, so no one can talk the two ends out of it. False: X25519 is preferred, and a peer that requires the
     /// other gets it. An identity of a fleet that requires it requires it here too.
     pub post_quantum: bool,
-    /// Makes the congestion controllers; `None` is quinn's default.
-    pub congestion: Option<Arc<dyn ControllerFactory + Send + Sync + 'static>>,
+    /// Segmentation and receive offloads of UDP, where the system has them. Without them datagrams are sent and
+    /// received one by one, for drivers that get it wrong; ECN, the choice of the source address on hosts with several, and
+    /// MTU discovery go with them. A link with a [`Self::dscp`] has none either.
+    pub offload: bool,
+    /// Whether links over UDP look for the longest packet that the path carries; else they stay at 1200 bytes. What DTLS
+    /// carries is at most 1340 bytes long.
+    pub mtu_discovery: bool,
+    /// The code point of differentiated services (RFC 2474), 0 to 63, that everything a link sends is marked with.
+    pub dscp: Option<u8>,
+    /// What decides how much may be under way.
+    pub congestion: Congestion,
 }
 
 impl Default for LinkOptions {
@@ -51,14 +59,17 @@ impl Default for LinkOptions {
             idle_timeout: Duration::from_secs(10),
             receive_window_bytes: 64 << 20,
             flow_window_bytes: 32 << 20,
-            send_window_bytes: 16 << 20,
+            send_window_bytes: 64 << 20,
             flows_max: 4096,
             datagram_send_bytes: 64 << 10,
             datagram_receive_bytes: 1 << 20,
             handshakes_max: 256,
             handshakes_unvalidated_max: 32,
             post_quantum: false,
-            congestion: None,
+            offload: true,
+            mtu_discovery: true,
+            dscp: None,
+            congestion: Congestion::Delay,
         }
     }
 }
@@ -74,6 +85,10 @@ impl fmt::Debug for LinkOptions {
             .field("flows_max", &self.flows_max)
             .field("handshakes_max", &self.handshakes_max)
             .field("post_quantum", &self.post_quantum)
+            .field("offload", &self.offload)
+            .field("mtu_discovery", &self.mtu_discovery)
+            .field("dscp", &self.dscp)
+            .field("congestion", &self.congestion)
             .finish_non_exhaustive()
     }
 }

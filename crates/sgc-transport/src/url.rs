@@ -1,4 +1,4 @@
-//! Where links lead and where they are awaited: `quic://router.example:7447`, `quic://[::]:7447`.
+//! Where links lead and where they are awaited: `quic://router.example:7447`, `wss://router.example/sgc`, `quic://[::]:7447`.
 //!
 //! It parses and prints; host names are resolved when a link is dialled.
 
@@ -6,28 +6,62 @@ use std::fmt;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::str::FromStr;
 
-/// The port where none is given.
+/// The port where none is given, except for those of the web.
 pub const DEFAULT_PORT: u16 = 7447;
+
+/// The path of WebSocket where none is given.
+pub const DEFAULT_PATH: &str = "/sgc";
 
 /// The greatest cost that can be set, milliseconds of round trip.
 pub const COST_MS_MAX: u32 = 100_000;
 
 const HOST_BYTES_MAX: usize = 253;
+const PATH_BYTES_MAX: usize = 200;
 
 /// A transport, by the scheme of its URLs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Scheme {
     /// QUIC (RFC 9000) over UDP.
     Quic,
+    /// QUIC inside of DTLS 1.2 or 1.3 (RFC 6347, RFC 9147) over UDP.
+    Dtls,
+    /// QUIC over UDP whose packets are authenticated and can be read by everyone.
+    Udp,
+    /// TLS 1.3 (RFC 8446) over TCP.
+    Tls,
+    /// TCP, in the clear once both ends have proven who they are.
+    Tcp,
+    /// WebSocket (RFC 6455) over TCP, with TLS inside.
+    Ws,
+    /// The same over TLS.
+    Wss,
 }
 
 impl Scheme {
     fn parse(text: &str) -> Result<Self, UrlError> {
         match text {
             "quic" => Ok(Self::Quic),
-            "dtls" | "tls" | "tcp" | "udp" | "ws" | "wss" => Err(UrlError::SchemePlanned(text.to_owned())),
+            "dtls" => Ok(Self::Dtls),
+            "udp" => Ok(Self::Udp),
+            "tls" => Ok(Self::Tls),
+            "tcp" => Ok(Self::Tcp),
+            "ws" => Ok(Self::Ws),
+            "wss" => Ok(Self::Wss),
             _ => Err(UrlError::SchemeUnknown(text.chars().take(40).collect())),
         }
+    }
+
+    /// The port where none is given.
+    pub fn default_port(self) -> u16 {
+        match self {
+            Self::Ws => 80,
+            Self::Wss => 443,
+            _ => DEFAULT_PORT,
+        }
+    }
+
+    fn has_path(self) -> bool {
+        matches!(self, Self::Ws | Self::Wss)
     }
 }
 
@@ -35,6 +69,12 @@ impl fmt::Display for Scheme {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Quic => "quic",
+            Self::Dtls => "dtls",
+            Self::Udp => "udp",
+            Self::Tls => "tls",
+            Self::Tcp => "tcp",
+            Self::Ws => "ws",
+            Self::Wss => "wss",
         })
     }
 }
@@ -48,6 +88,8 @@ pub struct LinkUrl {
     pub host: String,
     /// Port.
     pub port: u16,
+    /// Of WebSocket, where it is another than [`DEFAULT_PATH`].
+    pub path: Option<String>,
     /// What the link is to cost where ways are weighed, milliseconds of round trip; measured if not given.
     pub cost_ms: Option<u32>,
 }
@@ -60,7 +102,7 @@ impl FromStr for LinkUrl {
             Some((text, cost)) => (text, Some(cost_ms(cost)?)),
             None => (text, None),
         };
-        let (scheme, host, port) = split(text)?;
+        let (scheme, host, port, path) = split(text)?;
         if port == 0 {
             return Err(UrlError::Port("0".into()));
         }
@@ -69,17 +111,29 @@ impl FromStr for LinkUrl {
         if !is_host || host.len() > HOST_BYTES_MAX {
             return Err(UrlError::Host(host.chars().take(80).collect()));
         }
-        Ok(Self { scheme, host: host.to_owned(), port, cost_ms })
+        Ok(Self { scheme, host: host.to_owned(), port, path, cost_ms })
+    }
+}
+
+impl LinkUrl {
+    /// What WebSocket asks for.
+    pub fn path(&self) -> &str {
+        self.path.as_deref().unwrap_or(DEFAULT_PATH)
+    }
+
+    /// Host and port, as they stand in a URL.
+    pub(crate) fn authority(&self) -> String {
+        if self.host.contains(':') {
+            format!("[{}]:{}", self.host, self.port)
+        } else {
+            format!("{}:{}", self.host, self.port)
+        }
     }
 }
 
 impl fmt::Display for LinkUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.host.contains(':') {
-            write!(f, "{}://[{}]:{}", self.scheme, self.host, self.port)?;
-        } else {
-            write!(f, "{}://{}:{}", self.scheme, self.host, self.port)?;
-        }
+        write!(f, "{}://{}{}", self.scheme, self.authority(), self.path.as_deref().unwrap_or_default())?;
         self.cost_ms.map_or(Ok(()), |cost| write!(f, "?cost={cost}ms"))
     }
 }
@@ -91,24 +145,38 @@ pub struct ListenAddr {
     pub scheme: Scheme,
     /// The address to bind: `[::]` for every interface, IPv4 and IPv6 alike. Port 0 lets the system choose.
     pub addr: SocketAddr,
+    /// Of WebSocket, where it is another than [`DEFAULT_PATH`].
+    pub path: Option<String>,
+}
+
+impl ListenAddr {
+    /// The address for this transport, with what is default of the rest.
+    pub fn new(scheme: Scheme, addr: SocketAddr) -> Self {
+        Self { scheme, addr, path: None }
+    }
+
+    /// What WebSocket is to be asked for.
+    pub fn path(&self) -> &str {
+        self.path.as_deref().unwrap_or(DEFAULT_PATH)
+    }
 }
 
 impl FromStr for ListenAddr {
     type Err = UrlError;
 
     fn from_str(text: &str) -> Result<Self, UrlError> {
-        let (scheme, host, port) = split(text)?;
+        let (scheme, host, port, path) = split(text)?;
         let ip = match host {
             "*" => IpAddr::V6(Ipv6Addr::UNSPECIFIED),
             host => host.parse().map_err(|_| UrlError::NotAnAddress(host.chars().take(80).collect()))?,
         };
-        Ok(Self { scheme, addr: SocketAddr::new(ip, port) })
+        Ok(Self { scheme, addr: SocketAddr::new(ip, port), path })
     }
 }
 
 impl fmt::Display for ListenAddr {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}://{}", self.scheme, self.addr)
+        write!(f, "{}://{}{}", self.scheme, self.addr, self.path.as_deref().unwrap_or_default())
     }
 }
 
@@ -118,11 +186,8 @@ pub enum UrlError {
     /// There is no scheme.
     #[error("{0:?} has no transport in front: write quic://HOST or quic://HOST:PORT")]
     SchemeMissing(String),
-    /// A transport that is to come.
-    #[error("{0}:// is not in this version: quic:// is")]
-    SchemePlanned(String),
     /// No transport of that name is known.
-    #[error("{0}:// is not known: quic:// is")]
+    #[error("{0}:// is not known: quic, dtls, udp, tls, tcp, ws and wss are")]
     SchemeUnknown(String),
     /// The host is none.
     #[error("{0:?} is neither a host name nor an IP address (IPv6 is written in brackets)")]
@@ -136,6 +201,9 @@ pub enum UrlError {
     /// A cost that is not one.
     #[error("{0:?} is no cost of a link: write ?cost=20ms, 1 to {COST_MS_MAX} ms")]
     Cost(String),
+    /// The path is none.
+    #[error("{0:?} is no path: write wss://HOST/PATH, at most {PATH_BYTES_MAX} letters, digits and /._~-")]
+    Path(String),
     /// Something follows.
     #[error("{0:?} does not belong into the address of a link")]
     Trailing(String),
@@ -149,10 +217,14 @@ fn cost_ms(text: &str) -> Result<u32, UrlError> {
         .ok_or_else(|| UrlError::Cost(text.chars().take(80).collect()))
 }
 
-fn split(text: &str) -> Result<(Scheme, &str, u16), UrlError> {
+fn split(text: &str) -> Result<(Scheme, &str, u16, Option<String>), UrlError> {
     let short = |s: &str| s.chars().take(80).collect::<String>();
     let (scheme, rest) = text.split_once("://").ok_or_else(|| UrlError::SchemeMissing(short(text)))?;
     let scheme = Scheme::parse(scheme)?;
+    let (rest, path) = match rest.find('/').filter(|_| scheme.has_path()).map(|at| rest.split_at(at)) {
+        Some((authority, path)) => (authority, path_of(path)?),
+        None => (rest, None),
+    };
     let authority = match rest.split_once(['/', '?', '#', '@']) {
         None => rest,
         Some((authority, "")) if rest.ends_with('/') => authority,
@@ -177,12 +249,21 @@ fn split(text: &str) -> Result<(Scheme, &str, u16), UrlError> {
     };
     let digits = |p: &&str| p.bytes().all(|b| b.is_ascii_digit());
     let port = match port {
-        None => DEFAULT_PORT,
+        None => scheme.default_port(),
         Some(p) => {
             Some(p).filter(digits).and_then(|p| p.parse().ok()).ok_or_else(|| UrlError::Port(short(p)))?
         }
     };
-    Ok((scheme, host, port))
+    Ok((scheme, host, port, path))
+}
+
+/// A path, if it is another than the default.
+fn path_of(path: &str) -> Result<Option<String>, UrlError> {
+    let is_in_paths = |b: u8| b.is_ascii_alphanumeric() || b"/._~-".contains(&b);
+    if path.len() > PATH_BYTES_MAX || !path.bytes().all(is_in_paths) {
+        return Err(UrlError::Path(path.chars().take(80).collect()));
+    }
+    Ok(Some(path).filter(|path| !matches!(*path, "/" | DEFAULT_PATH)).map(str::to_owned))
 }
 
 #[cfg(test)]
@@ -197,7 +278,15 @@ mod tests {
             ("quic://10.0.0.1/", "quic://10.0.0.1:7447"),
             ("quic://[fe80::1]:9", "quic://[fe80::1]:9"),
             ("quic://[::1]", "quic://[::1]:7447"),
+            ("dtls://router", "dtls://router:7447"),
+            ("udp://10.0.0.1:9", "udp://10.0.0.1:9"),
             ("quic://lte.example?cost=120ms", "quic://lte.example:7447?cost=120ms"),
+            ("tls://router", "tls://router:7447"),
+            ("tcp://router:1", "tcp://router:1"),
+            ("ws://router", "ws://router:80"),
+            ("wss://router/", "wss://router:443"),
+            ("wss://router/sgc?cost=5ms", "wss://router:443?cost=5ms"),
+            ("wss://[::1]/robots/a-1?cost=5ms", "wss://[::1]:443/robots/a-1?cost=5ms"),
         ] {
             let url: LinkUrl = text.parse().unwrap();
             assert_eq!(url.to_string(), shown);
@@ -207,6 +296,8 @@ mod tests {
             ("quic://[::]:0", "quic://[::]:0"),
             ("quic://0.0.0.0", "quic://0.0.0.0:7447"),
             ("quic://*", "quic://[::]:7447"),
+            ("wss://*/x", "wss://[::]:443/x"),
+            ("ws://[::]:8080/sgc", "ws://[::]:8080"),
         ] {
             assert_eq!(text.parse::<ListenAddr>().unwrap().to_string(), shown);
         }
@@ -216,11 +307,6 @@ mod tests {
     fn mistakes_are_named() {
         let refused = |text: &str| text.parse::<LinkUrl>().unwrap_err();
         assert!(matches!(refused("router:7447"), UrlError::SchemeMissing(_)));
-        for scheme in ["dtls", "tls", "tcp", "udp", "ws", "wss"] {
-            let error = refused(&format!("{scheme}://router"));
-            assert_eq!(error, UrlError::SchemePlanned(scheme.into()));
-            assert!(error.to_string().contains("not in this version"));
-        }
         assert!(matches!(refused("http://router"), UrlError::SchemeUnknown(_)));
         for cost in ["", "20", "0ms", "100001ms", "-1ms", "1sms"] {
             assert_eq!(refused(&format!("quic://router?cost={cost}")), UrlError::Cost(cost.into()));
@@ -233,7 +319,16 @@ mod tests {
         for text in ["quic://a:", "quic://a:0", "quic://a:65536", "quic://a:x", "quic://a:+1"] {
             assert!(matches!(refused(text), UrlError::Port(_)), "{text}");
         }
-        for text in ["quic://a/path", "quic://user@a", "quic://[::1]x"] {
+        for text in [
+            "ws://a/b c",
+            "ws://a/b\r\nHost:",
+            "wss://a/%20",
+            "wss://a/b?c",
+            &format!("ws://a/{}", "x".repeat(200)),
+        ] {
+            assert!(matches!(refused(text), UrlError::Path(_)), "{text}");
+        }
+        for text in ["quic://a/path", "tls://a/path", "quic://user@a", "ws://user@a/b", "quic://[::1]x"] {
             assert!(matches!(refused(text), UrlError::Trailing(_)), "{text}");
         }
         assert!(matches!("quic://router".parse::<ListenAddr>(), Err(UrlError::NotAnAddress(_))));

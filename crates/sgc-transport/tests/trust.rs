@@ -18,6 +18,9 @@ use sgc_wire::UnixMillis;
 use support::*;
 use tokio::net::UdpSocket;
 
+/// Those whose handshakes differ.
+const SCHEMES: [&str; 4] = ["quic", "tls", "tcp", "wss"];
+
 /// The node's next certificate.
 fn renew(fleet: &Fleet, node: &str) -> Arc<Identity> {
     let request = EnrollRequest::new(node.parse().unwrap(), now());
@@ -33,49 +36,53 @@ fn revoke(store: &CredentialStore, fleet: &Fleet, whose: &Identity) {
 
 #[tokio::test]
 async fn a_revoked_dialer_is_refused_and_both_logs_name_it() {
-    let fleet = fleet(1);
-    let arm = enroll(&fleet, "arm-1");
-    let store = CredentialStore::new(enroll(&fleet, "router"));
-    let mut server = Server::start(store.clone(), LinkOptions::default());
-    let before = dial(Arc::clone(&arm), &server.url).await.unwrap();
-    let far = server.link().await;
-    revoke(&store, &fleet, &arm);
-    let error = dial(Arc::clone(&arm), &server.url).await.unwrap_err();
-    assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Revoked)), "{error}");
-    assert!(error.to_string().contains("revoked: the keeper of the fleet has to enroll"), "{error}");
-    let refused = server.refusal().await;
-    assert!(matches!(refused.reason, Refusal::Certificate(CertError::Revoked { .. })), "{refused}");
-    assert!(refused.to_string().contains("revoked by its CA"), "{refused}");
-    assert_eq!(server.metrics.refused(RefusalKind::Revoked), 1);
-    // Another certificate of the same node is as good as before.
-    dial(renew(&fleet, "arm-1"), &server.url).await.unwrap();
-    // The link that was there says why it goes.
-    let reason = store.objection(far.peer(), now()).unwrap();
-    assert_eq!(reason, CloseReason::Revoked);
-    far.close(reason);
-    let end = soon(before.closed()).await;
-    assert!(matches!(end, LinkError::Closed { by_peer: true, reason: CloseReason::Revoked }), "{end}");
-    assert!(end.to_string().contains("this node's certificate was revoked"), "{end}");
-    let here = soon(far.closed()).await;
-    assert!(here.to_string().contains("the peer's certificate was revoked"), "{here}");
+    for scheme in SCHEMES {
+        let fleet = fleet(1);
+        let arm = enroll(&fleet, "arm-1");
+        let store = CredentialStore::new(enroll(&fleet, "router"));
+        let mut server = Server::start_on(scheme, store.clone(), LinkOptions::default());
+        let before = dial(Arc::clone(&arm), &server.url).await.unwrap();
+        let far = server.link().await;
+        revoke(&store, &fleet, &arm);
+        let error = dial(Arc::clone(&arm), &server.url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Revoked)), "{error}");
+        assert!(error.to_string().contains("revoked: the keeper of the fleet has to enroll"), "{error}");
+        let refused = server.refusal().await;
+        assert!(matches!(refused.reason, Refusal::Certificate(CertError::Revoked { .. })), "{refused}");
+        assert!(refused.to_string().contains("revoked by its CA"), "{refused}");
+        assert_eq!(server.metrics.refused(RefusalKind::Revoked), 1);
+        // Another certificate of the same node is as good as before.
+        dial(renew(&fleet, "arm-1"), &server.url).await.unwrap();
+        // The link that was there says why it goes.
+        let reason = store.objection(far.peer(), now()).unwrap();
+        assert_eq!(reason, CloseReason::Revoked);
+        far.close(reason);
+        let end = soon(before.closed()).await;
+        assert!(matches!(end, LinkError::Closed { by_peer: true, reason: CloseReason::Revoked }), "{end}");
+        assert!(end.to_string().contains("this node's certificate was revoked"), "{end}");
+        let here = soon(far.closed()).await;
+        assert!(here.to_string().contains("the peer's certificate was revoked"), "{here}");
+    }
 }
 
 #[tokio::test]
 async fn a_revoked_listener_is_refused_and_both_logs_name_it() {
-    let fleet = fleet(1);
-    let router = enroll(&fleet, "router");
-    let mut server = Server::start(Arc::clone(&router), LinkOptions::default());
-    let store = CredentialStore::new(enroll(&fleet, "arm-1"));
-    let dialer = dialer(store.clone());
-    let near = dial_with(&dialer, &server.url).await.unwrap();
-    server.link().await;
-    assert_eq!(store.objection(near.peer(), now()), None);
-    revoke(&store, &fleet, &router);
-    assert_eq!(store.objection(near.peer(), now()), Some(CloseReason::Revoked));
-    let error = dial_with(&dialer, &server.url).await.unwrap_err();
-    assert!(matches!(error, LinkError::RefusedHere(CertError::Revoked { .. })), "{error}");
-    let refused = server.refusal().await;
-    assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::Revoked)), "{refused}");
+    for scheme in SCHEMES {
+        let fleet = fleet(1);
+        let router = enroll(&fleet, "router");
+        let mut server = Server::start_on(scheme, Arc::clone(&router), LinkOptions::default());
+        let store = CredentialStore::new(enroll(&fleet, "arm-1"));
+        let dialer = dialer(store.clone());
+        let near = dial_with(&dialer, &server.url).await.unwrap();
+        server.link().await;
+        assert_eq!(store.objection(near.peer(), now()), None);
+        revoke(&store, &fleet, &router);
+        assert_eq!(store.objection(near.peer(), now()), Some(CloseReason::Revoked));
+        let error = dial_with(&dialer, &server.url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedHere(CertError::Revoked { .. })), "{error}");
+        let refused = server.refusal().await;
+        assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::Revoked)), "{refused}");
+    }
 }
 
 #[tokio::test]
@@ -175,36 +182,38 @@ async fn a_ca_that_is_no_longer_trusted_takes_its_links_along() {
 
 #[tokio::test]
 async fn only_nodes_of_admitted_cas_attach_and_both_logs_name_it() {
-    let (own, first, second) = (fleet(1), fleet(2), fleet(3));
-    let router = enroll(&own, "router");
-    let both = first.anchors().certificates().chain(second.anchors().certificates());
-    let store = CredentialStore::new(router);
-    store.set_anchors(store.anchors().with_anchors(both.cloned()).unwrap());
-    store.set_admitted(Some(first.anchors().fingerprints().collect()));
-    let mut server = Server::start(store.clone(), LinkOptions::default());
-    let of = |fleet: &Fleet| Arc::new(enroll(fleet, "arm-1").with_anchors(own.anchors().clone()));
+    for scheme in SCHEMES {
+        let (own, first, second) = (fleet(1), fleet(2), fleet(3));
+        let router = enroll(&own, "router");
+        let both = first.anchors().certificates().chain(second.anchors().certificates());
+        let store = CredentialStore::new(router);
+        store.set_anchors(store.anchors().with_anchors(both.cloned()).unwrap());
+        store.set_admitted(Some(first.anchors().fingerprints().collect()));
+        let mut server = Server::start_on(scheme, store.clone(), LinkOptions::default());
+        let of = |fleet: &Fleet| Arc::new(enroll(fleet, "arm-1").with_anchors(own.anchors().clone()));
 
-    let _near = dial(of(&first), &server.url).await.unwrap();
-    let far = server.link().await;
-    assert!(store.admits(far.peer()));
-    // Of a CA that is believed, and of the router's own.
-    for stranger in [of(&second), enroll(&own, "arm-2")] {
-        let error = dial(stranger, &server.url).await.unwrap_err();
-        assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::NotAdmitted)), "{error}");
-        let refused = server.refusal().await;
-        let text = refused.to_string();
-        assert!(matches!(refused.reason, Refusal::Certificate(CertError::NotAdmitted { .. })), "{text}");
-        assert!(text.contains("`accept` in [router]"), "{text}");
+        let _near = dial(of(&first), &server.url).await.unwrap();
+        let far = server.link().await;
+        assert!(store.admits(far.peer()));
+        // Of a CA that is believed, and of the router's own.
+        for stranger in [of(&second), enroll(&own, "arm-2")] {
+            let error = dial(stranger, &server.url).await.unwrap_err();
+            assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::NotAdmitted)), "{error}");
+            let refused = server.refusal().await;
+            let text = refused.to_string();
+            assert!(matches!(refused.reason, Refusal::Certificate(CertError::NotAdmitted { .. })), "{text}");
+            assert!(text.contains("`accept` in [router]"), "{text}");
+        }
+        assert_eq!(server.metrics.refused(RefusalKind::NotAdmitted), 2);
+
+        // Whom this node dials is not restricted, and the next handshake goes by what holds then.
+        let other = Server::start_on(scheme, of(&second), LinkOptions::default());
+        dial(store.clone(), &other.url).await.unwrap();
+        store.set_admitted(None);
+        dial(of(&second), &server.url).await.unwrap();
+        store.set_admitted(Some(second.anchors().fingerprints().collect()));
+        assert!(!store.admits(far.peer()));
     }
-    assert_eq!(server.metrics.refused(RefusalKind::NotAdmitted), 2);
-
-    // Whom this node dials is not restricted, and the next handshake goes by what holds then.
-    let other = Server::start(of(&second), LinkOptions::default());
-    dial(store.clone(), &other.url).await.unwrap();
-    store.set_admitted(None);
-    dial(of(&second), &server.url).await.unwrap();
-    store.set_admitted(Some(second.anchors().fingerprints().collect()));
-    assert!(!store.admits(far.peer()));
 }
 
 // Key exchange.
@@ -215,16 +224,18 @@ fn with(post_quantum: bool) -> LinkOptions {
 
 #[tokio::test]
 async fn post_quantum_keys_are_agreed_on_where_either_end_requires_them() {
-    let fleet = fleet(1);
-    let (router, arm) = (enroll(&fleet, "router"), enroll(&fleet, "arm-1"));
-    for (dials, listens) in [(false, false), (false, true), (true, false), (true, true)] {
-        let mut server = Server::start(Arc::clone(&router), with(listens));
-        let dialer = Dialer::new(Arc::clone(&arm), with(dials), Arc::default());
-        let near = soon(dialer.dial(&server.url)).await.unwrap();
-        let far = server.link().await;
-        let expected = if dials || listens { "X25519MLKEM768" } else { "X25519" };
-        for link in [near, far] {
-            assert_eq!(link.stats().key_exchange.label(), expected, "{dials} {listens}");
+    for scheme in SCHEMES {
+        let fleet = fleet(1);
+        let (router, arm) = (enroll(&fleet, "router"), enroll(&fleet, "arm-1"));
+        for (dials, listens) in [(false, false), (false, true), (true, false), (true, true)] {
+            let mut server = Server::start_on(scheme, Arc::clone(&router), with(listens));
+            let dialer = Dialer::new(Arc::clone(&arm), with(dials), Arc::default());
+            let near = soon(dialer.dial(&server.url)).await.unwrap();
+            let far = server.link().await;
+            let expected = if dials || listens { "X25519MLKEM768" } else { "X25519" };
+            for link in [near, far] {
+                assert_eq!(link.stats().key_exchange.label(), expected, "{dials} {listens}");
+            }
         }
     }
 }
@@ -394,6 +405,37 @@ async fn keys_of_every_supported_kind_link_with_each_other() {
             assert_eq!(server.link().await.peer().node_id, arm.node_id());
         }
     }
+}
+
+#[tokio::test]
+async fn dtls_takes_keys_of_its_two_kinds_and_names_what_it_does_not_take() {
+    let pki = Pki::new();
+    let p256 = pki.node(&KeyPair::generate_for(&rcgen::PKCS_ECDSA_P256_SHA256).unwrap(), '1');
+    let p384 = pki.node(&KeyPair::generate_for(&rcgen::PKCS_ECDSA_P384_SHA384).unwrap(), '2');
+    for (listens, dials) in [(&p256, &p384), (&p384, &p256), (&p384, &p384)] {
+        let mut server = Server::start_on("dtls", Arc::clone(listens), LinkOptions::default());
+        let near = dial(Arc::clone(dials), &server.url).await.unwrap();
+        assert_eq!(near.peer().node_id, listens.node_id());
+        assert_eq!(server.link().await.peer().node_id, dials.node_id());
+    }
+    let other = pki.node(&KeyPair::generate_for(&rcgen::PKCS_ED25519).unwrap(), '3');
+    let addr = "dtls://127.0.0.1:0".parse().unwrap();
+    let bound = Listener::bind(&addr, Arc::clone(&other), LinkOptions::default(), Arc::default());
+    let error = bound.err().unwrap();
+    assert_eq!(error.kind(), std::io::ErrorKind::InvalidInput);
+    assert!(error.to_string().contains("P-256"), "{error}");
+    let error = dial(other, &"dtls://127.0.0.1:9".parse().unwrap()).await.unwrap_err();
+    assert!(matches!(error, LinkError::KeyUnsupported), "{error}");
+}
+
+#[tokio::test]
+async fn post_quantum_keys_are_agreed_on_inside_of_dtls() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), with(true));
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), with(true), Arc::default());
+    let near = dial_with(&dialer, &server.url).await.unwrap();
+    assert_eq!(near.stats().key_exchange, KeyExchange::X25519MlKem768);
+    assert_eq!(server.link().await.stats().key_exchange, KeyExchange::X25519MlKem768);
 }
 
 #[tokio::test]

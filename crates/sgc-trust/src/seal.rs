@@ -171,7 +171,7 @@ fn nonce(header: &PacketHeader) -> Nonce {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::{Class, Decode, MessageKind, SecretBytes};
+    use sgc_wire::{Class, Decode, MessageKind, PayloadEncoding, SecretBytes};
 
     use super::*;
 
@@ -209,7 +209,8 @@ mod tests {
         }
     }
 
-    const HEAD: MessageHead = MessageHead { kind: MessageKind::Write, source_timestamp_ns: 99 };
+    const HEAD: MessageHead =
+        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 99 };
 
     fn sealed(h: &PacketHeader) -> Vec<u8> {
         key(h).seal(h, &HEAD, &vec![5; h.fragment_bytes()])

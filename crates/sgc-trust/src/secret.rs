@@ -12,6 +12,7 @@ use zeroize::{Zeroize, ZeroizeOnDrop, Zeroizing};
 
 const PSEUDONYM_DOMAIN: &str = "sgc pseudonym v1";
 const GROUP_DOMAIN: &str = "sgc group v1";
+const PUBLISHER_DOMAIN: &str = "sgc publisher v1";
 pub(crate) const SECRET_BLOCK: &str = "SGC FLEET SECRET";
 pub(crate) const NAMING_BLOCK: &str = "SGC NAMING SECRET";
 pub(crate) const SECRET_BYTES: usize = 32;
@@ -51,6 +52,18 @@ impl FleetSecret {
     /// What certificates call the group of this name.
     pub fn group_tag(&self, group: &str) -> GroupTag {
         GroupTag(self.tag(GROUP_DOMAIN, group))
+    }
+
+    /// What sources of a local publisher begin with: the same whenever its node starts, and to who has no secret
+    /// nothing but that. `publisher` is what identifies it on its network.
+    pub fn publisher_tag(&self, publisher: &[u8; 16]) -> [u8; 8] {
+        let mut mac = hmac::Context::with_key(&hmac::Key::new(hmac::HMAC_SHA256, &self.0));
+        mac.update(PUBLISHER_DOMAIN.as_bytes());
+        mac.update(&[0]);
+        mac.update(publisher);
+        let mut out = [0; 8];
+        out.copy_from_slice(&mac.sign().as_ref()[..8]);
+        out
     }
 
     fn tag(&self, domain: &str, name: &str) -> [u8; 32] {

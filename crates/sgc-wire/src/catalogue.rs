@@ -8,6 +8,7 @@ use crate::ids::{Blind, SecretBytes, SourceId};
 use crate::metadata::Metadata;
 use crate::packet::Class;
 use crate::qos::Qos;
+use crate::ros_node::RosNode;
 
 /// Most entries of one catalogue.
 pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
@@ -121,6 +122,8 @@ pub struct CatalogueSource {
     pub source: SourceId,
     /// What this publisher offers.
     pub qos: Qos,
+    /// The ROS 2 node that it belongs to, if its network says so.
+    pub node: Option<RosNode>,
 }
 
 impl Encode for Class {
@@ -231,6 +234,7 @@ impl Encode for CatalogueEntry {
         w.list(&self.sources, |w, s| {
             s.source.encode(w);
             s.qos.encode(w);
+            w.option(s.node.as_ref(), |w, n| n.encode(w));
         });
     }
 }
@@ -248,7 +252,11 @@ impl Decode for CatalogueEntry {
             qos: Qos::decode(r)?,
             class: Class::decode(r)?,
             sources: r.list("sources", ENTRY_SOURCES_MAX, |r| {
-                Ok(CatalogueSource { source: SourceId::decode(r)?, qos: Qos::decode(r)? })
+                Ok(CatalogueSource {
+                    source: SourceId::decode(r)?,
+                    qos: Qos::decode(r)?,
+                    node: r.option("node", RosNode::decode)?,
+                })
             })?,
         })
     }
@@ -270,7 +278,14 @@ mod tests {
             type_hash: Some("RIHS01_00".into()),
             qos: Qos { partitions: vec!["x".into()], ..Qos::default() },
             class: Class::Bulk,
-            sources: vec![CatalogueSource { source: SourceId([1; 16]), qos: Qos::default() }],
+            sources: vec![
+                CatalogueSource { source: SourceId([1; 16]), qos: Qos::default(), node: None },
+                CatalogueSource {
+                    source: SourceId([2; 16]),
+                    qos: Qos::default(),
+                    node: RosNode::new("/robot", "talker", Some("/robot")),
+                },
+            ],
         };
         let announce = SourceAnnounce {
             source: SourceId([2; 16]),

@@ -7,7 +7,7 @@
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::ids::{Blind, Label, Name, NodeId, NodeTag, SinkId, SourceId, UnixMillis};
+use crate::ids::{Blind, Label, LaneToken, Name, NodeId, NodeTag, SinkId, SourceId, UnixMillis};
 
 /// Longest control frame, bytes.
 pub const CONTROL_FRAME_BYTES_MAX: usize = 1024 * 1024;
@@ -144,6 +144,30 @@ pub enum Control {
     LabelAck {
         /// Label.
         label: Label,
+    },
+    /// Is the other end there? Between the two nodes of a link alone. Who is asked answers at once.
+    Pulse {
+        /// Whether this is the answer.
+        answers: bool,
+    },
+    /// The sender, which dialled this link, wants to dial another connection for packets of this name alone, both ways.
+    LaneOffer {
+        /// What the connection will show.
+        token: LaneToken,
+        /// Name.
+        name: Name,
+    },
+    /// Whether a connection that shows this token is awaited.
+    LaneAnswer {
+        /// As offered.
+        token: LaneToken,
+        /// True if it is.
+        accepted: bool,
+    },
+    /// The sender, which cannot dial, wants a lane for this name.
+    LaneWanted {
+        /// Name.
+        name: Name,
     },
 }
 
@@ -726,6 +750,24 @@ impl Encode for Control {
                 w.u8(21);
                 label.encode(w);
             }
+            Self::Pulse { answers } => {
+                w.u8(22);
+                w.bool(*answers);
+            }
+            Self::LaneOffer { token, name } => {
+                w.u8(23);
+                token.encode(w);
+                name.encode(w);
+            }
+            Self::LaneAnswer { token, accepted } => {
+                w.u8(24);
+                token.encode(w);
+                w.bool(*accepted);
+            }
+            Self::LaneWanted { name } => {
+                w.u8(25);
+                name.encode(w);
+            }
         }
     }
 }
@@ -761,6 +803,10 @@ impl Decode for Control {
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
             21 => Self::LabelAck { label: Label::decode(r)? },
+            22 => Self::Pulse { answers: r.bool("answers")? },
+            23 => Self::LaneOffer { token: LaneToken::decode(r)?, name: Name::decode(r)? },
+            24 => Self::LaneAnswer { token: LaneToken::decode(r)?, accepted: r.bool("accepted")? },
+            25 => Self::LaneWanted { name: Name::decode(r)? },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -794,6 +840,10 @@ mod tests {
             Control::Reroute { name, sink },
             Control::Label { label, name },
             Control::LabelAck { label },
+            Control::Pulse { answers: true },
+            Control::LaneOffer { token: LaneToken([4; 16]), name },
+            Control::LaneAnswer { token: LaneToken([4; 16]), accepted: true },
+            Control::LaneWanted { name },
         ]
     }
 

@@ -83,13 +83,41 @@ id!(
     GroupTag, 32, "group tag"
 );
 id!(
-    /// One incarnation of one publisher on one name, random, so that no nonce repeats after a restart.
+    /// One incarnation of one publisher on one name: the tag of the publisher, if its node gives it one, and else random;
+    /// then 8 random bytes, so that no nonce repeats after a restart.
     SourceId, 16, "source id"
 );
 id!(
     /// One incarnation of one joiner of one name, random.
     SinkId, 16, "sink id"
 );
+id!(
+    /// What a connection shows that was agreed on as a lane of a link; random, used once.
+    LaneToken, 16, "lane token"
+);
+
+impl SourceId {
+    /// In a catalogue: all publishers that are not told apart.
+    pub const OTHERS: Self = Self([0; 16]);
+
+    /// The source, unless it stands for all others.
+    pub fn told_apart(self) -> Option<Self> {
+        (self != Self::OTHERS).then_some(self)
+    }
+
+    /// A source of the publisher with this tag.
+    pub fn of_publisher(tag: [u8; 8], random: [u8; 8]) -> Self {
+        let mut id = [0; 16];
+        id[..8].copy_from_slice(&tag);
+        id[8..].copy_from_slice(&random);
+        Self(id)
+    }
+
+    /// What all sources of one publisher begin with.
+    pub fn publisher(&self) -> &[u8] {
+        &self.0[..8]
+    }
+}
 
 impl NodeId {
     /// Its tag.

@@ -13,6 +13,7 @@ mod message;
 mod metadata;
 mod packet;
 mod qos;
+mod ros_node;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
@@ -26,13 +27,14 @@ pub use control::{
     Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed, SourceOffer,
 };
 pub use ids::{
-    Blind, GroupTag, LABELS_MAX, Label, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym, SecretBytes,
-    SinkId, SourceId, UnixMillis,
+    Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,
+    SecretBytes, SinkId, SourceId, UnixMillis,
 };
-pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind};
+pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use packet::{
     AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, LABEL_SAVES_BYTES, MESSAGE_BYTES_MAX,
     PACKET_VERSION, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
 };
-pub use qos::{Durability, History, Liveliness, Qos, Reliability};
+pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
+pub use ros_node::RosNode;

@@ -19,6 +19,30 @@ pub enum MessageKind {
     /// No message, but numbered as one: what was published until here, and what can still be asked for. Its payload is the
     /// number of the oldest such message, 8 bytes.
     Mark,
+    /// A call of a service: the request.
+    Request,
+    /// What a call was answered.
+    Reply,
+    /// Asks what became of a call; without payload, as all that follow.
+    Ask,
+    /// The call is over for who made it.
+    Forget,
+    /// Who was asked has never heard of the call.
+    Unknown,
+    /// The call will not be answered any more.
+    Gone,
+}
+
+/// What a payload is written in, before it is sealed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum PayloadEncoding {
+    /// As the local network has it: CDR with its encapsulation header.
+    #[default]
+    Plain,
+    /// Its length (4 bytes, big-endian), and a frame of Zstandard (RFC 8878).
+    Zstd,
+    /// Its length (4 bytes, big-endian), and a block of LZ4.
+    Lz4,
 }
 
 /// Travels sealed, behind the first fragment of each message.
@@ -26,14 +50,29 @@ pub enum MessageKind {
 pub struct MessageHead {
     /// Data, or the end of an instance.
     pub kind: MessageKind,
-    /// Source time stamp, nanoseconds since the Unix epoch.
+    /// What the payload is written in.
+    pub encoding: PayloadEncoding,
+    /// Source time stamp, nanoseconds since the Unix epoch. Of the kinds from [`MessageKind::Request`] on, the number
+    /// of the call at its source.
     pub source_timestamp_ns: i64,
+}
+
+impl MessageHead {
+    /// The head of a message that is about a call.
+    pub fn of_call(kind: MessageKind, number: u64) -> Self {
+        Self { kind, encoding: PayloadEncoding::Plain, source_timestamp_ns: number as i64 }
+    }
+
+    /// The call that a message is about.
+    pub fn call(&self) -> u64 {
+        self.source_timestamp_ns as u64
+    }
 }
 
 impl Encode for MessageHead {
     fn encode(&self, w: &mut Writer) {
         w.u8(self.kind as u8);
-        w.u8(0); // payload encoding: CDR with its encapsulation header
+        w.u8(self.encoding as u8);
         w.u16(0);
         w.u64(self.source_timestamp_ns as u64);
     }
@@ -47,12 +86,24 @@ impl Decode for MessageHead {
             2 => MessageKind::Unregister,
             3 => MessageKind::Synced,
             4 => MessageKind::Mark,
+            5 => MessageKind::Request,
+            6 => MessageKind::Reply,
+            7 => MessageKind::Ask,
+            8 => MessageKind::Forget,
+            9 => MessageKind::Unknown,
+            10 => MessageKind::Gone,
             v => return Err(DecodeError::value("message kind", v.into())),
         };
-        match (r.u8()?, r.u16()?) {
-            (0, 0) => Ok(Self { kind, source_timestamp_ns: r.u64()? as i64 }),
-            (encoding, 0) => Err(DecodeError::value("payload encoding", encoding.into())),
-            (_, reserved) => Err(DecodeError::value("reserved", reserved.into())),
+        let encoding = match (r.u8()?, kind) {
+            (0, _) => PayloadEncoding::Plain,
+            // Keys and marks are small.
+            (1, MessageKind::Write) => PayloadEncoding::Zstd,
+            (2, MessageKind::Write) => PayloadEncoding::Lz4,
+            (v, _) => return Err(DecodeError::value("payload encoding", v.into())),
+        };
+        match r.u16()? {
+            0 => Ok(Self { kind, encoding, source_timestamp_ns: r.u64()? as i64 }),
+            reserved => Err(DecodeError::value("reserved", reserved.into())),
         }
     }
 }
@@ -63,9 +114,37 @@ mod tests {
 
     #[test]
     fn head_has_its_fixed_length_and_round_trips() {
-        let head = MessageHead { kind: MessageKind::Dispose, source_timestamp_ns: -5 };
-        let bytes = head.to_vec();
-        assert_eq!(bytes.len(), MESSAGE_HEAD_BYTES);
-        assert_eq!(MessageHead::from_slice(&bytes), Ok(head));
+        for (kind, encoding) in [
+            (MessageKind::Dispose, PayloadEncoding::Plain),
+            (MessageKind::Write, PayloadEncoding::Zstd),
+            (MessageKind::Write, PayloadEncoding::Lz4),
+        ] {
+            let head = MessageHead { kind, encoding, source_timestamp_ns: -5 };
+            let bytes = head.to_vec();
+            assert_eq!(bytes.len(), MESSAGE_HEAD_BYTES);
+            assert_eq!(MessageHead::from_slice(&bytes), Ok(head));
+        }
+    }
+
+    #[test]
+    fn only_messages_with_data_are_compressed() {
+        let decode =
+            |kind: u8, encoding: u8| MessageHead::from_slice(&[kind, encoding, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+        for kind in 1..=4 {
+            assert!(decode(kind, 0).is_ok() && decode(kind, 1).is_err() && decode(kind, 2).is_err());
+        }
+        assert!(decode(0, 2).is_ok() && decode(0, 3).is_err());
+    }
+
+    /// The bytes are normative.
+    #[test]
+    fn every_kind_has_its_number() {
+        for kind in 0..=10_u8 {
+            let bytes = [kind, 0, 0, 0, 0xff, 0, 0, 0, 0, 0, 0, 9];
+            let head = MessageHead::from_slice(&bytes).unwrap();
+            assert_eq!((head.kind as u8, head.call()), (kind, 0xff00_0000_0000_0009));
+            assert_eq!((head, head.to_vec()), (MessageHead::of_call(head.kind, head.call()), bytes.into()));
+        }
+        assert!(MessageHead::from_slice(&[11; 12]).is_err());
     }
 }

@@ -47,6 +47,49 @@ pub enum Liveliness {
     ManualByTopic,
 }
 
+/// How samples are serialised (XTypes 1.3, 7.6.3.1): what a reader takes, or the one that a writer offers. Empty is
+/// not possible; an endpoint that says nothing has plain CDR.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Representations(u8);
+
+impl Representations {
+    /// Plain CDR, XCDR version 1: all that ROS 2's own types use.
+    pub const XCDR1: Self = Self(1);
+    /// XCDR version 2.
+    pub const XCDR2: Self = Self(2);
+    /// Either.
+    pub const BOTH: Self = Self(3);
+
+    /// What either names.
+    #[must_use]
+    pub fn or(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+
+    /// The one that a writer offers in whose place samples of all of these come: plain CDR, if it is among them.
+    #[must_use]
+    pub fn written(self) -> Self {
+        if self == Self::XCDR2 { self } else { Self::XCDR1 }
+    }
+
+    /// True if a writer that offers this is understood by a reader that takes `other`.
+    pub fn meets(self, other: Self) -> bool {
+        self.0 & other.0 != 0
+    }
+}
+
+impl Default for Representations {
+    fn default() -> Self {
+        Self::XCDR1
+    }
+}
+
+impl std::fmt::Debug for Representations {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(["", "XCDR1", "XCDR2", "XCDR1 or XCDR2"][usize::from(self.0 & 3)])
+    }
+}
+
 /// Quality of service of one endpoint. Durations are nanoseconds; `None` is infinite.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Qos {
@@ -66,6 +109,8 @@ pub struct Qos {
     pub lease_ns: Option<u64>,
     /// DDS partitions; empty is the default partition. At most [`Qos::PARTITIONS_MAX`].
     pub partitions: Vec<String>,
+    /// How its samples are serialised.
+    pub representations: Representations,
 }
 
 impl Qos {
@@ -97,6 +142,7 @@ impl Default for Qos {
             liveliness: Liveliness::Automatic,
             lease_ns: None,
             partitions: Vec::new(),
+            representations: Representations::XCDR1,
         }
     }
 }
@@ -114,6 +160,7 @@ impl Encode for Qos {
         w.u8(self.liveliness as u8);
         w.u64(self.lease_ns.unwrap_or(u64::MAX));
         w.list(&self.partitions, |w, p| w.str(p));
+        w.u8(self.representations.0);
     }
 }
 
@@ -149,6 +196,10 @@ impl Decode for Qos {
             partitions: r.list("partitions", Self::PARTITIONS_MAX, |r| {
                 r.str("partition", Self::PARTITION_BYTES_MAX)
             })?,
+            representations: match r.u8()? {
+                v @ 1..=3 => Representations(v),
+                v => return Err(DecodeError::value("data representations", v.into())),
+            },
         })
     }
 }

@@ -7,8 +7,8 @@ use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
     Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Qos, Recover,
-    RefuseReason, RejectReason, Request, SecretBytes, Signed, SinkId, SourceAnnounce, SourceId, TopicGrant,
-    UnixMillis,
+    RefuseReason, RejectReason, Request, RosNode, SecretBytes, Signed, SinkId, SourceAnnounce, SourceId,
+    TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -101,7 +101,11 @@ fn signed_bodies_and_grants_survive_mutation() {
         type_hash: Some("RIHS01_ab".into()),
         qos: Qos { partitions: vec!["p".into()], ..Qos::default() },
         class: Class::Realtime,
-        sources: vec![CatalogueSource { source: SourceId([8; 16]), qos: Qos::default() }],
+        sources: vec![CatalogueSource {
+            source: SourceId([8; 16]),
+            qos: Qos::default(),
+            node: RosNode::new("/robot", "talker", Some("/robot")),
+        }],
     };
     let contents = [
         GrantContent::Topic(TopicGrant {

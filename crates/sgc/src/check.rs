@@ -6,7 +6,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use sgc_node::config::{self, Config, DiscoveryRange, RouterUrl, ShareConfig, TokenSource};
+use sgc_node::config::{
+    self, Config, DiscoveryRange, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
+};
 use sgc_trust::Identity;
 
 use crate::error::CliError;
@@ -45,6 +47,13 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     for url in &config.routers {
         match url {
             RouterUrl::At(url) => row("dials", url.to_string()),
+            RouterUrl::Ways(ways) => row(
+                "dials",
+                format!(
+                    "{}: the first that works",
+                    ways.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+                ),
+            ),
             RouterUrl::Srv(domain) => {
                 let query = domain.query();
                 row(
@@ -89,7 +98,8 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     for share in &config.shares {
         let to: Vec<_> = share.to.iter().map(ToString::to_string).collect();
         let to = if to == ["*"] { "everyone in the fleet".to_owned() } else { to.join(", ") };
-        row("shares", format!("{}{} with {to}", share.topic, type_of(share.type_name.as_deref())));
+        let (what, type_name) = (called(share.interface, &share.topic), type_of(share.type_name.as_deref()));
+        row("shares", format!("{what}{type_name}{} with {to}", renamed(&share.naming, "as")));
         if !share.publish.is_empty() {
             let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
             row("", format!("published on by {} besides", publish.join(", ")));
@@ -99,10 +109,11 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
         }
     }
     for one in &config.uses {
-        row("uses", format!("{}{} from {}", one.topic, type_of(one.type_name.as_deref()), one.from));
+        let (what, type_name) = (called(one.interface, &one.topic), type_of(one.type_name.as_deref()));
+        row("uses", format!("{what}{type_name} from {}{}", one.from, renamed(&one.naming, "here as")));
     }
     for token in &config.tokens {
-        match token {
+        match &token.source {
             TokenSource::File(path) => row("uses", format!("by token, {}", path.display())),
             TokenSource::Text(token) => {
                 row("uses", format!("{} from {}, by token", token.metadata.ros_name, token.owner_name));
@@ -123,9 +134,32 @@ fn type_of(type_name: Option<&str>) -> String {
     type_name.map(|name| format!(" [{name}]")).unwrap_or_default()
 }
 
+/// What is no topic says so.
+fn called(interface: Interface, name: &str) -> String {
+    match interface {
+        Interface::Topic => name.to_owned(),
+        other => format!("{} {name}", other.key()),
+    }
+}
+
+/// What topics are called on the other side, if that differs.
+fn renamed(naming: &Naming, word: &str) -> String {
+    let except = match &naming.except[..] {
+        [] => String::new(),
+        except => format!(" except {}", except.join(", ")),
+    };
+    match &naming.rename {
+        Rename::Keep => except,
+        Rename::As(other) => format!("{except}, {word} {other}"),
+        Rename::Namespace(namespace) => format!("{except}, {word} {namespace}/..."),
+    }
+}
+
 /// The share's name, if it can be known yet: without a type it waits for a publisher.
 fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<Option<String>, CliError> {
-    if share.type_name.is_none() {
+    // What is made of several has as many names.
+    let several = share.interface.parts().len() > 1 || share.topic.contains('*');
+    if share.type_name.is_none() || several {
         return Ok(None);
     }
     let name = name::name_of(identity, &config.identity, identity.node_name(), share)?;

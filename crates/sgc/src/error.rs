@@ -221,6 +221,34 @@ pub(crate) enum CliError {
         /// Why, one line each.
         reason: String,
     },
+    /// A running node cannot say or show what it was asked for.
+    #[error("{reason}")]
+    NotSeen {
+        /// Why.
+        reason: String,
+    },
+    /// Nobody defines a type.
+    #[error(
+        "{type_name} cannot be decoded: {why}; source the workspace that defines it, name a directory with --msg-dir, or use --raw"
+    )]
+    NoDefinition {
+        /// The type.
+        type_name: String,
+        /// What is wrong.
+        why: String,
+    },
+    /// A message has no such member.
+    #[error("its messages have no member {path:?}")]
+    NoSuchField {
+        /// As asked for.
+        path: String,
+    },
+    /// A message has no stamp.
+    #[error("{topic}: its messages do not begin with a std_msgs/Header, so they say not when they were made")]
+    NoHeader {
+        /// The topic.
+        topic: String,
+    },
     /// There is no audit log.
     #[error("cannot read the audit log {}: {reason}", path.display())]
     NoAudit {
@@ -313,6 +341,10 @@ impl CliError {
             | Self::NoNodeHere { .. }
             | Self::NotAStatus { .. }
             | Self::NodeRefused { .. }
+            | Self::NotSeen { .. }
+            | Self::NoDefinition { .. }
+            | Self::NoSuchField { .. }
+            | Self::NoHeader { .. }
             | Self::NoAudit { .. }
             | Self::Demo { .. }
             | Self::Tell(_)

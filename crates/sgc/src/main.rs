@@ -10,6 +10,7 @@
 
 mod audit;
 mod check;
+mod definitions;
 mod demo;
 mod error;
 mod files;
@@ -21,7 +22,9 @@ mod reload;
 mod run;
 mod share_token;
 mod status;
+mod topic;
 mod use_token;
+mod why;
 
 use std::process::ExitCode;
 
@@ -51,6 +54,8 @@ enum Command {
     Router(run::RouterArgs),
     Check(check::CheckArgs),
     Status(status::StatusArgs),
+    Topic(topic::TopicArgs),
+    Why(why::WhyArgs),
     Reload(reload::ReloadArgs),
     Audit(audit::AuditArgs),
     Policy(policy::PolicyArgs),
@@ -79,6 +84,8 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Run(args) => run::run(args),
         Command::Router(args) => run::router(args),
         Command::Check(args) => check::check(&args),
+        Command::Why(args) => return why::why(&args),
+        Command::Topic(args) => return topic::topic(&args),
         Command::Status(args) => status::status(&args),
         Command::Reload(args) => reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),

@@ -5,9 +5,10 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use sgc_node::config::{self, ConfigErrors, ShareConfig};
+use sgc_node::config::{self, ConfigErrors, Interface, ShareConfig};
+use sgc_node::policy::metadata;
 use sgc_trust::{Identity, NodeName, derive_name};
-use sgc_wire::{Metadata, Name};
+use sgc_wire::{Kind, Metadata, Name};
 
 use crate::error::CliError;
 use crate::output;
@@ -54,6 +55,10 @@ pub(crate) struct NameArgs {
 pub(crate) fn name(args: &NameArgs) -> Result<(), CliError> {
     let owner: NodeName = args.owner.parse()?;
     let share = args.share().map_err(|errors| CliError::Arguments { errors })?;
+    if args.topic.contains('*') {
+        let reason = format!("{} stands for several topics, each of which has a name: give one", args.topic);
+        return Err(CliError::Cannot { reason });
+    }
     let identity = sgc_node::load_identity(&args.identity)?;
     output::line(name_of(&identity, &args.identity, &owner, &share)?)
 }
@@ -69,16 +74,9 @@ pub(crate) fn name_of(
     let (Some(secret), Some(owner_id)) = (newest, identity.node_id_of(owner.as_str())) else {
         return Err(CliError::RouterCannotName { path: identity_path.to_owned() });
     };
-    let extra = share.metadata.clone();
-    let type_name = share.type_name.as_deref().unwrap_or_default();
     let metadata = Metadata {
-        node: extra.node,
-        author: extra.author,
-        maintainer: extra.maintainer,
-        interface: extra.interface,
-        description: extra.description,
-        unique: extra.unique,
-        ..Metadata::topic(owner.as_str(), &share.topic, type_name)
+        kind: if share.interface == Interface::Service { Kind::Service } else { Kind::Topic },
+        ..metadata(share, owner.as_str())
     };
     Ok(derive_name(secret, &owner_id, &metadata))
 }

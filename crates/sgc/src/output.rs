@@ -13,6 +13,11 @@ pub(crate) fn line(text: impl Display) -> Result<(), CliError> {
     writeln!(out, "{text}").and_then(|()| out.flush()).map_err(CliError::Output)
 }
 
+/// A text from elsewhere without what a terminal would take for orders.
+pub(crate) fn clean(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
+}
+
 /// Writes a part of the result as it is, control sequences included.
 pub(crate) fn raw(text: &str) -> Result<(), CliError> {
     let mut out = io::stdout().lock();

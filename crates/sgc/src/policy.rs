@@ -135,7 +135,7 @@ fn verdict(
     role: Role,
 ) -> Verdict {
     let no = |because: String| Verdict { permitted: false, because };
-    let Some(share) = config.shares.iter().find(|share| share.topic == args.topic) else {
+    let Some(share) = config.share_of(&args.topic) else {
         return no(format!("{} does not share it", identity.node_name()));
     };
     match (&share.type_name, &args.type_name) {

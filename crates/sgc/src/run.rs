@@ -124,6 +124,7 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
         ..ArgsConfig::default()
     };
     let what = args.config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());
+    let file = args.config.clone();
     let source: ConfigSource = match args.config {
         Some(path) => Arc::new(move || config::load(&path, &environment)),
         None => Arc::new(move || config::load_args(&arguments, &environment)),
@@ -131,7 +132,7 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
     if is_open {
         tracing::info!("--share without --to: every member of the fleet may subscribe, and nobody else");
     }
-    run_node(source, what, &args.process)
+    run_node(source, file, what, &args.process)
 }
 
 /// Runs `sgc router`.
@@ -146,7 +147,7 @@ pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
         ..ArgsConfig::default()
     };
     let source: ConfigSource = Arc::new(move || config::load_args(&arguments, &environment));
-    run_node(source, "command line".to_owned(), &args.process)
+    run_node(source, None, "command line".to_owned(), &args.process)
 }
 
 /// Looks a variable up for the configuration.
@@ -274,7 +275,12 @@ fn terminal_is_there() -> bool {
     std::fs::File::open("/dev/tty").is_ok()
 }
 
-fn run_node(source: ConfigSource, what: String, process: &ProcessArgs) -> Result<(), CliError> {
+fn run_node(
+    source: ConfigSource,
+    file: Option<PathBuf>,
+    what: String,
+    process: &ProcessArgs,
+) -> Result<(), CliError> {
     let config = source().map_err(|errors| CliError::Config { what, errors })?;
     let stdin_closed = process.until_stdin_closes.then(stdin_closed);
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -285,7 +291,8 @@ fn run_node(source: ConfigSource, what: String, process: &ProcessArgs) -> Result
         let signals = EndSignals::without_hang_up()?;
         let hang_ups = HangUps::new()?;
         let (wishes, reload) = mpsc::channel(1);
-        let mut options = RunOptions { source: Some(source), reload: Some(reload), ..RunOptions::default() };
+        let mut options =
+            RunOptions { source: Some(source), reload: Some(reload), file, ..RunOptions::default() };
         if process.print_ready {
             let (ready, when_ready) = oneshot::channel::<Vec<_>>();
             options.ready = Some(ready);

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use sgc_node::config::{self, Config, RouterUrl, ShareConfig};
+use sgc_node::config::{self, Config, Interface, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
 use sgc_transport::LinkUrl;
@@ -133,9 +133,15 @@ fn give(
 /// The share as the token is for it: with a type.
 fn share(args: &ShareTokenArgs, topic: &str, config: &Config) -> Result<ShareConfig, CliError> {
     let cannot = |reason: String| CliError::Cannot { reason };
-    let Some(share) = config.shares.iter().find(|share| share.topic == topic) else {
+    let named = |share: &&ShareConfig| share.topic == topic;
+    let Some(share) = config.shares.iter().filter(named).min_by_key(|share| share.interface) else {
         return Err(cannot(format!("the configuration does not share {topic}: add a [[share]] for it")));
     };
+    if share.interface != Interface::Topic {
+        let reason =
+            format!("{topic} is no topic, and tokens are for topics: name a `[[partner]]` in its `to`");
+        return Err(cannot(reason));
+    }
     let mut share = share.clone();
     let asked = match &args.type_name {
         Some(name) => Some(config::message_type(name).map_err(|mistake| cannot(mistake.to_string()))?),

@@ -15,6 +15,7 @@ use sgc_node::admin::AdminRequest;
 use sgc_node::config::{self, Config};
 
 use crate::error::CliError;
+use crate::topic::NodeArgs;
 use crate::{files, output, run};
 
 /// How long a node may take to answer.
@@ -26,12 +27,8 @@ const SOCKET_EXTENSION: &str = "sock";
 /// Show how a running node is doing: links, shares and uses, names, drops.
 #[derive(Debug, Args)]
 pub(crate) struct StatusArgs {
-    /// The node's configuration; without it, the one node that this user runs here
-    #[arg(short, long, value_name = "FILE", conflicts_with = "socket")]
-    config: Option<PathBuf>,
-    /// The node's status socket
-    #[arg(long, value_name = "PATH")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    node: NodeArgs,
     /// Print the JSON document as the node gave it
     #[arg(long)]
     json: bool,
@@ -47,6 +44,7 @@ pub(crate) struct Status {
     pub(crate) links: Vec<Link>,
     routers: Vec<Router>,
     pub(crate) routes: Vec<Route>,
+    problems: Vec<String>,
     names: Vec<NameTraffic>,
     pub(crate) drops: BTreeMap<String, u64>,
     pub(crate) refused: BTreeMap<String, u64>,
@@ -77,6 +75,7 @@ struct Router {
     found_by: String,
     at: Option<String>,
     state: String,
+    why_not_first: Option<String>,
     last_failure: Option<String>,
     again_in_s: Option<u64>,
 }
@@ -93,6 +92,8 @@ pub(crate) struct Route {
     owner: String,
     pub(crate) state: String,
     messages: u64,
+    /// Bytes before and after.
+    compressed: Option<(u64, u64)>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -115,7 +116,7 @@ struct RouterSize {
 
 /// Runs `sgc status`.
 pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
-    let socket = socket(args.config.as_deref(), args.socket.as_deref())?;
+    let socket = args.node.socket()?;
     let text = ask(&socket, &AdminRequest::Status, ANSWER_MAX)?;
     let status = parse(&socket, &text)?;
     if args.json {
@@ -183,9 +184,9 @@ pub(crate) fn tell_local(list: &[u8]) -> Vec<String> {
     usual_sockets().iter().filter_map(took).collect()
 }
 
-/// Asks a node; gives its answer as it came.
-pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
-    let no_node = |error: std::io::Error| CliError::NoNode {
+/// Why nobody answers there.
+pub(crate) fn no_node(socket: &Path, error: &std::io::Error, patience: Duration) -> CliError {
+    CliError::NoNode {
         path: socket.to_owned(),
         reason: match error.kind() {
             std::io::ErrorKind::NotFound => "there is no such socket".to_owned(),
@@ -193,7 +194,12 @@ pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> 
             std::io::ErrorKind::WouldBlock => format!("it did not answer within {} s", patience.as_secs()),
             _ => error.to_string(),
         },
-    };
+    }
+}
+
+/// Asks a node; gives its answer as it came.
+pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
+    let no_node = |error: std::io::Error| no_node(socket, &error, patience);
     let mut stream = UnixStream::connect(socket).map_err(no_node)?;
     stream.set_read_timeout(Some(patience)).map_err(no_node)?;
     stream.set_write_timeout(Some(patience)).map_err(no_node)?;
@@ -242,11 +248,19 @@ impl Status {
             &["router", "found by", "at", "state", "last failure"],
             self.routers.iter().map(Router::row).collect(),
         );
+        let second: Vec<_> = self.routers.iter().filter_map(Router::second_row).collect();
+        if !second.is_empty() {
+            section("Not by the first way", &["router", "at", "why"], second);
+        }
         section(
             "Topics",
             &["", "topic", "type", "owner", "messages", "state"],
             self.routes.iter().map(Route::row).collect(),
         );
+        if !self.problems.is_empty() {
+            let rows = self.problems.iter().map(|problem| vec![problem.clone()]);
+            section("What is wrong", &["problem"], rows.collect());
+        }
         section(
             "Names",
             &["name", "packets", "bytes", "dropped"],
@@ -301,6 +315,13 @@ impl Router {
     }
 }
 
+impl Router {
+    fn second_row(&self) -> Option<Vec<String>> {
+        let why = self.why_not_first.clone()?;
+        Some(vec![self.router.clone(), self.at.clone().unwrap_or_default(), why])
+    }
+}
+
 impl Route {
     fn row(&self) -> Vec<String> {
         vec![
@@ -309,7 +330,12 @@ impl Route {
             self.type_name.clone().unwrap_or_else(|| "?".into()),
             self.owner.clone(),
             self.messages.to_string(),
-            self.state.clone(),
+            match self.compressed {
+                Some((before, after)) if before > 0 => {
+                    format!("{}, compressed to {:.0} %", self.state, 100.0 * after as f64 / before as f64)
+                }
+                _ => self.state.clone(),
+            },
         ]
     }
 }

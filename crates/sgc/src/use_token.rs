@@ -7,7 +7,7 @@ use std::io::{IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use sgc_node::config::{self, Config, TokenSource};
+use sgc_node::config::{self, Config, Interface, TokenSource};
 use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
 use zeroize::Zeroizing;
 
@@ -103,10 +103,10 @@ fn check(token: &ShareToken, config: &Config) -> Result<(), CliError> {
             token.expires, token.owner_name
         ));
     }
-    if config.shares.iter().any(|share| share.topic == *topic) {
+    if config.shares.iter().any(|s| (s.interface, &s.topic) == (Interface::Topic, topic)) {
         return cannot(format!("{topic} is shared by this node: it would be shared again, in a loop"));
     }
-    for source in &config.tokens {
+    for source in config.tokens.iter().map(|token| &token.source) {
         let known = match source {
             TokenSource::File(path) => sgc_node::read_token(path)?,
             TokenSource::Text(token) => ShareToken::clone(token),

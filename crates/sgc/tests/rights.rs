@@ -45,12 +45,12 @@ impl Place {
         }
         place.write("acme-ca.pem", &certificate_of(&place.read("acme.fleet")));
         place.write("lab-ca.pem", &certificate_of(&place.read("lab.fleet")));
-        let text = "# arm-1\n[node]\nname = \"arm-1\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"state\"\n\n\
+        let text = "# arm-1\n[node]\nname = \"arm-1\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"state\"\nwatch = false\n\n\
                     [admin]\nsocket = \"arm.sock\"\n\n\
                     [[share]]\ntopic = \"/cmd_vel\"\nto = [\"group:operators\"]\npublish = [\"desk\"]\ntype = \"geometry_msgs/msg/Twist\"\n\n\
                     [[share]]\ntopic = \"/handoff/pose\"\nto = [\"desk\"]\n";
         place.write("arm-1.toml", text);
-        let text = "[node]\nname = \"cart\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"cart-state\"\n\n\
+        let text = "[node]\nname = \"cart\"\nrouters = [\"quic://127.0.0.1:9\"]\nstate = \"cart-state\"\nwatch = false\n\n\
                     [admin]\nsocket = \"cart.sock\"\n";
         place.write("cart.toml", text);
         place

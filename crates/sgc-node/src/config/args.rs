@@ -7,7 +7,9 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use super::draft::{AuditDraft, Draft, Located, RosDraft, RotationDraft, ShareDraft, UseDraft, Words};
+use super::draft::{
+    AuditDraft, Draft, Located, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft, Words,
+};
 use super::error::{ConfigError, Mistake, Origin};
 
 const WORDS: Words = Words {
@@ -94,6 +96,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         name: None,
         routers: [all("--router", &args.routers), all("--peer", &args.peers)].concat(),
         resolver: None,
+        keep_alive: None,
         listen: all("--listen", &args.listen),
         peer_rate: None,
         mapping: None,
@@ -108,9 +111,11 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         admin_socket: None,
         state: None,
         trust: Vec::new(),
+        watch: None,
         authority: None,
         rotation: RotationDraft::default(),
         audit: AuditDraft::default(),
+        transport: TransportDraft::default(),
         partners: Vec::new(),
     };
     (draft, errors)

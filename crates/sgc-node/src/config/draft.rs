@@ -50,6 +50,7 @@ pub(super) struct Draft {
     pub(super) name: Option<Located<String>>,
     pub(super) routers: Vec<Located<String>>,
     pub(super) resolver: Option<Located<String>>,
+    pub(super) keep_alive: Option<Located<String>>,
     pub(super) listen: Vec<Located<String>>,
     pub(super) peer_rate: Option<Located<String>>,
     pub(super) mapping: Option<Located<String>>,
@@ -62,9 +63,11 @@ pub(super) struct Draft {
     pub(super) admin_socket: Option<Located<PathBuf>>,
     pub(super) state: Option<Located<PathBuf>>,
     pub(super) trust: Vec<Located<String>>,
+    pub(super) watch: Option<Located<bool>>,
     pub(super) authority: Option<Located<PathBuf>>,
     pub(super) rotation: RotationDraft,
     pub(super) audit: AuditDraft,
+    pub(super) transport: TransportDraft,
     pub(super) partners: Vec<PartnerDraft>,
 }
 
@@ -87,16 +90,19 @@ pub(super) struct RosDraft {
     pub(super) discovery_range: Option<Located<String>>,
     /// The whole list is located too, since an empty one is a choice.
     pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
+    pub(super) graph: Option<Located<bool>>,
 }
 
 /// `[[share]]`. What is required is `None` only where an error has been recorded already.
 #[derive(Debug, Default)]
 pub(super) struct ShareDraft {
+    /// Or the name of something else, as its key says.
     pub(super) topic: Option<Located<String>>,
     pub(super) to: Option<Located<Vec<Located<String>>>>,
     pub(super) publish: Option<Located<Vec<Located<String>>>>,
     pub(super) type_name: Option<Located<String>>,
     pub(super) priority: Option<Located<String>>,
+    pub(super) link: Option<Located<String>>,
     pub(super) suite: Option<Located<String>>,
     pub(super) description: Option<Located<String>>,
     pub(super) author: Option<Located<String>>,
@@ -104,16 +110,41 @@ pub(super) struct ShareDraft {
     pub(super) interface: Option<Located<String>>,
     pub(super) unique: Option<Located<String>>,
     pub(super) node: Option<Located<String>>,
+    pub(super) shaping: ShapingDraft,
+    pub(super) naming: NamingDraft,
+}
+
+/// What is left out, and other names.
+#[derive(Clone, Debug, Default)]
+pub(super) struct NamingDraft {
+    pub(super) except: Option<Located<Vec<Located<String>>>>,
+    pub(super) renamed: Option<Located<String>>,
+    pub(super) namespace: Option<Located<String>>,
+}
+
+/// How much of a topic goes on.
+#[derive(Debug, Default)]
+pub(super) struct ShapingDraft {
+    pub(super) max_rate: Option<Located<String>>,
+    pub(super) max_bandwidth: Option<Located<String>>,
+    pub(super) max_age: Option<Located<String>>,
+    pub(super) compress: Option<Located<String>>,
 }
 
 /// `[[use]]`. What is required is `None` only where an error has been recorded already.
 #[derive(Debug, Default)]
 pub(super) struct UseDraft {
     pub(super) from: Option<Located<String>>,
+    /// Or the name of something else, as its key says.
     pub(super) topic: Option<Located<String>>,
     pub(super) type_name: Option<Located<String>>,
     pub(super) publish: Option<Located<bool>>,
     pub(super) token: Option<Located<String>>,
+    pub(super) priority: Option<Located<String>>,
+    pub(super) shaping: ShapingDraft,
+    pub(super) naming: NamingDraft,
+    pub(super) frame_prefix: Option<Located<String>>,
+    pub(super) link: Option<Located<String>>,
 }
 
 /// `[rotation]`.
@@ -129,6 +160,16 @@ pub(super) struct AuditDraft {
     pub(super) file: Option<Located<PathBuf>>,
     pub(super) max_bytes: Option<Located<i64>>,
     pub(super) off: Option<Located<bool>>,
+}
+
+/// `[transport]`.
+#[derive(Debug, Default)]
+pub(super) struct TransportDraft {
+    pub(super) congestion: Option<Located<String>>,
+    pub(super) offload: Option<Located<bool>>,
+    pub(super) mtu_discovery: Option<Located<bool>>,
+    pub(super) dscp: Option<Located<String>>,
+    pub(super) lane_dscp: Option<Located<String>>,
 }
 
 /// `[[partner]]`. What is required is `None` only where an error has been recorded already.

@@ -171,6 +171,34 @@ pub enum Mistake {
         /// The key.
         key: String,
     },
+    /// A table about two things.
+    #[error("`{key}` stands beside `{other}`: a table is about one of them; make it two tables")]
+    TwoInterfaces {
+        /// The key.
+        key: &'static str,
+        /// What came first.
+        other: &'static str,
+    },
+    /// A key that means nothing for what the table is about.
+    #[error("`{key}` is for topics, and this is about `{interface}`: take it out")]
+    TopicsOnly {
+        /// The key.
+        key: &'static str,
+        /// What the table is about.
+        interface: &'static str,
+    },
+    /// A type of another kind.
+    #[error("`{key}` is {value:?}; the type of `{interface}` is spelt like {example:?}")]
+    InterfaceType {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What the table is about.
+        interface: &'static str,
+        /// A right value.
+        example: &'static str,
+    },
     /// A key without which the table means nothing.
     #[error("{table} has no `{key}`; add one, such as {key} = {example}")]
     MissingKey {
@@ -575,6 +603,98 @@ pub enum Mistake {
         /// The first use.
         other: String,
     },
+    /// A wildcard that is not a whole word.
+    #[error(
+        "`{key}` is {value:?}; a wildcard is a whole word of a name: '*' for one word, '**' for any number: {right:?}"
+    )]
+    Wildcard {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What was probably meant.
+        right: String,
+    },
+    /// Exceptions to a rule for one topic.
+    #[error("`{key}` is for a `topic` with wildcards, and {topic:?} has none: take it out")]
+    ExceptOfOne {
+        /// The key.
+        key: &'static str,
+        /// The topic.
+        topic: String,
+    },
+    /// An exception to nothing.
+    #[error("`{key}` names {value:?}, which {topic:?} does not cover anyway: take it out, or correct it")]
+    ExceptsNothing {
+        /// The key.
+        key: &'static str,
+        /// The exception.
+        value: String,
+        /// The topic.
+        topic: String,
+    },
+    /// Another name that does not have the wildcard of the topic.
+    #[error(
+        "`{key}` is {value:?}, but the topic is {topic:?}: {}",
+        right.as_ref().map_or_else(
+            || "another name needs a topic whose only wildcard is its last word; use `namespace`".to_owned(),
+            |right| format!("both end in the same wildcard, or neither has one: {right:?}")
+        )
+    )]
+    AsWildcard {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The topic.
+        topic: String,
+        /// What was probably meant, if anything would be right.
+        right: Option<String>,
+    },
+    /// A name in full, and what stands before it.
+    #[error("`{key}` stands beside `as`, which gives the whole name: take one of them out")]
+    AsAndNamespace {
+        /// The key beside it.
+        key: &'static str,
+    },
+    /// Two topics that others would see as one.
+    #[error("`{key}`: for others it would be {topic:?}, as which {other} is shared already: change one name")]
+    SharedAsOne {
+        /// The key.
+        key: &'static str,
+        /// What both would be called.
+        topic: String,
+        /// The first share.
+        other: String,
+    },
+    /// A pattern that others may publish on: nobody knows which topics there are.
+    #[error(
+        "`{key}` lets others publish, which needs the name of one topic, not {topic:?}: add a [[share]] for it"
+    )]
+    PublishOnPattern {
+        /// The key.
+        key: &'static str,
+        /// The topic.
+        topic: String,
+    },
+    /// A prefix that is none of frames.
+    #[error(
+        "`{key}` is {value:?}; it takes 1 to {max} letters, digits, '_', '-', '.' and '/', and no '/' at the beginning: \"robot1/\""
+    )]
+    FramePrefix {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The longest, in bytes.
+        max: usize,
+    },
+    /// Frames of what goes elsewhere.
+    #[error("`{key}` is for what comes here: take it out, or `publish`")]
+    FramesElsewhere {
+        /// The key.
+        key: &'static str,
+    },
     /// A topic that would come back to where it came from.
     #[error(
         "`{key}` is {topic:?}, which {other} shares: what is used here would be shared again, in a loop; keep one"
@@ -626,6 +746,38 @@ pub enum Mistake {
     TokenAndMore {
         /// The key beside it.
         key: &'static str,
+    },
+    /// A token's topic, which cannot be shaped.
+    #[error("`{key}` cannot stand beside `token` in this version: ask the owner to set it for the share")]
+    TokenUnshaped {
+        /// The key beside it.
+        key: &'static str,
+    },
+    /// A priority of what is not published here.
+    #[error(
+        "`{key}` is for what this node publishes there: what comes here has the priority of the owner's share; set `publish = true`, or take it out"
+    )]
+    PriorityOfOther {
+        /// The key.
+        key: &'static str,
+    },
+    /// How what comes from elsewhere is compressed.
+    #[error(
+        "`{key}` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out"
+    )]
+    CompressionOfOther {
+        /// The key.
+        key: &'static str,
+    },
+    /// A setting of how much of a topic goes on.
+    #[error("`{key}` is {value:?}; it takes {what}")]
+    Shaping {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What would be right.
+        what: &'static str,
     },
     /// The same token twice.
     #[error("`{key}` is the one that {other} has already: take one of them out")]

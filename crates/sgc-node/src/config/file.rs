@@ -7,11 +7,13 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use sgc_ros::Interface;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::draft::{
-    AuditDraft, Draft, Located, PartnerDraft, RosDraft, RotationDraft, ShareDraft, UseDraft, Words,
+    AuditDraft, Draft, Located, NamingDraft, PartnerDraft, RosDraft, RotationDraft, ShapingDraft, ShareDraft,
+    TransportDraft, UseDraft, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
@@ -24,6 +26,10 @@ const WORDS: Words = Words {
     share: "[[share]]",
     uses: "[[use]]",
 };
+
+/// What a table may be about.
+const INTERFACES: [Interface; 4] =
+    [Interface::Topic, Interface::Service, Interface::Action, Interface::Parameters];
 
 /// Reads the text. A draft comes back even when there are errors, unless the text is not TOML at all, so that
 /// `resolve` can report its own beside them.
@@ -84,17 +90,15 @@ impl FileReader<'_> {
         let authority = self.single(&top, "authority", Table::Authority);
         let rotation = self.single(&top, "rotation", Table::Rotation);
         let audit = self.single(&top, "audit", Table::Audit);
+        let transport = self.single(&top, "transport", Table::Transport);
         let mut draft = Draft {
             origin: Origin::File { file: self.file.clone(), line: None },
             words: WORDS,
             attempted: BTreeSet::new(),
             identity: self.identity(&top, node.as_ref()),
             name: self.string(node.as_ref(), "name", "a string, such as \"arm-1\""),
-            routers: self.flat_strings(
-                node.as_ref(),
-                "routers",
-                "an array of strings, such as [\"quic://router.lab.example:7447\"]",
-            ),
+            routers: self.routers(node.as_ref()),
+            keep_alive: self.string(node.as_ref(), "keep_alive", "\"auto\", or a string such as \"5s\""),
             resolver: self.string(node.as_ref(), "resolver", "a string, such as \"10.0.0.53\""),
             listen: self.flat_strings(
                 router.as_ref(),
@@ -127,6 +131,7 @@ impl FileReader<'_> {
                 "trust",
                 "an array of strings, such as [\"acme-ca.pem\"]",
             ),
+            watch: self.boolean(node.as_ref(), "watch", "true or false"),
             authority: self.authority(authority.as_ref()),
             rotation: RotationDraft {
                 every: self.string(rotation.as_ref(), "every", "a string, such as \"1h\""),
@@ -139,6 +144,7 @@ impl FileReader<'_> {
                 max_bytes: self.integer(audit.as_ref(), "max_bytes", "a number, such as 16777216"),
                 off: self.boolean(audit.as_ref(), "off", "true or false"),
             },
+            transport: self.transport(transport.as_ref()),
             partners: self
                 .repeated(&top, "partner", Table::Partner)
                 .iter()
@@ -176,6 +182,7 @@ impl FileReader<'_> {
                 "static_peers",
                 "an array of strings, such as [\"10.0.0.2\", \"arm-2.local\"]",
             ),
+            graph: self.boolean(ros, "graph", "true or false"),
         }
     }
 
@@ -185,7 +192,7 @@ impl FileReader<'_> {
         self.check_required(share, "to", "[\"desk\", \"group:operators\"]");
         let share = Some(share);
         ShareDraft {
-            topic: self.string(share, "topic", "a string, such as \"/camera/image\""),
+            topic: self.interface(share),
             to: self.strings(share, "to", "an array of strings, such as [\"desk\", \"group:operators\"]"),
             publish: self.strings(
                 share,
@@ -194,6 +201,7 @@ impl FileReader<'_> {
             ),
             type_name: self.string(share, "type", "a string, such as \"sensor_msgs/msg/Image\""),
             priority: self.string(share, "priority", "a string, such as \"realtime\""),
+            link: self.string(share, "link", "a string, \"shared\" or \"dedicated\""),
             suite: self.string(share, "suite", "a string, such as \"group\""),
             description: self.string(share, "description", TEXT),
             author: self.string(share, "author", TEXT),
@@ -201,6 +209,8 @@ impl FileReader<'_> {
             interface: self.string(share, "interface", TEXT),
             unique: self.string(share, "unique", TEXT),
             node: self.string(share, "node", TEXT),
+            shaping: self.shaping(share),
+            naming: self.naming(share),
         }
     }
 
@@ -214,9 +224,62 @@ impl FileReader<'_> {
         UseDraft {
             token: self.string(one, "token", "a string, such as \"arm-1-pose.token\""),
             from: self.string(one, "from", "a string, such as \"arm-1\""),
-            topic: self.string(one, "topic", "a string, such as \"/camera/image\""),
+            topic: self.interface(one),
             type_name: self.string(one, "type", "a string, such as \"sensor_msgs/msg/Image\""),
             publish: self.boolean(one, "publish", "true or false"),
+            priority: self.string(one, "priority", "a string, such as \"realtime\""),
+            shaping: self.shaping(one),
+            naming: self.naming(one),
+            frame_prefix: self.string(one, "frame_prefix", "a string, such as \"robot1/\""),
+            link: self.string(one, "link", "a string, \"shared\" or \"dedicated\""),
+        }
+    }
+
+    /// The name of what is shared or used; which key it stands under says what that is.
+    fn interface(&mut self, section: Option<&Section<'_, '_>>) -> Option<Located<String>> {
+        let mut first: Option<Located<String>> = None;
+        for interface in INTERFACES {
+            let key = interface.key();
+            let Some(named) = self.string(section, key, "a string, such as \"/camera/image\"") else {
+                continue;
+            };
+            match &first {
+                Some(other) => {
+                    let other = other.key;
+                    self.errors.push(named.error(Mistake::TwoInterfaces { key, other }));
+                }
+                None => first = Some(named),
+            }
+        }
+        first
+    }
+
+    fn shaping(&mut self, topic: Option<&Section<'_, '_>>) -> ShapingDraft {
+        ShapingDraft {
+            max_rate: self.string(topic, "max_rate", "a string, such as \"10Hz\""),
+            max_bandwidth: self.string(topic, "max_bandwidth", "a string, such as \"2Mbps\""),
+            max_age: self.string(topic, "max_age", "a string, such as \"500ms\""),
+            compress: self.string(topic, "compress", "a string, \"zstd\", \"lz4\" or \"none\""),
+        }
+    }
+
+    fn naming(&mut self, topic: Option<&Section<'_, '_>>) -> NamingDraft {
+        const PATTERNS: &str = "an array of strings, such as [\"/camera/debug/**\"]";
+        NamingDraft {
+            except: self.strings(topic, "except", PATTERNS),
+            renamed: self.string(topic, "as", "a string, such as \"/robot1/camera\""),
+            namespace: self.string(topic, "namespace", "a string, such as \"/robot1\""),
+        }
+    }
+
+    fn transport(&mut self, transport: Option<&Section<'_, '_>>) -> TransportDraft {
+        const MARK: &str = "a string, such as \"EF\", \"AF41\", \"CS1\" or \"46\"";
+        TransportDraft {
+            congestion: self.string(transport, "congestion", "a string, such as \"delay\""),
+            offload: self.boolean(transport, "offload", "true or false"),
+            mtu_discovery: self.boolean(transport, "mtu_discovery", "true or false"),
+            dscp: self.string(transport, "dscp", MARK),
+            lane_dscp: self.string(transport, "lane_dscp", MARK),
         }
     }
 
@@ -327,9 +390,8 @@ impl FileReader<'_> {
     }
 
     fn check_required(&mut self, section: &Section<'_, '_>, key: &'static str, example: &'static str) {
-        // A key of something planned, such as `service`, stands in for `topic`; it has its own error.
         let has = |key: &str| section.entries.contains_key(key) || section.meant.contains(&key);
-        let replaced = key == "topic" && (has("service") || has("action"));
+        let replaced = key == "topic" && INTERFACES.iter().any(|interface| has(interface.key()));
         if !replaced && !has(key) {
             self.record(
                 section.span.clone(),
@@ -392,6 +454,30 @@ impl FileReader<'_> {
             key,
             origin: self.origin(value.span()),
         })
+    }
+
+    /// Strings, and arrays of strings that name the ways to one router.
+    fn routers(&mut self, node: Option<&Section<'_, '_>>) -> Vec<Located<String>> {
+        const KEY: &str = "routers";
+        const EXPECTED: &str = "an array of strings, such as [\"quic://router.lab.example:7447\"], or of arrays of \
+            strings that name the ways to one router";
+        let Some(value) = node.and_then(|node| node.entries.get(KEY)) else { return Vec::new() };
+        let DeValue::Array(array) = value.get_ref() else {
+            self.record_type(value, KEY, EXPECTED);
+            return Vec::new();
+        };
+        let mut routers = Vec::new();
+        for item in array.iter() {
+            let ways = item.get_ref().as_array().filter(|ways| !ways.is_empty());
+            routers.extend(self.typed(item, KEY, EXPECTED, |item| match ways {
+                Some(ways) => {
+                    let ways = ways.iter().map(|way| way.get_ref().as_str());
+                    Some(ways.collect::<Option<Vec<_>>>()?.join(","))
+                }
+                None => item.as_str().map(str::to_owned),
+            }));
+        }
+        routers
     }
 
     fn flat_strings(

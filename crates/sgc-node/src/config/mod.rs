@@ -26,24 +26,33 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+pub use sgc_ros::{Interface, Naming, Rename, Shaping};
 use sgc_router::MappingKind;
-use sgc_transport::ListenAddr;
+use sgc_transport::{Congestion, ListenAddr};
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
 use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
-pub use names::{PEER_BYTES_MAX, Recipient, TOPIC_BYTES_MAX, TYPE_BYTES_MAX, parse_duration, parse_rate};
+pub use names::{
+    FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, Recipient, TYPE_BYTES_MAX, parse_duration, parse_rate,
+};
 pub use resolve::{
-    ACCEPT_MAX, LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX, SOCKET_PATH_BYTES_MAX,
-    SUITES, TRUST_MAX, USES_MAX,
+    ACCEPT_MAX, EXCEPT_MAX, LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX,
+    SOCKET_PATH_BYTES_MAX, SUITES, TRUST_MAX, USES_MAX,
 };
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
-pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain};
+pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain, WAYS_MAX};
 pub use schema::Table;
+pub use sgc_ros::TOPIC_BYTES_MAX;
 
 /// The largest file that is read as a configuration: 1024 shares with all their metadata fit.
 pub const CONFIG_BYTES_MAX: u64 = 4 * 1024 * 1024;
+
+/// The shortest time between pulses of a link.
+pub const KEEP_ALIVE_MIN: Duration = Duration::from_secs(1);
+/// The longest.
+pub const KEEP_ALIVE_MAX: Duration = Duration::from_secs(60);
 
 /// The least that a peer may be held to: below it a large message takes minutes.
 pub const PEER_RATE_MIN: u64 = 64_000;
@@ -64,6 +73,9 @@ pub struct Config {
     pub routers: Vec<RouterUrl>,
     /// The DNS server that host names and SRV records of routers are looked up at; none is the system's way.
     pub resolver: Option<SocketAddr>,
+    /// How long nothing may come from a peer before it is asked whether it is there, at most; none finds out by itself.
+    /// [`KEEP_ALIVE_MIN`] to [`KEEP_ALIVE_MAX`].
+    pub keep_alive: Option<Duration>,
     /// Where to listen; port 0 lets the system choose. Not empty: this node is a router.
     pub listen: Vec<ListenAddr>,
     /// What one peer may send into this node, bits a second; [`PEER_RATE_MIN`] to [`PEER_RATE_MAX`].
@@ -81,11 +93,13 @@ pub struct Config {
     /// What this node wants, each topic of an owner once, none of them shared.
     pub uses: Vec<UseConfig>,
     /// What partners of other fleets handed to this node.
-    pub tokens: Vec<TokenSource>,
+    pub tokens: Vec<TokenConfig>,
     /// Other fleets, or some of their nodes, that shares may name.
     pub partners: Vec<PartnerConfig>,
     /// Files with more CAs whose nodes may link to this one.
     pub trust: Vec<PathBuf>,
+    /// Whether the file is read again when it changes.
+    pub watch: bool,
     /// The fleet file, if this node is its fleet's authority.
     pub authority: Option<PathBuf>,
     /// Where this node keeps what it has to remember, if not in its usual place.
@@ -94,12 +108,36 @@ pub struct Config {
     pub rotation: RotationConfig,
     /// Who was granted and refused what, as it is kept.
     pub audit: AuditConfig,
+    /// How links are made.
+    pub transport: TransportConfig,
     /// Where the status socket goes, if not in its usual place.
     pub admin_socket: Option<PathBuf>,
 }
 
+/// How links are made, whatever their transport can do of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TransportConfig {
+    /// What decides how much may be under way.
+    pub congestion: Congestion,
+    /// Whether the system may segment and gather datagrams.
+    pub offload: bool,
+    /// Whether the longest packet that a path carries is looked for.
+    pub mtu_discovery: bool,
+    /// What packets are marked with, 0 to 63.
+    pub dscp: Option<u8>,
+    /// The same for connections of single topics that this node dials.
+    pub lane_dscp: Option<u8>,
+}
+
+impl Default for TransportConfig {
+    fn default() -> Self {
+        let congestion = Congestion::default();
+        Self { congestion, offload: true, mtu_discovery: true, dscp: None, lane_dscp: None }
+    }
+}
+
 /// The local ROS 2 network.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RosConfig {
     /// 0 to [`DOMAIN_ID_MAX`].
     pub domain_id: u32,
@@ -107,8 +145,17 @@ pub struct RosConfig {
     pub discovery: DiscoveryRange,
     /// Host names and IP addresses to look at besides. Empty where the range is `Off` or `SystemDefault`.
     pub static_peers: Vec<String>,
+    /// Whether far nodes appear in the local ROS graph, and local ones in far ones.
+    pub graph: bool,
     /// `CYCLONEDDS_URI` as it is: what users of that middleware have set for their network holds here too.
     pub cyclonedds_uri: Option<String>,
+}
+
+impl Default for RosConfig {
+    fn default() -> Self {
+        let (discovery, static_peers) = (DiscoveryRange::default(), Vec::new());
+        Self { domain_id: 0, discovery, static_peers, graph: true, cyclonedds_uri: None }
+    }
 }
 
 /// How far ROS 2 discovery reaches (`ROS_AUTOMATIC_DISCOVERY_RANGE`).
@@ -128,16 +175,24 @@ pub enum DiscoveryRange {
 /// A topic that this node owns and lets others subscribe to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShareConfig {
-    /// A fully qualified ROS 2 name.
+    /// What it is.
+    pub interface: Interface,
+    /// A fully qualified ROS 2 name, or a pattern of such.
     pub topic: String,
-    /// `pkg/msg/Name`; taken from discovery where it is not given.
+    /// What is left out, and what the rest is called for others.
+    pub naming: Naming,
+    /// `pkg/msg/Name`, or `srv` or `action` in the middle; taken from discovery where it is not given.
     pub type_name: Option<String>,
-    /// Who may subscribe; never empty, no one twice.
+    /// Who may subscribe, or call; never empty, no one twice.
     pub to: Vec<Recipient>,
     /// Who may publish besides this node; no one twice.
     pub publish: Vec<Recipient>,
     /// What overtakes it.
     pub priority: Class,
+    /// How much of it goes out.
+    pub shaping: Shaping,
+    /// Whether it has a connection of its own to the next node.
+    pub dedicated: bool,
     /// How its payloads are sealed.
     pub suite: Suite,
     /// What else goes into its name.
@@ -167,12 +222,37 @@ pub struct ShareMetadata {
 pub struct UseConfig {
     /// The node that shares it.
     pub from: NodeName,
-    /// A fully qualified ROS 2 name.
+    /// What it is.
+    pub interface: Interface,
+    /// A fully qualified ROS 2 name there, or a pattern of such.
     pub topic: String,
+    /// What is left out, and what the rest is called here.
+    pub naming: Naming,
+    /// What the names of frames in tf messages get in front.
+    pub frame_prefix: Option<String>,
     /// `pkg/msg/Name`, if the user insists on one; otherwise the owner's catalogue says.
     pub type_name: Option<String>,
     /// True if local messages go there, false if it appears here.
     pub publish: bool,
+    /// What overtakes that which is published there; as the owner says if not given.
+    pub priority: Option<Class>,
+    /// How much of it goes on, whichever way.
+    pub shaping: Shaping,
+    /// Whether it has a connection of its own to the next node.
+    pub dedicated: bool,
+}
+
+/// A topic that is used by a token.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TokenConfig {
+    /// Where the token is.
+    pub source: TokenSource,
+    /// What its topic is called here.
+    pub naming: Naming,
+    /// What the names of frames in tf messages get in front.
+    pub frame_prefix: Option<String>,
+    /// Whether it has a connection of its own to the next node.
+    pub dedicated: bool,
 }
 
 /// Where a token is.
@@ -257,6 +337,12 @@ impl Config {
     /// Takes part in ROS 2 not at all and only passes packets on.
     pub fn is_pure_router(&self) -> bool {
         self.ros.is_none()
+    }
+
+    /// The share of a local topic: the one that names it, else the first whose pattern covers it.
+    pub fn share_of(&self, topic: &str) -> Option<&ShareConfig> {
+        let named = self.shares.iter().find(|share| share.topic == topic);
+        named.or_else(|| self.shares.iter().find(|share| share.naming.shares(&share.topic, topic)))
     }
 
     /// Resolves the command line without looking at any file. The ROS environment counts as it does with a file.

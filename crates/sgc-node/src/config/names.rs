@@ -6,6 +6,7 @@
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
+use sgc_ros::{Interface, TOPIC_BYTES_MAX};
 use sgc_transport::{ListenAddr, UrlError};
 use sgc_trust::{FleetName, GroupName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
@@ -14,8 +15,8 @@ use super::error::{Mistake, TopicRule};
 use super::router_url::{RouterUrl, RouterUrlError};
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
-/// The longest topic: 256 bytes of DDS less a terminator and 8 for the prefix that rmw adds.
-pub const TOPIC_BYTES_MAX: usize = 247;
+/// The longest prefix of frames.
+pub const FRAME_PREFIX_BYTES_MAX: usize = 64;
 /// The longest message type: 256 bytes of DDS less a terminator and what `::dds_::` and `_` add.
 pub const TYPE_BYTES_MAX: usize = 240;
 /// The longest peer address, as `rmw` has it.
@@ -48,16 +49,46 @@ impl std::fmt::Display for Recipient {
     }
 }
 
+/// Checks a topic, or a pattern of topics in which `*` and `**` stand for words.
+pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake> {
+    if !value.contains('*') {
+        return topic(key, value);
+    }
+    let is_wildcard = |word: &&str| matches!(*word, "*" | "**");
+    if value.split('/').any(|word| word.contains('*') && !is_wildcard(&word)) {
+        let whole = |word: &str| if word.contains('*') { "*".to_owned() } else { word.to_owned() };
+        let right = value.split('/').map(whole).collect::<Vec<_>>().join("/");
+        return Err(Mistake::Wildcard { key, value: value.to_owned(), right });
+    }
+    // Where a word may stand a wildcard may.
+    let words: Vec<_> = value.split('/').map(|word| if is_wildcard(&word) { "w" } else { word }).collect();
+    let name = words.join("/");
+    match broken_topic_rule(&name) {
+        None => Ok(value.to_owned()),
+        Some(rule) => Err(Mistake::TopicName { key, value: value.to_owned(), rule, right: None }),
+    }
+}
+
+/// Checks what the names of frames get in front.
+pub(super) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mistake> {
+    let allowed = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.' | b'/');
+    let fits = (1..=FRAME_PREFIX_BYTES_MAX).contains(&value.len());
+    if fits && value.bytes().all(allowed) && !value.starts_with('/') {
+        return Ok(value.to_owned());
+    }
+    Err(Mistake::FramePrefix { key, value: value.to_owned(), max: FRAME_PREFIX_BYTES_MAX })
+}
+
+/// How an interface is named: one that is made of several has no wildcard.
+pub(super) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> Result<String, Mistake> {
+    match interface {
+        Interface::Topic | Interface::Service => pattern,
+        Interface::Action | Interface::Parameters => topic,
+    }
+}
+
 /// Checks a fully qualified topic name as rmw does; repeated underscores are allowed as it allows them.
 pub(super) fn topic(key: &'static str, value: &str) -> Result<String, Mistake> {
-    if value.contains(['*', '?']) {
-        return Err(Mistake::PlannedValue {
-            key,
-            value: value.to_owned(),
-            what: "wildcards are",
-            instead: "name one topic",
-        });
-    }
     match broken_topic_rule(value) {
         None => Ok(value.to_owned()),
         Some(rule) => {
@@ -103,13 +134,38 @@ fn repaired_topic(value: &str) -> Option<String> {
     broken_topic_rule(&repaired).is_none().then_some(repaired)
 }
 
+/// Checks the type of an interface.
+pub(super) fn interface_type(
+    key: &'static str,
+    value: &str,
+    interface: Interface,
+) -> Result<String, Mistake> {
+    let (kind, example) = match interface {
+        Interface::Topic => return message_type(key, value),
+        Interface::Service => ("srv", "std_srvs/srv/Trigger"),
+        Interface::Action => ("action", "nav2_msgs/action/NavigateToPose"),
+        Interface::Parameters => return Err(Mistake::TopicsOnly { key, interface: interface.key() }),
+    };
+    if value.len() > TYPE_BYTES_MAX {
+        return Err(Mistake::TooLong { key, bytes: value.len(), max: TYPE_BYTES_MAX });
+    }
+    let ros = sgc_ros::ros_type(value);
+    match ros.split('/').collect::<Vec<_>>()[..] {
+        [package, found, name] if found == kind && is_identifier(package) && is_identifier(name) => Ok(ros),
+        _ => {
+            let (value, interface) = (value.to_owned(), interface.key());
+            Err(Mistake::InterfaceType { key, value, interface, example })
+        }
+    }
+}
+
 /// Checks a message type and gives it as `pkg/msg/Name`, also from DDS's `pkg::msg::dds_::Name_`.
 pub(super) fn message_type(key: &'static str, value: &str) -> Result<String, Mistake> {
-    let planned = |what| Mistake::PlannedValue {
+    let other = || Mistake::InterfaceType {
         key,
         value: value.to_owned(),
-        what,
-        instead: "name a message type, such as \"std_msgs/msg/String\"",
+        interface: Interface::Topic.key(),
+        example: "std_msgs/msg/String",
     };
     let wrong = |right| Mistake::TypeName { key, value: value.to_owned(), right };
     if value.len() > TYPE_BYTES_MAX {
@@ -126,8 +182,7 @@ pub(super) fn message_type(key: &'static str, value: &str) -> Result<String, Mis
     let words: Vec<&str> = value.split('/').collect();
     match words[..] {
         [package, "msg", name] if is_identifier(package) && is_identifier(name) => Ok(value.to_owned()),
-        [_, "srv", _] => Err(planned("services are")),
-        [_, "action", _] => Err(planned("actions are")),
+        [_, "srv" | "action", _] => Err(other()),
         _ => {
             let slashed = value.trim().replace("::", "/").replace('.', "/");
             let words: Vec<&str> = slashed.split('/').collect();
@@ -212,6 +267,58 @@ pub fn parse_rate(text: &str) -> Option<u64> {
     number.parse::<u64>().ok()?.checked_mul(unit)
 }
 
+/// Checks what packets are marked with: a class of differentiated services (RFC 2474, 2597, 3246), or its number.
+pub(super) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
+    const WHAT: &str = "a class of differentiated services: \"CS0\" to \"CS7\", \"AF11\" to \"AF43\", \"EF\", or \"0\" to \"63\"";
+    let digit = |byte: u8, max: u8| Some(byte.checked_sub(b'0')?).filter(|digit| *digit <= max);
+    let mark = match value.as_bytes() {
+        b"EF" => Some(46),
+        [b'C', b'S', class] => digit(*class, 7).map(|class| class << 3),
+        [b'A', b'F', class, drop] => digit(*class, 4)
+            .zip(digit(*drop, 3))
+            .filter(|(class, drop)| *class > 0 && *drop > 0)
+            .map(|(class, drop)| (class << 3) | (drop << 1)),
+        [b'0'..=b'9'] | [b'1'..=b'9', b'0'..=b'9'] => value.parse().ok().filter(|mark| *mark < 64),
+        _ => None,
+    };
+    mark.ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+/// Checks how often messages of a topic may go, and says how long there is between two.
+pub(super) fn interval(key: &'static str, value: &str) -> Result<Duration, Mistake> {
+    const WHAT: &str = "messages a second, 0.001 to 10000: \"10Hz\", \"0.5Hz\"";
+    let number = |text: &str| {
+        let text = text.trim_end();
+        let is_plain = text.bytes().all(|b| b.is_ascii_digit() || b == b'.') && text.len() <= 16;
+        text.parse::<f64>().ok().filter(|hz| is_plain && (0.001..=10_000.0).contains(hz))
+    };
+    let hz = value.strip_suffix("Hz").and_then(number);
+    hz.map(|hz| Duration::from_secs_f64(1.0 / hz)).ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+/// Checks how many bits a second of a topic may go.
+pub(super) fn bandwidth(key: &'static str, value: &str) -> Result<u64, Mistake> {
+    const WHAT: &str = "bits a second, \"1kbps\" to \"1000Gbps\": \"500kbps\", \"2Mbps\"";
+    let rate = parse_rate(value).filter(|rate| (1000..=PEER_RATE_MAX).contains(rate));
+    rate.ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+/// Checks how old messages of a topic may be.
+pub(super) fn age(key: &'static str, value: &str) -> Result<Duration, Mistake> {
+    const WHAT: &str = "a length of time, \"1ms\" to \"1h\": \"500ms\", \"2s\"";
+    let millis = |text: &str| {
+        let digits = Some(text.trim_end()).filter(|t| t.bytes().all(|b| b.is_ascii_digit()));
+        digits?.parse().ok().map(Duration::from_millis)
+    };
+    let age = value.strip_suffix("ms").map_or_else(|| parse_duration(value), millis);
+    let bounds = Duration::from_millis(1)..=Duration::from_secs(3600);
+    age.filter(|age| bounds.contains(age)).ok_or_else(|| shaping_mistake(key, value, WHAT))
+}
+
+fn shaping_mistake(key: &'static str, value: &str, what: &'static str) -> Mistake {
+    Mistake::Shaping { key, value: value.to_owned(), what }
+}
+
 /// A rate in the largest unit that divides it.
 pub(super) fn rate_text(rate: u64) -> String {
     let unit = RATE_UNITS.into_iter().find(|(unit, _)| rate.is_multiple_of(*unit));
@@ -262,12 +369,12 @@ fn is_host(value: &str) -> bool {
 
 /// Checks where a router is to be found: `quic://HOST[:PORT]`, `srv://DOMAIN`, `mdns://[NODE]`.
 pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistake> {
-    let router = match value.parse() {
+    let router: RouterUrl = match value.parse() {
         Ok(router) => router,
         Err(RouterUrlError::Link(fault)) => return Err(url_mistake(key, value, fault)),
         Err(fault) => return Err(Mistake::Router { key, value: value.to_owned(), fault }),
     };
-    if let RouterUrl::At(url) = &router {
+    for url in router.ways() {
         let host = url.host.clone();
         if !is_host(&host) {
             return Err(url_mistake(key, value, UrlError::Host(host)));
@@ -288,7 +395,7 @@ pub(super) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mis
         .ok_or_else(|| Mistake::Resolver { key, value: value.to_owned() })
 }
 
-/// Checks where to listen, `quic://ADDRESS[:PORT]`.
+/// Checks where to listen, `SCHEME://ADDRESS[:PORT]`.
 pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
     if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {
         return Err(Mistake::ListenFinds { key, value: value.to_owned() });
@@ -297,11 +404,5 @@ pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mista
 }
 
 fn url_mistake(key: &'static str, value: &str, fault: UrlError) -> Mistake {
-    let value = value.to_owned();
-    match fault {
-        UrlError::SchemePlanned(_) => {
-            Mistake::PlannedValue { key, value, what: "this transport is", instead: "use quic://" }
-        }
-        fault => Mistake::Url { key, value, fault },
-    }
+    Mistake::Url { key, value: value.to_owned(), fault }
 }

@@ -6,23 +6,29 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use sgc_ros::{Interface, Naming, Rename, Shaping, is_pattern, matches};
 use sgc_router::MappingKind;
+use sgc_transport::Congestion;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
-use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX};
+use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX, PayloadEncoding};
 
-use super::draft::{Draft, Located, PartnerDraft, RosDraft, ShareDraft, UseDraft, Words};
+use super::draft::{
+    Draft, Located, NamingDraft, PartnerDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
+};
 use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
 use super::schema::nearest;
 use super::{
-    AuditConfig, Config, Environment, PartnerConfig, RotationConfig, ShareConfig, ShareMetadata, TokenSource,
-    UseConfig, ros_env,
+    AuditConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig, RotationConfig,
+    ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig, ros_env,
 };
 
 /// Shares of one node.
 pub const SHARES_MAX: usize = 1024;
 /// Uses of one node.
 pub const USES_MAX: usize = 1024;
+/// Exceptions of one share or use.
+pub const EXCEPT_MAX: usize = 256;
 /// Recipients of one share.
 pub const RECIPIENTS_MAX: usize = 1024;
 /// Routers that one node dials.
@@ -81,6 +87,10 @@ pub(super) fn resolve(
     let identity = resolver.identity(draft, node_name.as_ref());
     let routers = resolver.addresses(&draft.routers, names::router, ROUTERS_MAX);
     let dns = draft.resolver.as_ref().and_then(|server| resolver.keep(server, names::resolver));
+    let keep_alive = draft.keep_alive.as_ref().filter(|written| written.value != "auto");
+    let bounds = (KEEP_ALIVE_MIN, KEEP_ALIVE_MAX);
+    let keep_alive = keep_alive
+        .and_then(|written| resolver.keep(written, |key, value| names::duration(key, value, bounds)));
     let listen = resolver.addresses(&draft.listen, names::listen, LISTEN_MAX);
     let announce = resolver.announce(draft);
     let accept = resolver.accept(draft);
@@ -106,6 +116,7 @@ pub(super) fn resolve(
     let state = draft.state.as_ref().and_then(|state| resolver.path(state, "\"/var/lib/sgc/arm-1\""));
     let rotation = resolver.rotation(draft);
     let audit = resolver.audit(draft);
+    let transport = resolver.transport(draft);
     let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket));
     match identity {
         Some(identity) if resolver.errors.is_empty() => Ok(Config {
@@ -113,6 +124,7 @@ pub(super) fn resolve(
             identity,
             routers,
             resolver: dns,
+            keep_alive,
             listen,
             peer_rate,
             mapping,
@@ -124,10 +136,12 @@ pub(super) fn resolve(
             tokens,
             partners,
             trust,
+            watch: draft.watch.as_ref().is_none_or(|watch| watch.value),
             authority,
             state,
             rotation,
             audit,
+            transport,
             admin_socket,
         }),
         _ => Err(resolver.errors),
@@ -212,12 +226,15 @@ impl Resolver<'_> {
 
     fn shares(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<ShareConfig> {
         self.check_count(&draft.origin, self.words.share, draft.shares.len(), SHARES_MAX);
-        let mut first: BTreeMap<&str, &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(&str, &str), &Located<String>> = BTreeMap::new();
+        let mut called: BTreeMap<(&str, String), &Located<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for share in draft.shares.iter().take(SHARES_MAX) {
-            let topic = share.topic.as_ref().and_then(|topic| self.keep(topic, names::topic));
+            let interface = interface_of(share.topic.as_ref());
+            let topic =
+                share.topic.as_ref().and_then(|topic| self.keep(topic, names::interface_name(interface)));
             if let (Some(topic), Some(written)) = (&topic, &share.topic) {
-                if let Some(other) = first.get(topic.as_str()) {
+                if let Some(other) = first.get(&(interface.key(), topic.as_str())) {
                     let mistake = Mistake::SharedTwice {
                         key: written.key,
                         topic: topic.clone(),
@@ -225,10 +242,21 @@ impl Resolver<'_> {
                     };
                     self.record(&written.origin, mistake);
                 } else {
-                    first.insert(&written.value, written);
+                    first.insert((interface.key(), &written.value), written);
                 }
             }
-            valid.extend(self.share(share, topic, node_name, &draft.partners));
+            let resolved = self.share(share, topic, node_name, &draft.partners);
+            if let (Some(resolved), Some(written)) = (&resolved, &share.topic) {
+                let name = (interface.key(), resolved.naming.renamed(&resolved.topic, &resolved.topic));
+                match called.get(&name).filter(|other| other.value != written.value) {
+                    Some(other) => {
+                        let (key, other) = (written.key, other.reference());
+                        self.record(&written.origin, Mistake::SharedAsOne { key, topic: name.1, other });
+                    }
+                    None => drop(called.insert(name, written)),
+                }
+            }
+            valid.extend(resolved);
         }
         valid
     }
@@ -247,14 +275,28 @@ impl Resolver<'_> {
             self.recipients(to, node_name, partners)
         });
         let publish = share.publish.as_ref().map(|publish| self.recipients(publish, node_name, partners));
-        let type_name = share.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
-        if let Some(publish) = &share.publish
+        let interface = interface_of(share.topic.as_ref());
+        let type_name = share
+            .type_name
+            .as_ref()
+            .and_then(|name| self.keep(name, |key, value| names::interface_type(key, value, interface)));
+        let publishes = share.publish.as_ref().map(|publish| (publish.key, &publish.origin));
+        self.check_topics_only(interface, publishes, &share.shaping);
+        let pattern = topic.as_ref().filter(|topic| is_pattern(topic));
+        if let (Some(publish), Some(topic)) = (&share.publish, pattern) {
+            let topic = topic.clone();
+            self.record(&publish.origin, Mistake::PublishOnPattern { key: publish.key, topic });
+        } else if let Some(publish) = &share.publish
             && share.type_name.is_none()
+            && interface == Interface::Topic
         {
             self.record(&publish.origin, Mistake::PublishWithoutType { key: publish.key });
         }
         let priority = share.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
+        let dedicated = self.dedicated(share.link.as_ref());
         let suite = share.suite.as_ref().and_then(|name| self.keep(name, suite));
+        let shaping = self.shaping(&share.shaping);
+        let naming = self.naming(&share.naming, topic.as_deref());
         let metadata = ShareMetadata {
             description: self.metadata(share.description.as_ref()),
             author: self.metadata(share.author.as_ref()),
@@ -264,11 +306,15 @@ impl Resolver<'_> {
             node: self.metadata(share.node.as_ref()),
         };
         Some(ShareConfig {
+            interface,
             topic: topic?,
+            naming: naming?,
             to: to?,
             publish: publish.unwrap_or_default(),
             type_name,
             priority: priority.unwrap_or_default(),
+            shaping,
+            dedicated,
             suite: suite.unwrap_or(Suite::DEFAULT),
             metadata,
         })
@@ -431,6 +477,18 @@ impl Resolver<'_> {
         }
     }
 
+    fn transport(&mut self, draft: &Draft) -> TransportConfig {
+        let written = &draft.transport;
+        let congestion = written.congestion.as_ref().and_then(|name| self.keep(name, congestion));
+        TransportConfig {
+            congestion: congestion.unwrap_or_default(),
+            offload: written.offload.as_ref().is_none_or(|offload| offload.value),
+            mtu_discovery: written.mtu_discovery.as_ref().is_none_or(|looks| looks.value),
+            dscp: written.dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
+            lane_dscp: written.lane_dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
+        }
+    }
+
     fn audit(&mut self, draft: &Draft) -> AuditConfig {
         let written = &draft.audit;
         let file = written.file.as_ref().and_then(|f| self.path(f, "\"/var/log/sgc/arm-1.audit\""));
@@ -463,22 +521,42 @@ impl Resolver<'_> {
         valid
     }
 
-    fn tokens(&mut self, draft: &Draft) -> Vec<TokenSource> {
-        let mut first: Vec<(TokenSource, &Located<String>)> = Vec::new();
+    fn tokens(&mut self, draft: &Draft) -> Vec<TokenConfig> {
+        let mut first: Vec<(TokenConfig, &Located<String>)> = Vec::new();
         for one in &draft.uses {
             let Some(written) = &one.token else { continue };
+            for beside in [
+                &one.priority,
+                &one.shaping.max_rate,
+                &one.shaping.max_bandwidth,
+                &one.shaping.max_age,
+                &one.shaping.compress,
+            ]
+            .into_iter()
+            .flatten()
+            {
+                self.record(&beside.origin, Mistake::TokenUnshaped { key: beside.key });
+            }
             for beside in [&one.from, &one.topic, &one.type_name].into_iter().flatten() {
                 self.record(&beside.origin, Mistake::TokenAndMore { key: beside.key });
             }
+            if let Some(except) = &one.naming.except {
+                self.record(&except.origin, Mistake::TokenAndMore { key: except.key });
+            }
+            // Which topic it is, the token says; one it is.
+            let unnamed = NamingDraft { except: None, ..one.naming.clone() };
+            let naming = self.naming(&unnamed, Some("/topic")).unwrap_or_default();
+            let frame_prefix = self.frame_prefix(one);
             let Some(source) = self.token(written) else { continue };
-            if let Some((_, other)) = first.iter().find(|(known, _)| *known == source) {
+            if let Some((_, other)) = first.iter().find(|(known, _)| known.source == source) {
                 let other = other.reference();
                 self.record(&written.origin, Mistake::TokenTwice { key: written.key, other });
             } else {
-                first.push((source, written));
+                let dedicated = self.dedicated(one.link.as_ref());
+                first.push((TokenConfig { source, naming, frame_prefix, dedicated }, written));
             }
         }
-        first.into_iter().map(|(source, _)| source).collect()
+        first.into_iter().map(|(token, _)| token).collect()
     }
 
     fn token(&mut self, written: &Located<String>) -> Option<TokenSource> {
@@ -495,6 +573,11 @@ impl Resolver<'_> {
         Some(TokenSource::File(path))
     }
 
+    /// Whether a topic has a connection of its own.
+    fn dedicated(&mut self, link: Option<&Located<String>>) -> bool {
+        link.and_then(|link| self.keep(link, is_dedicated)).unwrap_or_default()
+    }
+
     fn metadata(&mut self, text: Option<&Located<String>>) -> String {
         let Some(text) = text else { return String::new() };
         let (bytes, max) = (text.value.len(), METADATA_FIELD_BYTES_MAX);
@@ -506,26 +589,31 @@ impl Resolver<'_> {
 
     fn uses(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<UseConfig> {
         self.check_count(&draft.origin, self.words.uses, draft.uses.len(), USES_MAX);
-        let shared: BTreeMap<&str, &Located<String>> = draft
+        let shared: BTreeMap<(&str, &str), &Located<String>> = draft
             .shares
             .iter()
             .filter_map(|share| share.topic.as_ref())
-            .map(|topic| (topic.value.as_str(), topic))
+            .map(|topic| ((interface_of(Some(topic)).key(), topic.value.as_str()), topic))
             .rev()
             .collect();
-        let mut first: BTreeMap<(NodeName, String), &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(NodeName, &str, String, bool), &Located<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for one in draft.uses.iter().take(USES_MAX).filter(|one| one.token.is_none()) {
             let resolved = self.one_use(one, node_name);
             if let (Some(resolved), Some(written)) = (&resolved, &one.topic) {
                 let (key, topic) = (written.key, resolved.topic.clone());
-                let pair = (resolved.from.clone(), topic.clone());
+                // Of what matches a pattern some may go one way and some the other.
+                let is_other_way = is_pattern(&topic) && resolved.publish;
+                let what = resolved.interface.key();
+                let pair = (resolved.from.clone(), what, topic.clone(), is_other_way);
+                let here = resolved.naming.renamed(&topic, &topic);
                 if let Some(other) = first.get(&pair) {
                     let (from, other) = (pair.0.to_string(), other.reference());
                     self.record(&written.origin, Mistake::UsedTwice { key, topic, from, other });
-                } else if let Some(share) = shared.get(topic.as_str()) {
+                } else if let Some(share) = shared.get(&(what, here.as_str())).filter(|_| !is_pattern(&here))
+                {
                     let other = share.reference();
-                    self.record(&written.origin, Mistake::SharedAndUsed { key, topic, other });
+                    self.record(&written.origin, Mistake::SharedAndUsed { key, topic: here, other });
                 } else {
                     first.insert(pair, written);
                 }
@@ -543,10 +631,138 @@ impl Resolver<'_> {
             }
             Some(name)
         });
-        let topic = one.topic.as_ref().and_then(|topic| self.keep(topic, names::topic));
-        let type_name = one.type_name.as_ref().and_then(|name| self.keep(name, names::message_type));
+        let interface = interface_of(one.topic.as_ref());
+        let topic = one.topic.as_ref().and_then(|topic| self.keep(topic, names::interface_name(interface)));
+        let naming = self.naming(&one.naming, topic.as_deref());
+        let type_name = one
+            .type_name
+            .as_ref()
+            .and_then(|name| self.keep(name, |key, value| names::interface_type(key, value, interface)));
+        let publishes = one.publish.as_ref().map(|publish| (publish.key, &publish.origin));
+        self.check_topics_only(interface, publishes, &one.shaping);
         let publish = one.publish.as_ref().is_some_and(|publish| publish.value);
-        Some(UseConfig { from: from?, topic: topic?, type_name, publish })
+        let sends = publish || interface != Interface::Topic;
+        if let Some(written) = one.priority.as_ref().filter(|_| !sends) {
+            self.record(&written.origin, Mistake::PriorityOfOther { key: written.key });
+        }
+        if let Some(written) = one.shaping.compress.as_ref().filter(|_| !publish) {
+            self.record(&written.origin, Mistake::CompressionOfOther { key: written.key });
+        }
+        let priority = one.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
+        let shaping = self.shaping(&one.shaping);
+        let dedicated = self.dedicated(one.link.as_ref());
+        if let Some(written) = one.frame_prefix.as_ref().filter(|_| publish) {
+            self.record(&written.origin, Mistake::FramesElsewhere { key: written.key });
+        }
+        let frame_prefix = self.frame_prefix(one);
+        Some(UseConfig {
+            from: from?,
+            interface,
+            topic: topic?,
+            naming: naming?,
+            frame_prefix,
+            type_name,
+            publish,
+            priority,
+            shaping,
+            dedicated,
+        })
+    }
+
+    fn frame_prefix(&mut self, one: &UseDraft) -> Option<String> {
+        one.frame_prefix.as_ref().and_then(|prefix| self.keep(prefix, names::frame_prefix))
+    }
+
+    /// What a rule for this topic leaves out, and other names; nothing if the topic is not known.
+    fn naming(&mut self, written: &NamingDraft, topic: Option<&str>) -> Option<Naming> {
+        let except = written.except.as_ref().map(|except| {
+            if let Some(topic) = topic.filter(|topic| !is_pattern(topic)) {
+                let topic = topic.to_owned();
+                self.record(&except.origin, Mistake::ExceptOfOne { key: except.key, topic });
+            }
+            let valid = self.addresses(&except.value, names::pattern, EXCEPT_MAX);
+            for one in &except.value {
+                let nothing = topic.filter(|topic| is_pattern(topic) && !is_pattern(&one.value));
+                if let Some(topic) =
+                    nothing.filter(|topic| valid.contains(&one.value) && !matches(topic, &one.value))
+                {
+                    let (key, value, topic) = (one.key, one.value.clone(), topic.to_owned());
+                    self.record(&one.origin, Mistake::ExceptsNothing { key, value, topic });
+                }
+            }
+            valid
+        });
+        if let (Some(_), Some(namespace)) = (&written.renamed, &written.namespace) {
+            self.record(&namespace.origin, Mistake::AsAndNamespace { key: namespace.key });
+        }
+        let renamed = written.renamed.as_ref().and_then(|name| {
+            let other = self.keep(name, names::pattern)?;
+            topic.is_none_or(|topic| self.check_as(name, topic)).then_some(other)
+        });
+        let namespace = written.namespace.as_ref().and_then(|name| self.keep(name, names::topic));
+        let rename = match (renamed, namespace) {
+            (Some(other), _) => Rename::As(other),
+            (None, Some(namespace)) => Rename::Namespace(namespace),
+            (None, None) => Rename::Keep,
+        };
+        let naming = Naming { except: except.unwrap_or_default(), rename };
+        let topic = topic?;
+        if let (Some(namespace), Rename::Namespace(_)) = (&written.namespace, &naming.rename)
+            && let Err(mistake) = names::pattern(namespace.key, &naming.renamed(topic, topic))
+        {
+            self.record(&namespace.origin, mistake);
+        }
+        Some(naming)
+    }
+
+    /// Whether `as` has the wildcard of the topic, or neither has any.
+    fn check_as(&mut self, written: &Located<String>, topic: &str) -> bool {
+        let split = |name: &str| {
+            let (stem, last) = name.rsplit_once('/').unwrap_or_default();
+            (stem.to_owned(), last.to_owned())
+        };
+        let ((topic_stem, topic_last), (stem, last)) = (split(topic), split(&written.value));
+        let right = match (is_pattern(topic), is_pattern(&topic_stem), is_pattern(&stem)) {
+            (true, false, false) if topic_last == last => return true,
+            (false, ..) if !is_pattern(&written.value) => return true,
+            (true, false, false) if is_pattern(&last) => Some(format!("{stem}/{topic_last}")),
+            (true, false, false) => Some(format!("{}/{topic_last}", written.value)),
+            (false, _, false) if !stem.is_empty() => Some(stem),
+            _ => None,
+        };
+        let (key, value, topic) = (written.key, written.value.clone(), topic.to_owned());
+        self.record(&written.origin, Mistake::AsWildcard { key, value, topic, right });
+        false
+    }
+
+    /// Says so of settings that mean nothing for services.
+    fn check_topics_only(
+        &mut self,
+        interface: Interface,
+        publish: Option<(&'static str, &Origin)>,
+        shaping: &ShapingDraft,
+    ) {
+        if interface == Interface::Topic {
+            return;
+        }
+        let shaping = [&shaping.max_rate, &shaping.max_bandwidth, &shaping.max_age];
+        let written = shaping.into_iter().flatten().map(|one| (one.key, &one.origin));
+        for (key, origin) in publish.into_iter().chain(written) {
+            self.record(origin, Mistake::TopicsOnly { key, interface: interface.key() });
+        }
+    }
+
+    fn shaping(&mut self, written: &ShapingDraft) -> Shaping {
+        Shaping {
+            interval: written.max_rate.as_ref().and_then(|rate| self.keep(rate, names::interval)),
+            bits_per_s: written.max_bandwidth.as_ref().and_then(|rate| self.keep(rate, names::bandwidth)),
+            max_age: written.max_age.as_ref().and_then(|age| self.keep(age, names::age)),
+            compression: written
+                .compress
+                .as_ref()
+                .and_then(|c| self.keep(c, compression))
+                .unwrap_or_default(),
+        }
     }
 
     fn socket(&mut self, socket: &Located<PathBuf>) -> Option<PathBuf> {
@@ -562,6 +778,13 @@ impl Resolver<'_> {
     }
 }
 
+/// What a table is about: the key that the name stands under says so. Arguments name topics.
+fn interface_of(named: Option<&Located<String>>) -> Interface {
+    let key = named.map_or("", |named| named.key);
+    let others = [Interface::Service, Interface::Action, Interface::Parameters];
+    others.into_iter().find(|interface| interface.key() == key).unwrap_or_default()
+}
+
 fn priority_class(key: &'static str, value: &str) -> Result<Class, Mistake> {
     match value {
         "realtime" => Ok(Class::Realtime),
@@ -571,12 +794,33 @@ fn priority_class(key: &'static str, value: &str) -> Result<Class, Mistake> {
     }
 }
 
+fn compression(key: &'static str, value: &str) -> Result<PayloadEncoding, Mistake> {
+    match value {
+        "zstd" => Ok(PayloadEncoding::Zstd),
+        "lz4" => Ok(PayloadEncoding::Lz4),
+        "none" => Ok(PayloadEncoding::Plain),
+        _ => Err(unknown_word(key, value, &["zstd", "lz4", "none"])),
+    }
+}
+
+fn is_dedicated(key: &'static str, value: &str) -> Result<bool, Mistake> {
+    match value {
+        "shared" => Ok(false),
+        "dedicated" => Ok(true),
+        _ => Err(unknown_word(key, value, &["shared", "dedicated"])),
+    }
+}
+
 fn mapping(key: &'static str, value: &str) -> Result<MappingKind, Mistake> {
     match value {
         "flood" => Ok(MappingKind::Flood),
         "query" => Ok(MappingKind::Query),
         _ => Err(unknown_word(key, value, &["flood", "query"])),
     }
+}
+
+fn congestion(key: &'static str, value: &str) -> Result<Congestion, Mistake> {
+    value.parse().map_err(|_| unknown_word(key, value, &["delay", "cubic", "bbr", "newreno"]))
 }
 
 fn suite(key: &'static str, value: &str) -> Result<Suite, Mistake> {

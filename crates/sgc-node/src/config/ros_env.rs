@@ -17,6 +17,8 @@ const DOMAIN_ID: &str = "ROS_DOMAIN_ID";
 const LOCALHOST_ONLY: &str = "ROS_LOCALHOST_ONLY";
 const DISCOVERY_RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
 const STATIC_PEERS: &str = "ROS_STATIC_PEERS";
+const SECURITY_ENABLE: &str = "ROS_SECURITY_ENABLE";
+const SECURITY_STRATEGY: &str = "ROS_SECURITY_STRATEGY";
 const CYCLONEDDS_URI: &str = "CYCLONEDDS_URI";
 
 const RANGES: [(&str, &str, DiscoveryRange); 4] = [
@@ -45,11 +47,27 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         None if range.only_localhost || !range.value.asks_peers() => Vec::new(),
         None => keep(env_peers(env), errors).unwrap_or_default(),
     };
+    keep(refuse_enforced_security(env), errors);
     RosConfig {
         domain_id: domain_id.unwrap_or(0),
         discovery: range.value,
         static_peers,
+        graph: ros.graph.as_ref().is_none_or(|graph| graph.value),
         cyclonedds_uri: variable(env, CYCLONEDDS_URI),
+    }
+}
+
+/// A network that enforces security admits nobody without an enclave: better said than found out by silence. What `rcl` takes
+/// for permission to go without is that here, too.
+fn refuse_enforced_security(env: Environment<'_>) -> Result<(), ConfigError> {
+    match (variable(env, SECURITY_ENABLE).as_deref(), variable(env, SECURITY_STRATEGY).as_deref()) {
+        (Some("true"), Some("Enforce")) => Err(in_environment(Mistake::PlannedValue {
+            key: SECURITY_STRATEGY,
+            value: "Enforce".into(),
+            what: "networks secured by SROS2 are",
+            instead: "a network without security, or without ROS_SECURITY_ENABLE (docs/vendors.md)",
+        })),
+        _ => Ok(()),
     }
 }
 

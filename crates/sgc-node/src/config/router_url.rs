@@ -9,6 +9,8 @@ use std::str::FromStr;
 use sgc_transport::{LinkUrl, UrlError};
 use sgc_trust::NodeName;
 
+/// Most ways to one router: one by each transport.
+pub const WAYS_MAX: usize = 7;
 /// The longest name in DNS, in text.
 const NAME_BYTES_MAX: usize = 253;
 /// What DNS knows the routers of a domain by (RFC 2782): service and protocol.
@@ -19,10 +21,31 @@ pub const SRV_SERVICE: &str = "_sgc._udp";
 pub enum RouterUrl {
     /// `quic://HOST:PORT`: it is there.
     At(LinkUrl),
+    /// `quic://HOST:PORT,tls://HOST:PORT`: ways to one router, the best first; 2 to [`WAYS_MAX`], none twice.
+    Ways(Vec<LinkUrl>),
     /// `srv://DOMAIN`: DNS names those of the domain, of which one is wanted.
     Srv(SrvDomain),
     /// `mdns://`, any on the local network that this node trusts, or `mdns://NODE`, the one of that name.
     Mdns(Option<NodeName>),
+}
+
+impl RouterUrl {
+    /// A router that is reached in one of these ways; at least one.
+    pub(crate) fn by(ways: &[LinkUrl]) -> Self {
+        match ways {
+            [only] => Self::At(only.clone()),
+            ways => Self::Ways(ways.to_vec()),
+        }
+    }
+
+    /// Where it is, if the user said so, in every way; otherwise nothing.
+    pub fn ways(&self) -> &[LinkUrl] {
+        match self {
+            Self::At(url) => std::slice::from_ref(url),
+            Self::Ways(ways) => ways,
+            Self::Srv(_) | Self::Mdns(_) => &[],
+        }
+    }
 }
 
 /// A domain whose SRV records name routers; absolute, in small letters, without its last dot.
@@ -51,6 +74,17 @@ pub enum RouterUrlError {
     /// No way of finding routers has that name.
     #[error("{0}:// is not known: it takes quic://HOST:PORT, srv://DOMAIN and mdns://")]
     Scheme(String),
+    /// Too many ways to one router.
+    #[error("{0} ways to one router; it takes at most {WAYS_MAX}")]
+    Ways(usize),
+    /// One way twice.
+    #[error("{0} stands there twice")]
+    WayTwice(String),
+    /// What is found otherwise is no way to a router.
+    #[error(
+        "{0} finds a router by itself: only addresses, such as \"quic://HOST:PORT,tls://HOST:443\", can stand together"
+    )]
+    WayFinds(String),
     /// Not a domain.
     #[error("after srv:// comes the domain whose {SRV_SERVICE} records name routers: \"srv://lab.example\"")]
     Domain,
@@ -74,6 +108,9 @@ impl FromStr for RouterUrl {
     type Err = RouterUrlError;
 
     fn from_str(text: &str) -> Result<Self, RouterUrlError> {
+        if text.contains(',') {
+            return ways(text).map(Self::Ways);
+        }
         match text.split_once("://") {
             Some(("srv", rest)) => domain(rest.strip_suffix('/').unwrap_or(rest)).map(Self::Srv),
             Some(("mdns", rest)) => match rest.strip_suffix('/').unwrap_or(rest) {
@@ -87,6 +124,24 @@ impl FromStr for RouterUrl {
             },
         }
     }
+}
+
+fn ways(text: &str) -> Result<Vec<LinkUrl>, RouterUrlError> {
+    let count = text.split(',').count();
+    if count > WAYS_MAX {
+        return Err(RouterUrlError::Ways(count));
+    }
+    let mut ways = Vec::with_capacity(count);
+    for one in text.split(',') {
+        match one.trim().parse()? {
+            RouterUrl::At(url) if ways.contains(&url) => {
+                return Err(RouterUrlError::WayTwice(url.to_string()));
+            }
+            RouterUrl::At(url) => ways.push(url),
+            other => return Err(RouterUrlError::WayFinds(other.to_string())),
+        }
+    }
+    Ok(ways)
 }
 
 fn domain(text: &str) -> Result<SrvDomain, RouterUrlError> {
@@ -130,6 +185,12 @@ impl fmt::Display for RouterUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::At(url) => write!(f, "{url}"),
+            Self::Ways(ways) => {
+                for (index, way) in ways.iter().enumerate() {
+                    write!(f, "{}{way}", if index > 0 { "," } else { "" })?;
+                }
+                Ok(())
+            }
             Self::Srv(domain) => write!(f, "srv://{domain}"),
             Self::Mdns(None) => f.write_str("mdns://"),
             Self::Mdns(Some(node)) => write!(f, "mdns://{node}"),
@@ -152,6 +213,7 @@ mod tests {
             ("mdns://", "mdns://"),
             ("mdns:///", "mdns://"),
             ("mdns://cloud", "mdns://cloud"),
+            ("quic://a, quic://b:443", "quic://a:7447,quic://b:443"),
         ] {
             let url: RouterUrl = text.parse().unwrap();
             assert_eq!(url.to_string(), shown);
@@ -165,7 +227,6 @@ mod tests {
     fn mistakes_are_named() {
         let refused = |text: &str| text.parse::<RouterUrl>().unwrap_err();
         assert!(matches!(refused("router:7447"), RouterUrlError::Link(UrlError::SchemeMissing(_))));
-        assert!(matches!(refused("tcp://router"), RouterUrlError::Link(UrlError::SchemePlanned(_))));
         assert_eq!(refused("http://router"), RouterUrlError::Scheme("http".into()));
         for text in ["srv://", "srv://a..b", "srv://-a", "srv://a b", "srv://a/b", "srv://.", "srv://a:b"] {
             assert_eq!(refused(text), RouterUrlError::Domain, "{text}");
@@ -176,6 +237,10 @@ mod tests {
         }
         assert_eq!(refused("srv://lab.example:53"), RouterUrlError::DomainPort("lab.example".into()));
         assert_eq!(refused("srv://_sgc._udp.lab"), RouterUrlError::DomainIsQuery("lab".into()));
+        assert_eq!(refused(&["quic://a"; 8].join(",")), RouterUrlError::Ways(8));
+        assert_eq!(refused("quic://a,quic://a:7447"), RouterUrlError::WayTwice("quic://a:7447".into()));
+        assert_eq!(refused("quic://a,srv://b"), RouterUrlError::WayFinds("srv://b".into()));
+        assert!(matches!(refused("quic://a,"), RouterUrlError::Link(UrlError::SchemeMissing(_))));
         for text in ["mdns://A", "mdns://a:1", "mdns://a b"] {
             assert_eq!(refused(text), RouterUrlError::Node, "{text}");
         }

@@ -18,6 +18,8 @@ pub enum Table {
     Use,
     /// `[router]`
     Router,
+    /// `[transport]`
+    Transport,
     /// `[admin]`
     Admin,
     /// `[authority]`
@@ -32,7 +34,7 @@ pub enum Table {
 
 impl Table {
     /// All of them, in the order in which the reference lists them.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Top,
         Self::Node,
         Self::Ros,
@@ -40,6 +42,7 @@ impl Table {
         Self::Use,
         Self::Partner,
         Self::Router,
+        Self::Transport,
         Self::Authority,
         Self::Rotation,
         Self::Audit,
@@ -55,6 +58,7 @@ impl Table {
             Self::Share => "[[share]]",
             Self::Use => "[[use]]",
             Self::Router => "[router]",
+            Self::Transport => "[transport]",
             Self::Admin => "[admin]",
             Self::Authority => "[authority]",
             Self::Rotation => "[rotation]",
@@ -74,19 +78,33 @@ impl Table {
                 "use",
                 "partner",
                 "router",
+                "transport",
                 "authority",
                 "rotation",
                 "audit",
                 "admin",
             ],
-            Self::Node => &["name", "routers", "resolver", "identity", "state", "trust"],
-            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers"],
+            Self::Node => {
+                &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
+            }
+            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph"],
             Self::Share => &[
                 "topic",
+                "service",
+                "action",
+                "parameters",
+                "except",
+                "as",
+                "namespace",
                 "to",
                 "publish",
                 "type",
                 "priority",
+                "max_rate",
+                "max_bandwidth",
+                "max_age",
+                "compress",
+                "link",
                 "suite",
                 "description",
                 "author",
@@ -95,8 +113,28 @@ impl Table {
                 "unique",
                 "node",
             ],
-            Self::Use => &["from", "topic", "type", "publish", "token"],
+            Self::Use => &[
+                "from",
+                "topic",
+                "service",
+                "action",
+                "parameters",
+                "except",
+                "as",
+                "namespace",
+                "frame_prefix",
+                "type",
+                "publish",
+                "priority",
+                "max_rate",
+                "max_bandwidth",
+                "max_age",
+                "compress",
+                "token",
+                "link",
+            ],
             Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
+            Self::Transport => &["congestion", "offload", "mtu_discovery", "dscp", "lane_dscp"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],
@@ -109,39 +147,17 @@ impl Table {
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
             Self::Top => &["gateway", "profile"],
+            Self::Ros => &["enclave", "security_root"],
             Self::Node
-            | Self::Ros
             | Self::Router
+            | Self::Transport
             | Self::Admin
             | Self::Authority
             | Self::Rotation
             | Self::Audit
             | Self::Partner => &[],
-            Self::Share => &[
-                "service",
-                "action",
-                "max_rate",
-                "max_bandwidth",
-                "max_age",
-                "compress",
-                "encoding",
-                "link",
-                "as",
-                "namespace",
-                "except",
-            ],
-            Self::Use => &[
-                "priority",
-                "service",
-                "action",
-                "max_rate",
-                "max_bandwidth",
-                "max_age",
-                "link",
-                "as",
-                "namespace",
-                "except",
-            ],
+            Self::Share => &["encoding"],
+            Self::Use => &[],
         }
     }
 
@@ -222,7 +238,7 @@ mod tests {
         assert_eq!(nearest("tpoic", keys), Some("topic"));
         assert_eq!(nearest("Topics", keys), Some("topic"));
         assert_eq!(nearest("maintaner", keys), Some("maintainer"));
-        assert_eq!(nearest("name", keys), None);
+        assert_eq!(nearest("name", keys), Some("namespace"));
         assert_eq!(nearest("colour", keys), None);
         assert_eq!(nearest("domain", Table::Ros.keys()), Some("domain_id"));
         assert_eq!(nearest("localhost", &["OFF", "LOCALHOST"]), Some("LOCALHOST"));

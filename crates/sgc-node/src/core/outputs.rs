@@ -7,7 +7,7 @@ use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
-use super::{Core, EPOCH_GRACE, SUPERSEDED_MAX, now};
+use super::{Core, EPOCH_GRACE, SUPERSEDED_MAX, graph, now};
 use crate::audit::{AuditEvent, AuditRecord};
 
 impl<N: RosNetwork> Core<N> {
@@ -15,7 +15,8 @@ impl<N: RosNetwork> Core<N> {
         match output {
             RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
             RouterOutput::Send { link, frame } => {
-                let Some(entry) = self.links.get(&link) else { return };
+                let Some(entry) = self.links.get_mut(&link) else { return };
+                entry.heart.stir();
                 if !entry.control.send(frame) {
                     warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
                     self.control_drops.count_from("control_queue_full", link);
@@ -127,8 +128,9 @@ impl<N: RosNetwork> Core<N> {
             Event::Granted { name, sink, grant } => {
                 debug!(name = %name.short(), epoch = grant.epoch, "granted");
                 let entry = grant.entry.as_deref().cloned();
-                if self.publishing_granted(now, name, &grant) {
+                if let Some(anew) = self.publishing_granted(now, name, &grant) {
                     debug!(name = %name.short(), "publishing under it");
+                    self.call_granted(now, name, sink, grant, anew);
                 } else if let Some(local) = self.sinks.get(&name) {
                     local.grant(sink, grant, &self.data);
                     self.retire_due.insert(name, now.instant + EPOCH_GRACE);
@@ -144,12 +146,14 @@ impl<N: RosNetwork> Core<N> {
 
     /// What concerns the routes alone.
     pub(super) fn route_event(&mut self, now: Now, event: Event) {
+        self.calls_event(&event);
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer, role } => {
                 info!(peer = %peer.short(), "granted a subscriber");
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
-                if role == Role::Subscribe {
+                graph::forget_refusal(&mut self.refused, &name, &peer);
+                if role == Role::Subscribe || routes.is_service(&name) {
                     routes.handle_sink_joined(&name, sink);
                 }
             }
@@ -164,6 +168,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                graph::remember_refusal(&mut self.refused, name, peer, &reason);
                 if self.control_drops.count_from("join_refused", peer.short()) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
@@ -179,7 +184,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::Catalogue { owner, catalogue } => {
                 debug!(owner = %owner.short(), entries = catalogue.entries.len(), "catalogue");
-                routes.handle_catalogue(owner, catalogue);
+                routes.handle_catalogue(now.instant, owner, catalogue);
             }
             Event::OwnerLost { owner, reason } => {
                 info!(owner = %owner.short(), ?reason, "owner out of reach");

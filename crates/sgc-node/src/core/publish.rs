@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::{RecoveryLimits, Source, SourceConfig, Wish};
-use sgc_ros::RosNetwork;
+use sgc_ros::{RosNetwork, Shaping};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
 use tracing::warn;
@@ -25,6 +25,9 @@ pub(super) struct Offer {
     pub(super) suite: u8,
     pub(super) class: Class,
     pub(super) reliable: bool,
+    pub(super) shaping: Shaping,
+    /// True if it is a service, which is called.
+    pub(super) calls: bool,
 }
 
 /// What this node publishes under another's name.
@@ -41,7 +44,7 @@ pub(super) struct Publishing {
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` to let this node publish under it, at once or when there is a key to sign with.
     pub(super) fn publish_under(&mut self, name: Name, wanted: Offer) {
-        let Offer { owner, suite, class, reliable } = wanted;
+        let Offer { owner, suite, class, reliable, shaping, calls } = wanted;
         let Some(suite) = Suite::from_id(suite) else {
             warn!(suite, "a topic's suite is not in this build; this node cannot publish on it");
             return;
@@ -56,10 +59,14 @@ impl<N: RosNetwork> Core<N> {
         let id = self.endpoint.new_source_id();
         let (max, over) = (self.epoch_messages_max, self.epoch_over.clone());
         let share = LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over);
+        share.set_shaping(shaping);
         self.shares.insert(name, Arc::new(share));
         self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, Wish::Publish(offer));
+        if calls {
+            self.begin_called(name);
+        }
     }
 
     fn make_message_key(&self, suite: Suite) {
@@ -82,13 +89,15 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The owner lets this node publish, or begins a new epoch; false if this node does not publish under `name`.
-    pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> bool {
-        let Some(publishing) = self.publishing.get_mut(&name) else { return false };
+    /// The owner lets this node publish, or begins a new epoch; `None` if this node does not publish under `name`, and
+    /// true if the owner knows nothing of what was published before.
+    pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> Option<bool> {
+        let publishing = self.publishing.get_mut(&name)?;
         match &publishing.grant {
-            Some(known) if (known.epoch, &known.key) == (grant.epoch, &grant.key) => {}
+            Some(known) if (known.epoch, &known.key) == (grant.epoch, &grant.key) => Some(false),
             Some(known) if known.epoch < grant.epoch => {
                 publishing.next = Some((now.instant + REKEY_WAIT, grant.clone()));
+                Some(false)
             }
             // The owner started anew: another key, under which numbers begin again.
             Some(_) | None => {
@@ -111,9 +120,9 @@ impl<N: RosNetwork> Core<N> {
                     let shared = Some(SourceSlot::new(source, false, reliable));
                     share.set_map(SourceMap { shared, ..SourceMap::default() });
                 }
+                Some(true)
             }
         }
-        true
     }
 
     /// Publishes under the keys whose time has come.

@@ -1,33 +1,38 @@
 //! What the links measure: the router machine weighs ways by it, and leaves those that have fallen silent before
-//! their time-outs end them.
+//! their time-outs end them. When to ask a peer whether it is there is for [`crate::heart`] to say.
 
 use std::time::{Duration, Instant};
 
 use sgc_ros::RosNetwork;
 use sgc_router::LinkId;
-use sgc_transport::{AnyLink, Link};
+use sgc_transport::{AnyLink, CloseReason, Link};
+use sgc_wire::{Control, NodeId};
+use tracing::info;
 
-use super::{Core, now};
+use super::{Core, LinkEntry, now};
+use crate::heart::{Heart, Patience, Seen};
 
 /// How often links are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// After how long of silence a link seems dead. Each side sends something every second
-/// (`sgc_transport::LinkOptions::keep_alive`), and one of two may be lost.
-const SILENT_AFTER: Duration = Duration::from_millis(2500);
-
-/// When something came over a link last.
-pub(super) struct Pulse {
-    received_bytes: u64,
-    at: Instant,
-}
-
-impl Pulse {
-    pub(super) fn new(link: &AnyLink) -> Self {
-        Self { received_bytes: link.stats().received_bytes, at: Instant::now() }
-    }
-}
+/// Most peers of which it is remembered how soon their NATs forget.
+const IMPATIENT_MAX: usize = 1024;
 
 impl<N: RosNetwork> Core<N> {
+    /// How a link to this peer begins.
+    pub(super) fn heart_of(&self, link: &AnyLink) -> Heart {
+        let known = self.impatient.get(&link.peer().node_id);
+        let patience = Patience { max: known.copied().unwrap_or(self.patience.max), ..self.patience };
+        Heart::new(Instant::now(), patience, link.stats().received_bytes, link.remote())
+    }
+
+    /// Remembers of a link that ends how soon its peer has to be asked.
+    pub(super) fn remember_patience(&mut self, node: NodeId, patience: Patience) {
+        let is_known = self.impatient.contains_key(&node);
+        if patience.max < self.patience.max && (is_known || self.impatient.len() < IMPATIENT_MAX) {
+            self.impatient.insert(node, patience.max);
+        }
+    }
+
     /// Looks at all links, if that is due.
     pub(super) fn look_at_links(&mut self, at: Instant) {
         if self.look_due.is_none_or(|due| due > at) {
@@ -37,11 +42,8 @@ impl<N: RosNetwork> Core<N> {
         let now = now();
         for (id, entry) in &mut self.links {
             let stats = entry.link.stats();
-            if stats.received_bytes != entry.pulse.received_bytes {
-                entry.pulse = Pulse { received_bytes: stats.received_bytes, at };
-            }
-            let silent = at.saturating_duration_since(entry.pulse.at) >= SILENT_AFTER;
-            self.router.handle_link_quality(now, *id, stats.rtt, silent);
+            let verdict = entry.look(at, stats.received_bytes, stats.rtt);
+            self.router.handle_link_quality(now, *id, stats.rtt, verdict);
         }
     }
 
@@ -51,5 +53,23 @@ impl<N: RosNetwork> Core<N> {
         if let Some(entry) = self.links.get(&id) {
             self.router.handle_link_quality(now(), id, entry.link.stats().rtt, false);
         }
+    }
+}
+
+impl LinkEntry {
+    /// Looks at it, and asks the peer or gives it up if need be; true if it seems dead.
+    fn look(&mut self, at: Instant, received_bytes: u64, rtt: Duration) -> bool {
+        let (activity, remote) = (self.control.activity(), self.link.remote());
+        let verdict = self.heart.look(at, Seen { received_bytes, activity, remote, rtt });
+        if verdict.asks {
+            // If there is no room the peer does not take what is there, which is seen elsewhere.
+            self.control.send(Control::Pulse { answers: false });
+        }
+        if verdict.is_dead && self.closed_for.is_none() {
+            info!(%remote, peer = %self.link.peer().node_id.short(), "the peer does not answer; its link is closed");
+            self.closed_for = Some(CloseReason::Silent.to_string());
+            self.link.close(CloseReason::Silent);
+        }
+        verdict.is_silent
     }
 }

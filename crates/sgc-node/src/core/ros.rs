@@ -1,21 +1,30 @@
 //! What the routes want done: shares, joins, readers, writers, and the forwarding of their names.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use sgc_endpoint::{AskAgain, RecoveryLimits, Source, SourceConfig, Wish};
-use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Sample, SampleHandler};
+use sgc_ros::{
+    Command, EndpointSpec, Guid, RosNetwork, Sample, SampleHandler, Shaping, TF_MESSAGE, service_qos,
+};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, History, Name, Qos, SourceId};
+use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
 use tracing::{debug, error, warn};
 
 use super::publish::Offer;
-use super::{Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, drop_elsewhere, now};
+use super::{
+    Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT,
+    drop_elsewhere, now,
+};
 use crate::dataplane::{Forward, Out};
-use crate::outflow::OutFlow;
+use crate::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::sinks::{LocalSink, WriterQueue};
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
+
+/// Bytes of recovery kept of one publisher among many of a topic.
+const RECOVERY_BYTES_MIN: usize = 1 << 20;
 
 impl<N: RosNetwork> Core<N> {
     pub(super) fn carry_out(&mut self, command: Command) {
@@ -23,6 +32,7 @@ impl<N: RosNetwork> Core<N> {
         match command {
             Command::Share(spec) => {
                 let topic = spec.metadata.ros_name.clone();
+                let is_service = spec.metadata.kind == Kind::Service;
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
                         debug!(%topic, %name, "shared");
@@ -34,8 +44,32 @@ impl<N: RosNetwork> Core<N> {
                             self.epoch_over.clone(),
                         );
                         self.shares.insert(name, Arc::new(share));
+                        if is_service {
+                            self.begin_served(name);
+                        }
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
+                }
+            }
+            Command::Shape { name, shaping } => {
+                if let Some(share) = self.shares.get(&name) {
+                    let ages_as_before = share.shaping().max_age == shaping.max_age;
+                    share.set_shaping(shaping);
+                    if !ages_as_before {
+                        self.begin_flows_anew(name);
+                    }
+                }
+                if let Some(wanted) = self.keyless.get_mut(&name) {
+                    wanted.shaping = shaping;
+                }
+                // What others publish on a share of this node comes as they shape it.
+                if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
+                    sink.set_shaping(shaping);
+                }
+            }
+            Command::Frames { name, prefix } => {
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.set_frames(prefix);
                 }
             }
             Command::UpdateShare { name, qos, sources } => {
@@ -46,13 +80,15 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();
                 }
+                self.end_calls(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
                     sink.close();
                 }
             }
-            Command::MapSources { name, qos, class, own } => self.map_sources(name, &qos, class, own),
+            Command::MapSources { name, class, own } => self.map_sources(name, class, own),
             Command::OpenReader { name, spec } => self.open_reader(name, spec),
             Command::CloseReader { name } => {
+                self.graph.reader_gone(&name);
                 if let Some((_, Some(reader))) = self.readers.remove(&name) {
                     drop_elsewhere(reader);
                 }
@@ -67,12 +103,29 @@ impl<N: RosNetwork> Core<N> {
                 self.sinks.insert(name, Arc::new(sink));
                 self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
             }
-            Command::Publish { name, owner, suite, class, reliable } => {
-                self.publish_under(name, Offer { owner, suite, class, reliable });
+            Command::JoinAgain { name, owner } => {
+                self.endpoint.leave(now, &name);
+                self.endpoint.join(now, name, owner, Wish::Subscribe { describe: false });
             }
+            Command::Publish { name, owner, suite, class, reliable } => {
+                self.publish_under(
+                    name,
+                    Offer { owner, suite, class, reliable, shaping: Shaping::default(), calls: false },
+                );
+            }
+            Command::Call { name, owner, suite, class } => {
+                let shaping = Shaping::default();
+                self.publish_under(name, Offer { owner, suite, class, reliable: true, shaping, calls: true });
+            }
+            Command::OpenClient { name, spec } => self.open_client(name, spec),
+            Command::CloseClient { name } => self.close_client(&name),
+            Command::ServersGone { name } => self.servers_gone(&name),
+            Command::OpenServer { name, spec } => self.open_server(name, spec),
+            Command::CloseServer { name } => self.close_service_end(&name),
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
                 self.stop_publishing(&name);
+                self.end_calls(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
                     sink.close();
                 }
@@ -82,6 +135,7 @@ impl<N: RosNetwork> Core<N> {
             Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
             Command::CloseWriter { name, source } => {
                 self.writers.remove(&(name, source));
+                self.graph.writer_gone(&(name, source));
                 if let Some(source) = source {
                     self.history_due.remove(&(name, source));
                 }
@@ -89,28 +143,34 @@ impl<N: RosNetwork> Core<N> {
                     sink.set_writer(source, None);
                 }
             }
+            Command::MoveWriter { name, from, to } => self.move_writer(name, from, to),
+            Command::SetNode { name, source, owner, node } => {
+                self.graph.set_node((name, source), owner, node)
+            }
             Command::Report(problem) => warn!("{problem}"),
         }
     }
 
-    pub(super) fn map_sources(
-        &mut self,
-        name: Name,
-        qos: &Qos,
-        class: Class,
-        own: Vec<(Guid, SourceId, Qos)>,
-    ) {
+    pub(super) fn map_sources(&mut self, name: Name, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
         let (Some(share), Some(grant)) = (self.shares.get(&name).cloned(), self.endpoint.share_grant(&name))
         else {
             return;
         };
         let Some(message_key) = self.message_key(grant.suite) else { return };
         let old = share.map();
-        let slot = |id, qos: &Qos, keeps_history: bool| {
+        // What is answered is for one, and remembered call by call.
+        let is_service = self.calls.contains_key(&name);
+        let recovery = if is_service { RecoveryLimits::NONE } else { RecoveryLimits::default() };
+        // What is kept of a topic is not to grow with its publishers.
+        let share_of = |bytes: usize, sources: usize| (bytes / sources).max(RECOVERY_BYTES_MIN);
+        // Keys are in payloads, at which nobody looks here: what several instances keep is one row, as in the local writers.
+        let instances = if self.endpoint.is_keyed(&name) { KEYED_INSTANCES_KEPT } else { 1 };
+        let slot = |id, qos: &Qos, sources: usize| {
+            let keeps_history = qos.is_transient_local();
             let depth = match qos.history {
                 _ if !keeps_history => 0,
                 History::KeepAll => HISTORY_KEEP_ALL_MAX,
-                History::KeepLast(n) => n as usize,
+                History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
             };
             let config = SourceConfig {
                 name,
@@ -119,22 +179,27 @@ impl<N: RosNetwork> Core<N> {
                 reliable: qos.is_reliable(),
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
-                recovery: RecoveryLimits::default(),
+                recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
             };
             let source = Source::new(config, &grant, message_key.clone())?;
-            Some(SourceSlot::new(source, keeps_history, qos.is_reliable()))
+            let lifespan = qos.lifespan_ns.map(Duration::from_nanos);
+            Some(SourceSlot { lifespan, ..SourceSlot::new(source, keeps_history, qos.is_reliable()) })
         };
         // A source is never made twice under one id: its sequence numbers are nonces.
-        let mut map = SourceMap { per_writer: qos.is_transient_local(), ..SourceMap::default() };
+        let mut map = SourceMap { per_writer: !own.is_empty(), ..SourceMap::default() };
         for (guid, id, qos) in own {
             let kept = map.slot(&id).or_else(|| old.slot(&id));
-            if let Some(slot) = kept.or_else(|| slot(id, &qos, true)) {
+            let sources = map.own.len() + 1;
+            if let Some(slot) = kept.or_else(|| slot(id, &qos, sources)) {
                 map.own.insert(guid, slot);
             }
         }
-        let kept = old.shared.clone().filter(|s| s.reliable == qos.is_reliable());
-        map.shared = kept.or_else(|| slot(self.endpoint.new_source_id(), qos, false));
-        self.endpoint.set_sources(now(), &name, map.slots().map(|s| s.progress.clone()).collect());
+        if is_service {
+            let mut id = || self.endpoint.new_source_id();
+            map.shared = old.shared.clone().or_else(|| slot(id(), &service_qos(), 1));
+        }
+        let sources: BTreeMap<_, _> = map.slots().map(|s| (s.id, s.progress.clone())).collect();
+        self.endpoint.set_sources(now(), &name, sources.into_values().collect());
         share.set_map(map);
     }
 
@@ -160,6 +225,7 @@ impl<N: RosNetwork> Core<N> {
                     let _ = events.blocking_send(CoreEvent::ReaderReady {
                         name,
                         spec,
+                        guid: network.reader_guid(&reader),
                         reader: Box::new((reader, alive)),
                     });
                 }
@@ -177,9 +243,11 @@ impl<N: RosNetwork> Core<N> {
         self.writers.insert((name, source), spec.clone());
         let alive = self.alive.clone();
         let failures = self.ros_failures.clone();
+        let shaping = self.sinks.get(&name).map(|sink| sink.shaping()).unwrap_or_default();
+        let frames = self.sinks.get(&name).map(|sink| sink.frames()).filter(|_| spec.type_name == TF_MESSAGE);
         tokio::task::spawn_blocking(move || {
             let writer = network.create_writer(&spec).map_err(|e| e.to_string()).and_then(|writer| {
-                WriterQueue::spawn(writer, spec.topic.clone(), failures.clone(), alive)
+                WriterQueue::spawn(writer, &spec, shaping, frames, failures.clone(), alive)
                     .map_err(|e| e.to_string())
             });
             let writer = writer
@@ -190,6 +258,19 @@ impl<N: RosNetwork> Core<N> {
                 .ok();
             let _ = events.blocking_send(CoreEvent::WriterReady { name, source, spec, writer });
         });
+    }
+
+    /// Goes on with a writer for another source of the same publisher.
+    fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
+        let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
+        self.history_due.remove(&(name, from));
+        if self.sinks.get(&name).is_some_and(|sink| sink.move_writer(from, to)) {
+            self.graph.writer_moved(name, from, to);
+            self.writers.insert((name, Some(to)), spec);
+            return self.ask_histories(name);
+        }
+        // It is not there yet: whoever makes it finds that it is not wanted any more.
+        self.open_writer(name, Some(to), spec);
     }
 
     /// Asks for all that a sink's writers still lack.
@@ -220,9 +301,22 @@ impl<N: RosNetwork> Core<N> {
         self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
     }
 
+    /// Has what waits for links wait by other settings; what is queued is still sent.
+    fn begin_flows_anew(&mut self, name: Name) {
+        let Some((entry, _)) = self.entries.get(&name) else { return };
+        let entry = entry.clone();
+        for link in self.links.values_mut() {
+            if let Some(flow) = link.flows.remove(&name) {
+                flow.close();
+            }
+        }
+        self.set_forward(name, Some(entry));
+    }
+
     pub(super) fn set_forward(&mut self, name: Name, entry: Option<FibEntry>) {
         let Some(entry) = entry else {
             self.entries.remove(&name);
+            self.want_lanes(name);
             self.data.set(name, None);
             for link in self.links.values_mut() {
                 if let Some(flow) = link.flows.remove(&name) {
@@ -233,6 +327,9 @@ impl<N: RosNetwork> Core<N> {
         };
         let stats = self.entries.get(&name).map(|(_, stats)| stats.clone()).unwrap_or_default();
         let wanted = entry.links();
+        let max_age = self.shares.get(&name).and_then(|share| share.shaping().max_age);
+        let max_age = max_age.map_or(OUTFLOW_AGE_MAX, |max_age| max_age.min(OUTFLOW_AGE_MAX));
+        let waits = outflow::FlowLimits { max_age, ..outflow::FlowLimits::default() };
         let mut outs = Vec::new();
         for id in &wanted {
             if *id == LinkId::LOCAL {
@@ -241,9 +338,12 @@ impl<N: RosNetwork> Core<N> {
                 }
             } else if let Some(link) = self.links.get_mut(id) {
                 let (to, control) = (&link.link, &mut link.control);
-                let begin = || OutFlow::spawn(to.clone(), name, control.label(name));
+                let begin = || {
+                    let lanes = control.lanes().clone();
+                    OutFlow::spawn(to.clone(), name, control.label(name), lanes, waits)
+                };
                 let flow = link.flows.entry(name).or_insert_with(begin).clone();
-                outs.push((*id, Out::Link(flow)));
+                outs.push((*id, Out::Link(flow, link.control.activity().clone())));
             }
         }
         for (id, link) in &mut self.links {
@@ -255,5 +355,23 @@ impl<N: RosNetwork> Core<N> {
         }
         self.data.set(name, Some(Forward::new(entry.clone(), outs, stats.clone())));
         self.entries.insert(name, (entry, stats));
+        self.want_lanes(name);
+    }
+
+    /// Brings the lanes in line with where a name's packets go, and with what the user wants.
+    fn want_lanes(&self, name: Name) {
+        let dedicated = self.routes.as_ref().is_some_and(|routes| routes.is_dedicated(&name));
+        let entry = self.entries.get(&name).map(|(entry, _)| entry);
+        for (id, link) in &self.links {
+            let carries = |entry: &FibEntry| {
+                entry.links().contains(id) || entry.trees.iter().any(|tree| tree.up == *id)
+            };
+            link.control.lanes().set_wanted(name, dedicated && entry.is_some_and(carries));
+        }
+    }
+
+    /// The same for all names.
+    pub(super) fn want_all_lanes(&self) {
+        self.entries.keys().for_each(|name| self.want_lanes(*name));
     }
 }

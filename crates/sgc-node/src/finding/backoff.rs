@@ -8,7 +8,7 @@ use rand_core::RngCore;
 use tokio::time::Instant;
 
 /// The shortest wait, before jitter.
-const BACKOFF_MIN: Duration = Duration::from_millis(250);
+pub(super) const BACKOFF_MIN: Duration = Duration::from_millis(250);
 /// The longest wait for a router that the user, or his DNS, named.
 pub(crate) const BACKOFF_MAX: Duration = Duration::from_secs(10);
 /// How long nothing is tried where trying again soon is of no use.
@@ -68,7 +68,8 @@ pub(crate) fn wait(failures: u32, max: Duration, rng: &mut ChaCha20Rng) -> Durat
     jittered(doubled.min(max), rng)
 }
 
-fn jittered(wait: Duration, rng: &mut ChaCha20Rng) -> Duration {
+/// Between a half of it and all of it.
+pub(super) fn jittered(wait: Duration, rng: &mut ChaCha20Rng) -> Duration {
     wait.mul_f64(0.5 + f64::from(rng.next_u32()) / f64::from(u32::MAX) / 2.0)
 }
 

@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::Serialize;
+use sgc_transport::LinkUrl;
 use sgc_wire::NodeId;
 use tokio::time::Instant;
 
-use super::Aim;
+use super::{Aim, Passed};
 use crate::stats::Drops;
 
 /// A router that this node looks for, or looks for routers at.
@@ -25,6 +26,8 @@ pub struct RouterStatus {
     pub peer: Option<String>,
     /// Failures in a row.
     pub failures: u32,
+    /// Why the link does not take the first of several ways, if it does not.
+    pub why_not_first: Option<String>,
     /// What went wrong last, if anything did.
     pub last_failure: Option<String>,
     /// Seconds until the next attempt.
@@ -62,6 +65,7 @@ impl Board {
             state: "looking",
             peer: None,
             failures: 0,
+            why_not_first: None,
             last_failure: None,
             again_in_s: None,
         };
@@ -116,9 +120,9 @@ impl Line {
     }
 
     /// A link is up.
-    pub(crate) fn linked(&self, aim: &Aim, node: &NodeId) {
+    pub(crate) fn linked(&self, url: &LinkUrl, node: &NodeId) {
         self.change(|row, due| {
-            row.at = Some(aim.url.to_string());
+            row.at = Some(url.to_string());
             row.state = "linked";
             row.peer = Some(node.to_string());
             row.failures = 0;
@@ -126,11 +130,25 @@ impl Line {
         });
     }
 
+    /// What became of the ways that are better than the one in use.
+    pub(crate) fn passed_over(&self, better: &[LinkUrl], passed: &[Passed]) {
+        let of = |way: &LinkUrl| {
+            let why = passed.iter().find(|passed| passed.way == *way).map(|passed| passed.why.as_str());
+            // In a message of the transport the URL is in front already.
+            let why = why.unwrap_or("did not work last time");
+            let why = why.strip_prefix(&format!("{way}: ")).unwrap_or(why);
+            format!("{}: {why}", way.scheme)
+        };
+        let why = better.iter().map(of).collect::<Vec<_>>().join("; ");
+        self.change(|row, _| row.why_not_first = (!better.is_empty()).then_some(why));
+    }
+
     /// The link ended.
     pub(crate) fn ended(&self, why: &str) {
         self.change(|row, _| {
             row.state = "trying again";
             row.peer = None;
+            row.why_not_first = None;
             row.last_failure = Some(format!("link ended: {why}"));
         });
     }

@@ -132,6 +132,11 @@ impl Candidates {
         }
     }
 
+    /// The network is another: what failed there may work here.
+    pub(crate) fn forgive_all(&mut self) {
+        self.tried.clear();
+    }
+
     /// How many are announced.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {

@@ -6,14 +6,16 @@ use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError};
+use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
 use sgc_wire::NodeId;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
+use tracing::warn;
 
 use super::dns::DnsError;
-use super::{Aim, Claim, Claims, Dns, Line, Names as _};
+use super::{Aim, Claim, Claims, Dns, Line, Names as _, Passed, WayBook, ways};
 use crate::core::CoreEvent;
 use crate::links::keep_renewed;
+use crate::roaming::Network;
 
 /// How a link is made and kept; tests put something else in its place.
 pub(crate) trait Hold: Clone + Send + Sync + 'static {
@@ -27,6 +29,8 @@ pub(crate) trait Hold: Clone + Send + Sync + 'static {
     ) -> impl Future<Output = Outcome> + Send;
     /// Waits until there is no link to this node.
     fn released(&self, node: &NodeId) -> impl Future<Output = ()> + Send;
+    /// How the network changes from here on.
+    fn network(&self) -> Network;
     /// True once the node is stopping.
     fn is_over(&self) -> bool;
 }
@@ -65,6 +69,9 @@ pub(crate) enum Failure {
     /// Its name cannot be looked up.
     #[error(transparent)]
     Dns(#[from] DnsError),
+    /// None of several ways works.
+    #[error("{}", .0.iter().map(|(_, why)| why.to_string()).collect::<Vec<_>>().join("; "))]
+    Ways(Vec<(LinkUrl, Failure)>),
     /// Every place is taken.
     #[error("as many links as are wanted are up")]
     Enough,
@@ -85,7 +92,7 @@ pub(crate) enum Failure {
 impl Failure {
     /// True if trying again soon is of no use.
     pub(crate) fn stands_back(&self) -> bool {
-        !matches!(self, Self::Dial(_) | Self::Dns(_))
+        !matches!(self, Self::Dial(_) | Self::Dns(_) | Self::Ways(_))
     }
 }
 
@@ -95,22 +102,76 @@ pub(crate) struct Holder {
     /// This node.
     pub(crate) me: NodeId,
     pub(crate) dialer: Arc<Dialer>,
+    /// What connections of single topics are dialled with; mostly the same.
+    pub(crate) lane_dialer: Arc<Dialer>,
     pub(crate) dns: Dns,
     pub(crate) core: mpsc::Sender<CoreEvent>,
     /// Each change says that the credentials changed.
     pub(crate) redial: watch::Receiver<()>,
     pub(crate) claims: Claims,
+    /// How the network changes.
+    pub(crate) network: Network,
+    /// Which ways worked.
+    pub(crate) ways: WayBook,
+}
+
+/// A link that was dialled.
+pub(crate) struct Dialled {
+    pub(crate) link: AnyLink,
+    /// By which way.
+    pub(crate) url: LinkUrl,
+    /// The ways that were tried before.
+    pub(crate) passed: Vec<Passed>,
 }
 
 impl Holder {
-    /// Dials once.
-    pub(crate) async fn dial(&self, aim: &Aim) -> Result<AnyLink, Failure> {
-        let addresses = match (&aim.addresses[..], self.dns.is_chosen()) {
-            ([], false) => return Ok(self.dialer.dial(&aim.url).await?),
-            ([], true) => self.dns.addresses(&aim.url.host, aim.url.port).await?,
+    /// Dials once, by whichever way works, beginning with the one that did last.
+    pub(crate) async fn dial(&self, aim: &Aim) -> Result<Dialled, Failure> {
+        if let [] | [_] = &aim.ways[..] {
+            let link = self.dial_way(&aim.url, &aim.addresses).await?;
+            return Ok(Dialled { link, url: aim.url.clone(), passed: Vec::new() });
+        }
+        self.dial_first(&self.ways.in_order(&aim.ways)).await
+    }
+
+    /// Dials by the first of these ways that works.
+    pub(crate) async fn dial_first(&self, ways: &[LinkUrl]) -> Result<Dialled, Failure> {
+        let dial = |way: LinkUrl| {
+            let holder = self.clone();
+            async move { holder.dial_way(&way, &[]).await }
+        };
+        let (link, url, passed) = ways::first(ways, dial).await.map_err(Failure::Ways)?;
+        Ok(Dialled { link, url, passed })
+    }
+
+    async fn dial_way(&self, url: &LinkUrl, addresses: &[SocketAddr]) -> Result<AnyLink, Failure> {
+        let addresses = match (addresses, self.dns.is_chosen()) {
+            ([], false) => return Ok(self.dialer.dial(url).await?),
+            ([], true) => self.dns.addresses(&url.host, url.port).await?,
             (known, _) => known.to_vec(),
         };
-        Ok(self.dialer.dial_at(&aim.url, addresses).await?)
+        Ok(self.dialer.dial_at(url, addresses).await?)
+    }
+
+    /// Has the links of all go on from where the node is now, once after each change of the network.
+    pub(crate) fn rebind(&self) {
+        if !self.network.is_first() {
+            return;
+        }
+        let lanes = Some(&self.lane_dialer).filter(|lanes| !Arc::ptr_eq(lanes, &self.dialer));
+        let renewed = [Some(&self.dialer), lanes].into_iter().flatten().map(|dialer| dialer.rebind());
+        if let Err(error) = renewed.collect::<Vec<_>>().into_iter().collect::<Result<(), _>>() {
+            warn!(%error, "the network changed and no new socket could be opened; links keep the old one");
+        }
+    }
+
+    /// Says of a link that it is up, and remembers the way.
+    pub(crate) fn linked(&self, aim: &Aim, url: &LinkUrl, passed: &[Passed], node: &NodeId, line: &Line) {
+        line.linked(url, node);
+        line.passed_over(aim.better_than(url), passed);
+        if aim.ways.len() > 1 {
+            self.ways.worked_by(&aim.ways, url);
+        }
     }
 
     /// The claim on who answered, unless the one that is held covers it.
@@ -163,8 +224,8 @@ impl Hold for Holder {
         redial.mark_unchanged();
         let first = aim.borrow_and_update().clone();
         line.connecting(&first);
-        let link = match self.dial(&first).await {
-            Ok(link) => link,
+        let Dialled { link, url, passed } = match self.dial(&first).await {
+            Ok(dialled) => dialled,
             Err(why) => return Outcome::Failed(why),
         };
         let (node, remote) = (link.peer().node_id, link.remote());
@@ -175,7 +236,7 @@ impl Hold for Holder {
                 return Outcome::Failed(why);
             }
         };
-        line.linked(&first, &node);
+        self.linked(&first, &url, &passed, &node, line);
         let overtaken = async {
             if self.gives_way(wish, &node) {
                 self.claims.arrived(&node).await;
@@ -184,13 +245,17 @@ impl Hold for Holder {
             std::future::pending::<Infallible>().await
         };
         tokio::select! {
-            end = keep_renewed(link.clone(), aim, redial, self, claim, line) => Outcome::Ended { remote, end },
+            end = keep_renewed(link.clone(), url, aim, redial, self, claim, line) => Outcome::Ended { remote, end },
             never = overtaken => match never {},
         }
     }
 
     async fn released(&self, node: &NodeId) {
         self.claims.released(node).await;
+    }
+
+    fn network(&self) -> Network {
+        self.network.onward()
     }
 
     fn is_over(&self) -> bool {

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use sgc_transport::{LinkUrl, Scheme};
@@ -20,6 +21,8 @@ use super::{Aim, BACKOFF_MAX, Board, Failure, Hold, Line, LocalNetwork, Outcome,
 pub(crate) const LINKS_MAX: usize = 2;
 /// Most that are dialled at once.
 pub(crate) const DIALS_MAX: usize = 4;
+/// How often failures may be forgotten because the network changed, which neighbours can bring about.
+const FORGIVE_EVERY: Duration = Duration::from_secs(10);
 /// What was heard and not looked at yet.
 const HEARD_MAX: usize = 64;
 
@@ -102,6 +105,7 @@ pub(crate) async fn keep_links<H: Hold>(
     let mut elsewhere: JoinSet<Vec<SocketAddr>> = JoinSet::new();
     // Of each one waits at most, however often it is tried meanwhile.
     let mut waiting = BTreeSet::new();
+    let (mut network, mut forgiven) = (holder.network(), None::<Instant>);
     loop {
         let now = Instant::now();
         let mut is_full = true;
@@ -165,6 +169,13 @@ pub(crate) async fn keep_links<H: Hold>(
                 found.forgive(&released);
             }
             () = timer => {}
+            () = network.changed() => {
+                let now = Instant::now();
+                if forgiven.is_none_or(|at| now - at >= FORGIVE_EVERY) {
+                    forgiven = Some(now);
+                    found.forgive_all();
+                }
+            }
         }
     }
 }
@@ -175,10 +186,11 @@ async fn attempt<H: Hold>(addresses: Vec<SocketAddr>, wish: Wish, holder: H, boa
         scheme: Scheme::Quic,
         host: addresses.first().map(|first| first.ip().to_string()).unwrap_or_default(),
         port: addresses.first().map_or(0, SocketAddr::port),
+        path: None,
         cost_ms: None,
     };
     let line = board.line(&url, "mdns");
-    let (_fixed, aim) = watch::channel(Aim { url: url.clone(), addresses: addresses.clone() });
+    let (_fixed, aim) = watch::channel(Aim { addresses: addresses.clone(), ..Aim::from(url.clone()) });
     let outcome = holder.hold(aim, &wish, &line).await;
     match &outcome {
         Outcome::Ended { remote, end } => info!(%remote, "link ended: {end}"),

@@ -13,6 +13,7 @@ mod hold;
 mod local;
 mod mdns;
 mod srv;
+mod ways;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -25,16 +26,19 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
+use backoff::BACKOFF_MIN;
 pub(crate) use backoff::{BACKOFF_MAX, Backoff, wait};
 pub use board::RouterStatus;
 pub(crate) use board::{Board, Line};
 pub(crate) use claims::{Claim, Claims};
 pub(crate) use dns::{Dns, Names};
-pub(crate) use hold::{Failure, Hold, Holder, Outcome, Wish};
+pub(crate) use hold::{Dialled, Failure, Hold, Holder, Outcome, Wish};
 pub(crate) use local::LocalNetwork;
 pub(crate) use mdns::Wanted;
+pub(crate) use ways::{Climb, Passed, WayBook, is_over_udp};
 
 use crate::config::RouterUrl;
+use crate::roaming::Network;
 
 /// Somewhere to dial.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -43,11 +47,32 @@ pub(crate) struct Aim {
     pub(crate) url: LinkUrl,
     /// Its addresses, where they are known; if there are none the host is looked up.
     pub(crate) addresses: Vec<SocketAddr>,
+    /// Where there are several ways to the router, all of them, the best first; `url` is that one.
+    pub(crate) ways: Vec<LinkUrl>,
+}
+
+impl Aim {
+    /// A router with these ways, the best first; nothing if there are none.
+    pub(crate) fn by(ways: Vec<LinkUrl>) -> Option<Self> {
+        let url = ways.first()?.clone();
+        Some(Self { ways, ..Self::from(url) })
+    }
+
+    /// Every way, the best first.
+    pub(crate) fn ways(&self) -> &[LinkUrl] {
+        if self.ways.is_empty() { std::slice::from_ref(&self.url) } else { &self.ways }
+    }
+
+    /// The ways that are better than this one; none if it is not one of them.
+    pub(crate) fn better_than(&self, way: &LinkUrl) -> &[LinkUrl] {
+        let rank = self.ways().iter().position(|other| other == way);
+        &self.ways()[..rank.unwrap_or(0)]
+    }
 }
 
 impl From<LinkUrl> for Aim {
     fn from(url: LinkUrl) -> Self {
-        Self { url, addresses: Vec::new() }
+        Self { url, addresses: Vec::new(), ways: Vec::new() }
     }
 }
 
@@ -62,22 +87,20 @@ pub(crate) fn start(
     rng: &mut ChaCha20Rng,
 ) -> Vec<JoinHandle<()>> {
     let mut tasks = Vec::new();
-    let configured = configured.iter().map(|url| (url, "static"));
-    for (url, by) in configured.chain(of_tokens.iter().map(|url| (url, "token"))) {
-        let (holder, rng) = (holder.clone(), ChaCha20Rng::from_rng(rng));
-        match url {
-            RouterUrl::At(url) => {
-                let line = board.line(url, by);
-                tasks.push(tokio::spawn(keep_at(url.clone(), holder, line, rng)));
-            }
-            RouterUrl::Srv(domain) => {
-                let line = board.line(url, "srv");
-                let dns = holder.dns.clone();
-                tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, holder, line, rng)));
-            }
-            // Together, below.
-            RouterUrl::Mdns(_) => {}
+    for (urls, by) in [(configured, "static"), (of_tokens, "token")] {
+        for ways in ways::routers(urls) {
+            let (holder, rng) = (holder.clone(), ChaCha20Rng::from_rng(rng));
+            let Some(aim) = Aim::by(ways) else { continue };
+            let written = RouterUrl::by(aim.ways());
+            tasks.push(tokio::spawn(keep_at(aim, holder, board.line(written, by), rng)));
         }
+    }
+    for url in configured.iter().chain(of_tokens) {
+        // Those of the local network together, below.
+        let RouterUrl::Srv(domain) = url else { continue };
+        let (holder, rng) = (holder.clone(), ChaCha20Rng::from_rng(rng));
+        let (line, dns) = (board.line(url, "srv"), holder.dns.clone());
+        tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, holder, line, rng)));
     }
     if let Some((local, wanted)) = local {
         let (holder, rng) = (holder.clone(), ChaCha20Rng::from_rng(rng));
@@ -87,16 +110,19 @@ pub(crate) fn start(
 }
 
 /// Keeps a link to one router: dials, and dials again with patience and jitter whenever the link ends.
-pub(crate) async fn keep_at<H: Hold>(url: LinkUrl, holder: H, line: Line, mut rng: ChaCha20Rng) {
-    let (_fixed, aim) = watch::channel(Aim::from(url));
+pub(crate) async fn keep_at<H: Hold>(aim: impl Into<Aim>, holder: H, line: Line, mut rng: ChaCha20Rng) {
+    let (_fixed, aim) = watch::channel(aim.into());
     let mut backoff = Backoff::new(BACKOFF_MAX);
+    let mut network = holder.network();
     loop {
         let outcome = holder.hold(aim.clone(), &Wish::default(), &line).await;
         if holder.is_over() {
             return;
         }
         take_note(&outcome, &mut backoff, &line, &mut rng);
-        pause(&holder, &outcome, backoff.due()).await;
+        if pause(&holder, &outcome, backoff.due(), &mut network).await == Pause::Cut {
+            backoff = Backoff::new(BACKOFF_MAX);
+        }
     }
 }
 
@@ -130,16 +156,36 @@ fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &Line, rng: &mut Ch
     line.waits(backoff.due(), stands_back);
 }
 
-/// Waits until `due`, or until nobody else has the router that another way led to.
-async fn pause<H: Hold>(holder: &H, outcome: &Outcome, due: Option<Instant>) {
+/// How a pause ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pause {
+    /// As it was to.
+    Over,
+    /// By a change of the network, after which what failed before may work.
+    Cut,
+}
+
+/// Waits until `due`, until nobody else has the router that another way led to, or until the network is another.
+async fn pause<H: Hold>(holder: &H, outcome: &Outcome, due: Option<Instant>, network: &mut Network) -> Pause {
     let due = due.unwrap_or_else(Instant::now);
-    match outcome {
-        Outcome::Failed(Failure::Reached(node)) => tokio::select! {
-            () = sleep_until(due) => {}
-            () = holder.released(node) => {}
-        },
-        _ => sleep_until(due).await,
+    let released = async {
+        match outcome {
+            Outcome::Failed(Failure::Reached(node)) => holder.released(node).await,
+            _ => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        () = sleep_until(due) => Pause::Over,
+        () = released => Pause::Over,
+        () = another_network(network) => Pause::Cut,
     }
+}
+
+/// Waits until the network is another. A network that never rests cannot have attempts follow at once on each other.
+async fn another_network(network: &mut Network) {
+    let least = Instant::now() + BACKOFF_MIN;
+    network.changed().await;
+    sleep_until(least).await;
 }
 
 #[cfg(test)]

@@ -10,7 +10,9 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 use tracing::{info, warn};
 
-use super::{Aim, BACKOFF_MAX, Backoff, Failure, Hold, Line, Names, Outcome, Wish, pause, take_note};
+use super::{
+    Aim, BACKOFF_MAX, Backoff, Failure, Hold, Line, Names, Outcome, Wish, another_network, pause, take_note,
+};
 use crate::config::{RouterUrl, SrvDomain};
 
 /// Most targets of a domain that are taken, the best of them.
@@ -40,7 +42,7 @@ impl SrvTarget {
     }
 
     fn url(&self) -> LinkUrl {
-        LinkUrl { scheme: Scheme::Quic, host: self.host.clone(), port: self.port, cost_ms: None }
+        LinkUrl { scheme: Scheme::Quic, host: self.host.clone(), port: self.port, path: None, cost_ms: None }
     }
 }
 
@@ -133,6 +135,7 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
     let mut known =
         Known { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
     let mut tried: BTreeMap<LinkUrl, Backoff> = BTreeMap::new();
+    let mut network = holder.network();
     loop {
         if known.expires <= Instant::now() {
             line.looking_up();
@@ -159,7 +162,7 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
                 Outcome::Ended { .. } => break,
                 // The set has its link, by another way.
                 Outcome::Failed(Failure::Reached(_)) => {
-                    pause(&holder, &outcome, backoff.due()).await;
+                    pause(&holder, &outcome, backoff.due(), &mut network).await;
                     *backoff = Backoff::new(BACKOFF_MAX);
                     break;
                 }
@@ -176,14 +179,23 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
         let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(Instant::now)).min();
         let next = next.map_or(known.expires, |next| next.min(known.expires));
         line.waits(Some(next), false);
-        sleep_until(next).await;
+        tokio::select! {
+            () = sleep_until(next) => {}
+            () = another_network(&mut network) => {
+                tried.clear();
+                // An answer that is there stays good; that there was none says nothing of this network.
+                if known.answer.is_none() {
+                    known.expires = Instant::now();
+                }
+            }
+        }
     }
 }
 
 /// Where a target is now.
 async fn aim<N: Names>(target: &SrvTarget, names: &N) -> Result<Aim, Failure> {
     let addresses = names.addresses(&target.host, target.port).await?;
-    Ok(Aim { url: target.url(), addresses })
+    Ok(Aim { addresses, ..Aim::from(target.url()) })
 }
 
 /// Keeps a link to a target, and asks DNS meanwhile whether it still is one. If not, the link moves to one that is; as

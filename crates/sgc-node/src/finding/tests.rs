@@ -40,10 +40,12 @@ struct World {
     dials: Arc<Mutex<(usize, usize)>>,
     answer: Arc<Mutex<Result<SrvAnswer, DnsError>>>,
     asked: Arc<Mutex<Vec<Duration>>>,
+    network: (Arc<watch::Sender<u64>>, Network),
 }
 
 impl World {
     fn new() -> Self {
+        let (tell, network) = Network::told();
         Self {
             start: Instant::now(),
             hosts: Arc::default(),
@@ -52,6 +54,7 @@ impl World {
             dials: Arc::default(),
             answer: Arc::new(Mutex::new(Err(DnsError::NoRecord { name: "x".into() }))),
             asked: Arc::default(),
+            network: (Arc::new(tell), network),
         }
     }
 
@@ -145,6 +148,10 @@ impl Hold for World {
         }
     }
 
+    fn network(&self) -> Network {
+        self.network.1.onward()
+    }
+
     fn is_over(&self) -> bool {
         false
     }
@@ -161,6 +168,10 @@ impl Names for World {
     }
 }
 
+fn at(host: &str) -> LinkUrl {
+    format!("quic://{host}").parse().unwrap()
+}
+
 fn no_answer() -> DnsError {
     DnsError::NoAnswer { name: "x".into(), reason: "no answer".into() }
 }
@@ -174,7 +185,7 @@ async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
     let world = World::new();
     let board = Board::default();
     let line = board.line("quic://a", "static");
-    let keep = keep_at("quic://a".parse().unwrap(), world.clone(), line, ChaCha20Rng::seed_from_u64(1));
+    let keep = keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1));
     runs_for(200 * SECOND, keep).await;
     let dialled = world.dialled();
     let waits: Vec<_> = dialled.windows(2).map(|two| (two[1].0 - two[0].0).as_millis()).collect();
@@ -187,6 +198,47 @@ async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_failed_is_tried_at_once_on_another_network_but_not_without_a_pause() {
+    let world = World::new();
+    let line = Board::default().line("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    sleep(100 * SECOND).await;
+    world.set("a", Host::Up(3600 * SECOND));
+    let changed = world.start.elapsed();
+    world.network.0.send_modify(|change| *change += 1);
+    sleep(SECOND).await;
+    let last = world.dialled().last().unwrap().0;
+    assert!(last >= changed && last - changed < SECOND / 2 && world.up() == ["a"], "{last:?} {changed:?}");
+    task.abort();
+    // A network that changes all the time.
+    let world = World::new();
+    let line = Board::default().line("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    for _ in 0..10_000 {
+        sleep(SECOND / 1000).await;
+        world.network.0.send_modify(|change| *change += 1);
+    }
+    assert!((30..=81).contains(&world.dialled().len()), "{}", world.dialled().len());
+    task.abort();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_set_is_tried_anew_on_another_network() {
+    let world = World::new();
+    *world.answer.lock().unwrap() = Err(no_answer());
+    let (task, _board) = world.keep_one();
+    sleep(100 * SECOND).await;
+    world.answers(3600 * SECOND, &[(10, "a")]);
+    world.set("a", Host::Up(3600 * SECOND));
+    let changed = world.start.elapsed();
+    world.network.0.send_modify(|change| *change += 1);
+    sleep(SECOND).await;
+    assert!(world.asked().last().unwrap() >= &changed, "{:?}", world.asked());
+    assert_eq!(world.up(), ["a"]);
+    task.abort();
+}
+
+#[tokio::test(start_paused = true)]
 async fn nodes_that_lose_one_router_come_back_at_different_moments() {
     let mut second = BTreeSet::new();
     for seed in 0..20 {
@@ -194,7 +246,7 @@ async fn nodes_that_lose_one_router_come_back_at_different_moments() {
         world.set("a", Host::Up(SECOND));
         let line = Board::default().line("quic://a", "static");
         let rng = ChaCha20Rng::seed_from_u64(seed);
-        runs_for(2 * SECOND, keep_at("quic://a".parse().unwrap(), world.clone(), line, rng)).await;
+        runs_for(2 * SECOND, keep_at(at("a"), world.clone(), line, rng)).await;
         second.insert(world.dialled()[1].0.as_millis());
     }
     assert!(second.len() > 10 && second.iter().all(|at| (1125..=1253).contains(at)), "{second:?}");

@@ -19,7 +19,7 @@ use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::LockedFleet;
 use sgc_node::audit::{self, AuditRecord};
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_testkit::FakeDomain;
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, Identity, Suite};
@@ -145,7 +145,7 @@ impl Lab {
     }
 
     pub fn cloud_with(&self, change: impl FnOnce(&mut Config)) -> Node {
-        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
+        let addr = ListenAddr::new(Scheme::Quic, ([127, 0, 0, 1], self.port).into());
         let mut config = Config { routers: vec![], listen: vec![addr], ..self.config("cloud") };
         change(&mut config);
         Node::start(config, self.identity("cloud"), None)
@@ -196,18 +196,33 @@ pub fn nodes(names: &[&str]) -> Vec<Recipient> {
 
 pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
     ShareConfig {
+        interface: Default::default(),
         topic: topic.into(),
+        naming: Default::default(),
         type_name: None,
         to: nodes(to),
         publish: vec![],
         priority: Class::Default,
+        shaping: Shaping::default(),
+        dedicated: false,
         suite: Suite::DEFAULT,
         metadata: ShareMetadata::default(),
     }
 }
 
 pub fn uses(topic: &str) -> UseConfig {
-    UseConfig { publish: false, from: "robot".parse().unwrap(), topic: topic.into(), type_name: None }
+    UseConfig {
+        interface: Default::default(),
+        publish: false,
+        from: "robot".parse().unwrap(),
+        topic: topic.into(),
+        naming: Default::default(),
+        frame_prefix: None,
+        type_name: None,
+        priority: None,
+        shaping: Shaping::default(),
+        dedicated: false,
+    }
 }
 
 /// Says 1, 2, 3, … about a thousand times a second, until it is told to end.

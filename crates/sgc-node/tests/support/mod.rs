@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_node::{ConfigSource, RunOptions, run_on};
 use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
@@ -66,6 +66,34 @@ impl Node {
         domain: Option<&FakeDomain>,
         mdns_port: Option<u16>,
     ) -> Self {
+        let file = Arc::new(Mutex::new(config.clone()));
+        let read = file.clone();
+        let source: ConfigSource = Arc::new(move || Ok(read.lock().unwrap().clone()));
+        let options = RunOptions { source: Some(source), mdns_port, ..RunOptions::default() };
+        Self::start_with(config, identity, domain, options, file)
+    }
+
+    /// As `source` reads it from `file`, which it watches.
+    pub fn start_watched(
+        source: ConfigSource,
+        file: &std::path::Path,
+        identity: Arc<Identity>,
+        domain: &FakeDomain,
+    ) -> Self {
+        let config = source().unwrap();
+        let unused = Arc::new(Mutex::new(config.clone()));
+        let options =
+            RunOptions { source: Some(source), file: Some(file.to_owned()), ..RunOptions::default() };
+        Self::start_with(config, identity, Some(domain), options, unused)
+    }
+
+    fn start_with(
+        config: Config,
+        identity: Arc<Identity>,
+        domain: Option<&FakeDomain>,
+        options: RunOptions,
+        file: Arc<Mutex<Config>>,
+    ) -> Self {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let (stop, stopped) = oneshot::channel::<()>();
@@ -73,12 +101,8 @@ impl Node {
         let (done, ended) = channel();
         let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
-        let file = Arc::new(Mutex::new(config.clone()));
-        let read = file.clone();
-        let source: ConfigSource = Arc::new(move || Ok(read.lock().unwrap().clone()));
+        let options = RunOptions { ready: Some(ready), ..options };
         runtime.spawn(async move {
-            let options =
-                RunOptions { ready: Some(ready), source: Some(source), mdns_port, ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };
@@ -199,7 +223,7 @@ impl Trio {
     }
 
     pub fn cloud_with(&self, change: impl FnOnce(&mut Config)) -> Node {
-        let addr = ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], self.port).into() };
+        let addr = ListenAddr::new(Scheme::Quic, ([127, 0, 0, 1], self.port).into());
         let mut config = Config { routers: vec![], listen: vec![addr], ..self.config() };
         change(&mut config);
         let node = Node::start(config, identity("cloud", true), None);
@@ -215,11 +239,15 @@ impl Trio {
         let shares = topics
             .iter()
             .map(|topic| ShareConfig {
+                interface: Default::default(),
                 topic: (*topic).into(),
+                naming: Default::default(),
                 type_name: None,
                 to: vec![Recipient::Node(to.parse().unwrap())],
                 publish: vec![],
                 priority: Class::Default,
+                shaping: Shaping::default(),
+                dedicated: false,
                 suite,
                 metadata: ShareMetadata::default(),
             })
@@ -236,10 +264,16 @@ impl Trio {
         let uses = topics
             .iter()
             .map(|topic| UseConfig {
+                interface: Default::default(),
                 publish: false,
                 from: "robot".parse().unwrap(),
                 topic: (*topic).into(),
+                naming: Default::default(),
+                frame_prefix: None,
                 type_name: None,
+                priority: None,
+                shaping: Shaping::default(),
+                dedicated: false,
             })
             .collect();
         let config = Config { uses, ..self.config() };
@@ -274,7 +308,8 @@ impl Talker {
     }
 
     pub fn say(&self, payload: impl Into<Bytes>) {
-        self.writer.write(SampleKind::Write, 1, payload.into()).unwrap();
+        let dated = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+        self.writer.write(SampleKind::Write, dated.as_nanos() as i64, payload.into()).unwrap();
     }
 
     pub fn wait_for_readers(&self, n: u32) {

@@ -4,10 +4,9 @@
 //! this node publish. A share route on which others may publish has a local writer while any of them is there.
 
 use rand_core::RngCore;
-use sgc_trust::derive_name;
 use sgc_wire::{Metadata, Name, Qos};
 
-use super::{Command, Direction, Routes, ShareRoute, same_reader};
+use super::{Cause, Command, Direction, Routes, Shaping, same_reader};
 use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
@@ -16,8 +15,11 @@ impl<R: RngCore> Routes<R> {
     /// Others than this node publish on one of its shares, or none any more.
     pub fn handle_publishers(&mut self, name: &Name, any: bool) {
         let Some(share) = self.shares.get_mut(name) else { return };
+        if self.share_rules[share.rule].is_service() {
+            return;
+        }
         let spec = any.then(|| EndpointSpec {
-            topic: dds_topic(&self.share_rules[share.rule].metadata.ros_name),
+            topic: dds_topic(&share.local_name),
             type_name: share.type_name.clone(),
             keyless: share.keyless,
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
@@ -31,23 +33,37 @@ impl<R: RngCore> Routes<R> {
             None => Command::CloseWriter { name: *name, source: None },
         });
         share.writer = spec;
+        self.check_later();
     }
 
     /// Begins the shares that are there for what others publish, whether anyone here does or not. Their type has to be
     /// given, since no local publisher shows it.
     pub(super) fn begin_inbound(&mut self) {
-        for (rule, share) in self.share_rules.iter().enumerate() {
-            let Metadata { type_name, .. } = &share.metadata;
+        for rule in 0..self.share_rules.len() {
+            let share = &self.share_rules[rule];
+            let Metadata { type_name, ros_name, .. } = &share.metadata;
             let known = self.shares.values().any(|s| s.rule == rule && ros_type(&s.type_name) == *type_name);
-            if known || type_name.is_empty() || share.policy.publish.is_empty() {
+            if known || type_name.is_empty() || !share.is_inbound() || share.is_pattern() {
                 continue;
             }
-            let name = derive_name(&self.secret, &self.node, &share.metadata);
-            let (spec, route) = ShareRoute::begin(name, rule, share, &dds_type(type_name), true, None);
-            self.shares.insert(name, route);
-            self.commands.push_back(Command::Share(spec));
-            self.refresh_share(name);
-            return self.begin_inbound();
+            let (topic, type_name) = (ros_name.clone(), dds_type(type_name));
+            if let Some(problem) = self.begin_share(rule, &topic, type_name, true, None) {
+                self.report(Cause::Inbound, problem);
+            }
+        }
+    }
+
+    /// What begins goes unshaped unless it is told otherwise.
+    pub(super) fn shape(&mut self, name: Name, shaping: Shaping) {
+        if shaping != Shaping::default() {
+            self.commands.push_back(Command::Shape { name, shaping });
+        }
+    }
+
+    /// Frames have no prefix unless it is told.
+    pub(super) fn frames(&mut self, name: Name, prefix: Option<String>) {
+        if prefix.is_some() {
+            self.commands.push_back(Command::Frames { name, prefix });
         }
     }
 
@@ -57,9 +73,8 @@ impl<R: RngCore> Routes<R> {
             self.uses.iter().filter(|(_, u)| self.publishes(u.rule)).map(|(n, _)| *n).collect();
         for name in names {
             let Some(route) = self.uses.get_mut(&name) else { continue };
-            let metadata = &route.entry.metadata;
-            if ros_topic(&writer.topic) == Some(&metadata.ros_name)
-                && ros_type(&writer.type_name) == metadata.type_name
+            if ros_topic(&writer.topic) == Some(route.local_name.as_str())
+                && ros_type(&writer.type_name) == route.entry.metadata.type_name
             {
                 route.local.insert(writer.guid, writer.clone());
                 self.refresh_publisher(name);
@@ -93,10 +108,13 @@ impl<R: RngCore> Routes<R> {
     /// Brings the local reader of a route that publishes in line with its local writers.
     pub(super) fn refresh_publisher(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
+        if self.use_rules[route.rule].is_service() {
+            return self.refresh_server(name);
+        }
         let offer = weakest(route.local.values().map(|w| &w.qos));
         let metadata = &route.entry.metadata;
         let spec = offer.map(|offer| EndpointSpec {
-            topic: dds_topic(&metadata.ros_name),
+            topic: dds_topic(&route.local_name),
             type_name: dds_type(&metadata.type_name),
             keyless: route.entry.keyless,
             type_hash: route.entry.type_hash.clone(),

@@ -6,31 +6,34 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use rand_core::RngCore;
-use sgc_wire::{Metadata, Name, NodeId};
+use sgc_wire::{Name, NodeId};
 
-use super::{Command, Routes, ShareRule, UseRule};
+use super::{Cause, Command, Direction, Routes, ShareRule, UseRule};
 use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 
 impl<R: RngCore> Routes<R> {
     /// The user wants something else from now on. What is as it was is not touched.
     ///
-    /// Rules for shares are told apart by topic, those for uses by owner and topic.
+    /// Each route goes on under whichever rule covers its interface now, if that rule wants it as it is.
     pub fn reconfigure(&mut self, now: Instant, shares: Vec<ShareRule>, uses: Vec<UseRule>) {
-        self.reconfigure_shares(now, shares);
+        // Uses are judged by what is shared from now on, and shares by what is used then.
+        let old = std::mem::replace(&mut self.share_rules, shares);
         self.reconfigure_uses(uses);
+        self.reconfigure_shares(now, &old);
+        self.check_later();
         self.handle_timeout(now);
     }
 
-    fn reconfigure_shares(&mut self, now: Instant, rules: Vec<ShareRule>) {
-        let old = std::mem::replace(&mut self.share_rules, rules);
-        let place = |topic: &str| self.share_rules.iter().position(|r| r.metadata.ros_name == topic);
+    fn reconfigure_shares(&mut self, now: Instant, old: &[ShareRule]) {
         let (mut gone, mut kept) = (Vec::new(), Vec::new());
         for (name, route) in &self.shares {
             let before = &old[route.rule];
-            match place(&before.metadata.ros_name) {
-                Some(index) if continues(before, &self.share_rules[index], &ros_type(&route.type_name)) => {
-                    kept.push((*name, index, before.policy != self.share_rules[index].policy));
+            let (local_name, type_name) = (&route.local_name, ros_type(&route.type_name));
+            let kind = before.metadata.kind;
+            match self.share_rule(kind, local_name, Some(&type_name)) {
+                Some(index) if continues(before, &self.share_rules[index], local_name, &type_name) => {
+                    kept.push((*name, index, before.clone()));
                 }
                 _ => gone.push(*name),
             }
@@ -38,15 +41,18 @@ impl<R: RngCore> Routes<R> {
         for name in gone {
             self.drop_share(name);
         }
-        for (name, index, is_changed) in kept {
+        for (name, index, before) in kept {
             let Some(route) = self.shares.get_mut(&name) else { continue };
             route.rule = index;
-            if route.writers.is_empty() && self.share_rules[index].policy.publish.is_empty() {
+            if route.writers.is_empty() && !self.share_rules[index].is_inbound() {
                 route.writerless_until.get_or_insert(now);
             }
-            if is_changed {
-                let policy = self.share_rules[index].policy.clone();
-                self.commands.push_back(Command::UpdatePolicy { name, policy });
+            let ShareRule { policy, shaping, .. } = &self.share_rules[index];
+            if *policy != before.policy {
+                self.commands.push_back(Command::UpdatePolicy { name, policy: policy.clone() });
+            }
+            if *shaping != before.shaping {
+                self.commands.push_back(Command::Shape { name, shaping: *shaping });
             }
         }
         self.begin_inbound();
@@ -54,7 +60,9 @@ impl<R: RngCore> Routes<R> {
         let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
         for writer in self.endpoints.values().filter(is_new).cloned().collect::<Vec<_>>() {
-            self.writer_there(writer);
+            if !self.service_end_there(&writer) {
+                self.writer_there(writer);
+            }
         }
     }
 
@@ -65,21 +73,42 @@ impl<R: RngCore> Routes<R> {
         let tokens = self.tokens.iter().map(|(name, token)| (*name, token.rule));
         let places: BTreeMap<Name, usize> = joined.chain(tokens).collect();
         for (name, index) in places {
-            let place = self.use_rules.iter().position(|r| r.is_same_place(&old[index]));
-            let found = self.uses.get(&name).map(|route| &route.entry.metadata.type_name);
-            let fits = |rule: &UseRule| match (&rule.type_name, found) {
-                (Some(wanted), Some(found)) => wanted == found,
-                _ => true,
+            let route = self.uses.get(&name);
+            let place = match route.filter(|_| old[index].token.is_none()) {
+                Some(route) => self
+                    .use_rule(&old[index].owner, &route.entry)
+                    .filter(|place| self.why_not_used(*place, &route.entry.metadata).is_none()),
+                None => self.use_rules.iter().position(|r| r.is_same_place(&old[index])),
             };
-            match place.filter(|place| fits(&self.use_rules[*place])) {
-                Some(place) => kept.push((name, place)),
+            let fits = |rule: &UseRule| {
+                let (same_way, wanted) = (rule.direction == old[index].direction, rule.type_name.as_ref());
+                same_way
+                    && route.is_none_or(|route| {
+                        let metadata = &route.entry.metadata;
+                        wanted.is_none_or(|wanted| *wanted == metadata.type_name)
+                            && rule.local_name(metadata) == route.local_name
+                    })
+            };
+            // What is published begins anew in another class.
+            let same_class =
+                |rule: &UseRule| rule.direction == Direction::Bring || rule.class == old[index].class;
+            let stays = |place: &usize| fits(&self.use_rules[*place]) && same_class(&self.use_rules[*place]);
+            match place.filter(stays) {
+                Some(place) => kept.push((name, place, index)),
                 None => gone.push(name),
             }
         }
         for name in gone {
             self.drop_use(name);
         }
-        for (name, place) in kept {
+        for (name, place, before) in kept {
+            let UseRule { shaping, frame_prefix, .. } = &self.use_rules[place];
+            if *shaping != old[before].shaping {
+                self.commands.push_back(Command::Shape { name, shaping: *shaping });
+            }
+            if *frame_prefix != old[before].frame_prefix {
+                self.commands.push_back(Command::Frames { name, prefix: frame_prefix.clone() });
+            }
             if let Some(route) = self.uses.get_mut(&name) {
                 route.rule = place;
             }
@@ -94,30 +123,27 @@ impl<R: RngCore> Routes<R> {
         let (before, after) = (owners(&old), owners(&self.use_rules));
         for owner in before.keys().filter(|owner| !after.contains_key(owner)).copied() {
             self.catalogues.remove(&owner);
+            self.settle(Cause::Catalogue(owner), BTreeSet::new());
             self.owners.remove(&owner);
+            self.settling.remove(&owner);
             self.commands.push_back(Command::Unfollow { owner });
         }
         for (owner, owner_name) in after {
             if !before.contains_key(&owner) {
                 self.commands.push_back(Command::Follow { owner_name });
-            } else if old != self.use_rules
-                && let Some(catalogue) = self.catalogues.get(&owner).cloned()
-            {
+            } else if let Some(catalogue) = self.catalogues.get(&owner).cloned() {
                 // What the owner lists already may be what a new rule asks for. Known entries change nothing.
-                let out_of_reach = self.owners.remove(&owner);
-                self.handle_catalogue(owner, catalogue);
-                self.owners.extend(out_of_reach.map(|state| (owner, state)));
+                self.list(owner, catalogue);
             }
         }
         self.join_tokens();
     }
 }
 
-/// Whether a share of this type goes on under a changed rule: only its policy may differ.
-fn continues(before: &ShareRule, after: &ShareRule, type_name: &str) -> bool {
-    let untyped = |rule: &ShareRule| Metadata { type_name: String::new(), ..rule.metadata.clone() };
+/// Whether a share of this type goes on under a changed rule: only its policy and shaping may differ.
+fn continues(before: &ShareRule, after: &ShareRule, local_name: &str, type_name: &str) -> bool {
     let wanted = &after.metadata.type_name;
     (wanted.is_empty() || wanted == type_name)
-        && untyped(before) == untyped(after)
+        && before.metadata_of(local_name, type_name) == after.metadata_of(local_name, type_name)
         && (before.suite, before.class) == (after.suite, after.class)
 }

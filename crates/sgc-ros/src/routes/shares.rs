@@ -5,15 +5,16 @@ use std::time::Instant;
 
 use rand_core::RngCore;
 use sgc_trust::derive_name;
-use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Metadata, Name, Qos, SinkId};
+use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Name, Qos, SinkId, SourceId};
 
+use super::services::interface;
 use super::{
-    Command, Problem, Routes, SINKLESS_HOLD, ShareRoute, WRITERLESS_HOLD, describe, random_source,
-    same_reader,
+    Cause, Command, OwnSource, Problem, ROUTES_PER_WILDCARD_MAX, Routes, SINKLESS_HOLD, ShareRoute,
+    WRITERLESS_HOLD, describe, same_reader, source_of,
 };
-use crate::names::{dds_topic, ros_topic, ros_type};
-use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
-use crate::qos::{reader_for, weakest};
+use crate::names::{dds_topic, is_topic_name, ros_type};
+use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid};
+use crate::qos::{of_all_instances, reader_for, service_qos, weakest};
 
 impl<R: RngCore> Routes<R> {
     /// A sink was granted one of our shares.
@@ -35,36 +36,81 @@ impl<R: RngCore> Routes<R> {
     }
 
     pub(super) fn writer_there(&mut self, writer: DiscoveredEndpoint) {
-        self.check_local(&writer);
-        self.publisher_there(&writer);
-        let Some(topic) = ros_topic(&writer.topic) else { return };
+        if matches!(interface(&writer.topic), Some((Kind::Topic, _))) {
+            self.check_local(&writer);
+            self.publisher_there(&writer);
+        }
+        self.share_writer(writer);
+    }
+
+    /// Shares what a local writer writes, if a rule says so.
+    pub(super) fn share_writer(&mut self, writer: DiscoveredEndpoint) {
+        let guid = writer.guid;
+        let problem = self.share_or_say_why_not(writer);
+        self.settle(Cause::Unshared(guid), problem.into_iter().collect());
+    }
+
+    fn share_or_say_why_not(&mut self, writer: DiscoveredEndpoint) -> Option<Problem> {
+        let (kind, topic) = interface(&writer.topic)?;
+        let topic = topic.to_owned();
         let found = ros_type(&writer.type_name);
-        let Some((rule, share)) =
-            self.share_rules.iter().enumerate().find(|(_, s)| s.metadata.ros_name == topic)
-        else {
-            return;
+        let Some(rule) = self.share_rule(kind, &topic, Some(&found)) else {
+            let problem = self.why_not_shared(kind, &topic, &found);
+            self.waits |= problem.is_some();
+            return problem;
         };
+        let share = &self.share_rules[rule];
         let expected = &share.metadata.type_name;
+        // `check_local` has said so.
         if !expected.is_empty() && *expected != found {
-            let problem = Problem::ShareType { topic: topic.to_owned(), expected: expected.clone(), found };
-            return self.report(problem);
+            return None;
         }
         // One that runs keeps its name, also after the secret that names come from was replaced.
         if let Some(route) =
-            self.shares.values_mut().find(|s| s.rule == rule && s.type_name == writer.type_name)
+            self.shares.values_mut().find(|s| s.rule == rule && s.fits(&topic, &writer.type_name))
         {
             route.writers.insert(writer.guid, writer);
             route.writerless_until = None;
             let name = route.name;
-            return self.refresh_share(name);
+            self.refresh_share(name);
+            return None;
         }
-        let metadata = Metadata { type_name: found, ..share.metadata.clone() };
+        self.begin_share(rule, &topic, writer.type_name.clone(), writer.keyless, Some(writer))
+    }
+
+    /// Begins a share with this first writer, or with none, unless its name or number forbids it: why.
+    pub(super) fn begin_share(
+        &mut self,
+        rule: usize,
+        topic: &str,
+        type_name: String,
+        keyless: bool,
+        writer: Option<DiscoveredEndpoint>,
+    ) -> Option<Problem> {
+        let share = &self.share_rules[rule];
+        let metadata = share.metadata_of(topic, &ros_type(&type_name));
         let name = derive_name(&self.secret, &self.node, &metadata);
-        let (type_name, keyless) = (writer.type_name.clone(), writer.keyless);
-        let (spec, route) = ShareRoute::begin(name, rule, share, &type_name, keyless, Some(writer));
+        let problem = if !is_topic_name(&metadata.ros_name) {
+            Some(Problem::NoSharedName { topic: topic.to_owned(), called: metadata.ros_name })
+        } else if let Some(other) = self.shares.get(&name) {
+            let (topic, other) = (topic.to_owned(), other.local_name.clone());
+            Some(Problem::SharedAsOne { topic, called: metadata.ros_name, other })
+        } else {
+            let running = || self.shares.values().filter(|s| s.rule == rule).count();
+            (share.is_pattern() && running() >= ROUTES_PER_WILDCARD_MAX)
+                .then(|| Problem::TooManyMatches { topic: share.metadata.ros_name.clone(), verb: "shared" })
+        };
+        if problem.is_some() {
+            self.waits = true;
+            return problem;
+        }
+        let shaping = share.shaping;
+        let (spec, route) = ShareRoute::begin(name, rule, share, topic, &type_name, keyless, writer);
         self.shares.insert(name, route);
         self.commands.push_back(Command::Share(spec));
+        self.shape(name, shaping);
         self.refresh_share(name);
+        None
     }
 
     pub(super) fn writer_gone(&mut self, now: Instant, endpoint: &DiscoveredEndpoint) {
@@ -77,12 +123,21 @@ impl<R: RngCore> Routes<R> {
         for name in names {
             let Some(share) = self.shares.get_mut(&name) else { continue };
             share.writers.remove(&endpoint.guid);
+            match share.own.get_mut(&endpoint.guid) {
+                Some(own) if !own.qos.is_transient_local() => own.gone = Some(now),
+                // Late joiners are given nothing of a publisher that is no more. That all are gone is seen after the
+                // hold.
+                _ if !share.writers.is_empty() => drop(share.own.remove(&endpoint.guid)),
+                _ => share.own.clear(),
+            }
             if share.writers.is_empty() {
                 // What was offered stands until the hold ends: a restarted program finds it as it was.
-                share.own.clear();
                 // One that others publish on is there without.
-                if self.share_rules[share.rule].policy.publish.is_empty() {
+                if !self.share_rules[share.rule].is_inbound() {
                     share.writerless_until = Some(now + WRITERLESS_HOLD);
+                    if self.share_rules[share.rule].is_service() {
+                        self.commands.push_back(Command::ServersGone { name });
+                    }
                     continue;
                 }
             }
@@ -95,46 +150,58 @@ impl<R: RngCore> Routes<R> {
         let Some(share) = self.shares.get_mut(&name) else { return };
         let offer = match weakest(share.writers.values().map(|w| &w.qos)) {
             Some(offer) => offer,
-            None if self.share_rules[share.rule].policy.publish.is_empty() => return,
+            None if !self.share_rules[share.rule].is_inbound() => return,
             // What the publishers elsewhere offer is not known here; ROS 2's default serves commands well.
             None => Qos::default(),
         };
-        share.own.retain(|guid, _| share.writers.contains_key(guid));
-        let mut problem = None;
-        if offer.is_transient_local() {
-            let mut known: BTreeSet<_> = share.own.values().copied().collect();
-            for guid in
-                share.writers.keys().filter(|guid| !share.own.contains_key(guid)).copied().collect::<Vec<_>>()
-            {
-                let source = match known.last() {
-                    Some(last) if known.len() >= ENTRY_SOURCES_MAX => {
-                        let topic = self.share_rules[share.rule].metadata.ros_name.clone();
-                        problem = Some(Problem::TooManySources { topic });
-                        *last
+        let transient_local = offer.is_transient_local();
+        // Answers have one source for all servers.
+        let is_service = self.share_rules[share.rule].is_service();
+        share.own.retain(|_, own| own.gone.is_none() || !transient_local);
+        let mut problems = BTreeSet::new();
+        for (guid, writer) in share.writers.iter().filter(|_| !is_service) {
+            let qos = carried(&writer.qos, &offer);
+            match share.own.get_mut(guid) {
+                // Another kind of source is another source.
+                Some(own) if own.gone.is_none() && same_kind(&own.qos, &qos) => own.qos = qos,
+                _ => {
+                    share.own.remove(guid);
+                    let mut new = || source_of(&self.secret, guid, &mut self.rng);
+                    let found = own_source(&mut share.own, &qos, &mut new);
+                    if found.is_none() {
+                        problems.insert(Problem::TooManySources { topic: share.local_name.clone() });
                     }
-                    _ => random_source(&mut self.rng),
-                };
-                known.insert(source);
-                share.own.insert(guid, source);
+                    let source = found.or_else(|| share.own.values().map(|own| own.source).max());
+                    let source = source.unwrap_or_else(new);
+                    share.own.insert(*guid, OwnSource { source, qos, gone: None });
+                }
             }
-        } else {
-            share.own.clear();
         }
-        if share
-            .writers
-            .values()
-            .any(|w| (w.qos.reliability, w.qos.durability) != (offer.reliability, offer.durability))
-        {
-            let topic = self.share_rules[share.rule].metadata.ros_name.clone();
-            problem = Some(Problem::MixedQos { topic, offered: describe(&offer) });
+        let Some(share) = self.shares.get(&name) else { return };
+        if share.writers.values().any(|w| {
+            (w.qos.reliability, w.qos.durability, w.qos.representations)
+                != (offer.reliability, offer.durability, offer.representations)
+        }) {
+            let topic = share.local_name.clone();
+            problems.insert(Problem::MixedQos { topic, offered: describe(&offer) });
         }
-        let own: Vec<_> = share.own.iter().map(|(g, s)| (*g, *s, share.writers[g].qos.clone())).collect();
-        let listed: BTreeMap<_, _> = own.iter().map(|(_, source, qos)| (*source, qos)).collect();
-        let sources =
-            listed.into_iter().map(|(source, qos)| CatalogueSource { source, qos: qos.clone() }).collect();
+        problems.extend(share.hashes_differ());
+        let own: Vec<_> = share.own.iter().map(|(g, own)| (*g, own.source, own.qos.clone())).collect();
+        let sources = if is_service { self.listed_servers(share) } else { self.listed(share) };
         self.commands.push_back(Command::UpdateShare { name, qos: offer.clone(), sources });
+        let Some(share) = self.shares.get_mut(&name) else { return };
         let class = self.share_rules[share.rule].class;
-        self.commands.push_back(Command::MapSources { name, qos: offer.clone(), class, own });
+        let keyless = share.keyless;
+        let kept = |qos: Qos| match keyless {
+            true => qos,
+            false => Qos { history: of_all_instances(qos.history), ..qos },
+        };
+        let own = own.into_iter().map(|(writer, source, qos)| (writer, source, kept(qos))).collect();
+        self.commands.push_back(Command::MapSources { name, class, own });
+        if is_service {
+            self.settle(Cause::Share(name), problems);
+            return self.refresh_client(name);
+        }
         // A transient-local topic is read from the start: late joiners are promised its history.
         let wanted = offer.is_transient_local() || !share.sinks.is_empty() || share.sinkless_until.is_some();
         let wanted = wanted && !share.writers.is_empty();
@@ -142,7 +209,7 @@ impl<R: RngCore> Routes<R> {
             share.sinkless_until = None;
         }
         let spec = wanted.then(|| EndpointSpec {
-            topic: dds_topic(&self.share_rules[share.rule].metadata.ros_name),
+            topic: dds_topic(&share.local_name),
             type_name: share.type_name.clone(),
             keyless: share.keyless,
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
@@ -157,20 +224,87 @@ impl<R: RngCore> Routes<R> {
             }
             share.reader = spec;
         }
-        if let Some(problem) = problem {
-            self.report(problem);
+        self.settle(Cause::Share(name), problems);
+    }
+
+    /// The publishers behind a share, each source once.
+    fn listed(&self, share: &ShareRoute) -> Vec<CatalogueSource> {
+        let mut listed = BTreeMap::<SourceId, Vec<(&Guid, &OwnSource)>>::new();
+        for (guid, own) in &share.own {
+            listed.entry(own.source).or_default().push((guid, own));
         }
+        let listed = listed.into_iter().filter_map(|(source, mut all)| {
+            // One that took over the source of another is who it stands for.
+            if all.iter().any(|(_, own)| own.gone.is_none()) {
+                all.retain(|(_, own)| own.gone.is_none());
+            }
+            let qos = weakest(all.iter().map(|(_, own)| &own.qos))?;
+            let node = self.node_of(all.first()?.0);
+            let is_same = all.iter().all(|(guid, _)| self.node_of(guid) == node);
+            Some(CatalogueSource { source, qos, node: node.filter(|_| is_same).cloned() })
+        });
+        listed.collect()
+    }
+
+    /// The nodes that answer, each under an id that nothing is sent under.
+    fn listed_servers(&self, share: &ShareRoute) -> Vec<CatalogueSource> {
+        let server = |guid: &Guid| CatalogueSource {
+            source: SourceId::of_publisher(self.secret.publisher_tag(&guid.0), [0; 8]),
+            qos: service_qos(),
+            node: self.node_of(guid).cloned(),
+        };
+        share.writers.keys().take(ENTRY_SOURCES_MAX).map(server).collect()
     }
 
     pub(super) fn drop_share(&mut self, name: Name) {
         if let Some(share) = self.shares.remove(&name) {
+            self.settle(Cause::Share(name), BTreeSet::new());
+            self.freed = true;
             if share.reader.is_some() {
                 self.commands.push_back(Command::CloseReader { name });
             }
             if share.writer.is_some() {
                 self.commands.push_back(Command::CloseWriter { name, source: None });
             }
+            if share.client.is_some() {
+                self.commands.push_back(Command::CloseClient { name });
+            }
             self.commands.push_back(Command::Unshare { name });
         }
     }
+}
+
+/// A source for a writer that has none: that of a volatile writer like it that is gone, or a new one; `None` if there
+/// are too many.
+fn own_source(
+    known: &mut BTreeMap<Guid, OwnSource>,
+    qos: &Qos,
+    new: impl FnOnce() -> SourceId,
+) -> Option<SourceId> {
+    let here = known.values().filter(|own| own.gone.is_none()).map(|own| own.source);
+    let here: BTreeSet<_> = here.collect();
+    let vacant = || known.values().filter(|own| !here.contains(&own.source));
+    if let Some(own) = vacant().filter(|own| own.qos == *qos).max_by_key(|own| own.gone) {
+        return Some(own.source);
+    }
+    let all: BTreeSet<_> = known.values().map(|own| own.source).collect();
+    if all.len() >= ENTRY_SOURCES_MAX {
+        let oldest = vacant().min_by_key(|own| own.gone)?.source;
+        known.retain(|_, own| own.source != oldest);
+    }
+    Some(new())
+}
+
+/// What of a writer's offer is carried: what all together offer is read, and kept for who joins late.
+fn carried(own: &Qos, offer: &Qos) -> Qos {
+    Qos {
+        reliability: own.reliability.min(offer.reliability),
+        durability: own.durability.min(offer.durability),
+        ..own.clone()
+    }
+}
+
+/// Whether one source can stand for both.
+fn same_kind(a: &Qos, b: &Qos) -> bool {
+    (a.reliability, a.is_transient_local()) == (b.reliability, b.is_transient_local())
 }

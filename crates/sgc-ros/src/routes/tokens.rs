@@ -2,11 +2,13 @@
 //!
 //! From the first grant on they are use routes like others.
 
+use std::collections::BTreeSet;
+
 use rand_core::RngCore;
 use sgc_trust::name_of;
 use sgc_wire::{CatalogueEntry, Name};
 
-use super::{Command, Problem, Routes, TokenJoin, UseRoute};
+use super::{Cause, Command, Problem, Routes, Shaping, TokenJoin, UseRoute};
 
 impl<R: RngCore> Routes<R> {
     /// What a token's name stands for, as its owner says with the grant: a catalogue of one entry.
@@ -18,26 +20,30 @@ impl<R: RngCore> Routes<R> {
         let expected = rule.token.as_ref().map(|(_, metadata)| metadata);
         if name_of(&rule.owner, &entry.blind) != name || expected != Some(&entry.metadata) {
             let problem = Problem::TokenEntry { topic: rule.topic.clone(), owner: rule.owner_name.clone() };
-            self.report(problem);
+            self.report(Cause::Token(name), problem);
             return self.close_use(name);
         }
-        let (owner, transient_local) = (rule.owner, entry.qos.is_transient_local());
+        let (owner, shaping, prefix) = (rule.owner, rule.shaping, rule.frame_prefix.clone());
+        self.settle(Cause::Token(name), BTreeSet::new());
+        let Some(token) = self.tokens.get_mut(&name) else { return };
+        let transient_local = entry.qos.is_transient_local();
         if token.transient_local != transient_local {
             // Another durability is another kind of sink: start over, now that it is known.
             token.transient_local = transient_local;
             self.close_use(name);
             self.commands.push_back(Command::Leave { name });
             self.commands.push_back(Command::Join { name, owner, transient_local, describe: true });
+            self.shape(name, shaping);
+            self.frames(name, prefix);
             return;
         }
         if let Some(route) = self.uses.get_mut(&name) {
             route.entry = entry;
-            return;
+        } else {
+            let local_name = self.use_rules[index].local_name(&entry.metadata);
+            self.uses.insert(name, UseRoute::new(index, local_name, entry));
         }
-        self.uses.insert(name, UseRoute::new(index, entry));
-        for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
-            self.check_local(&endpoint);
-        }
+        self.check_later();
     }
 
     /// Joins the names of those tokens that are not joined.
@@ -48,8 +54,14 @@ impl<R: RngCore> Routes<R> {
                 continue;
             }
             self.tokens.insert(*name, TokenJoin { rule: index, transient_local: false, refused: None });
-            let (name, owner) = (*name, rule.owner);
+            let (name, owner, shaping) = (*name, rule.owner, rule.shaping);
             self.commands.push_back(Command::Join { name, owner, transient_local: false, describe: true });
+            if shaping != Shaping::default() {
+                self.commands.push_back(Command::Shape { name, shaping });
+            }
+            if let Some(prefix) = &rule.frame_prefix {
+                self.commands.push_back(Command::Frames { name, prefix: Some(prefix.clone()) });
+            }
         }
     }
 }

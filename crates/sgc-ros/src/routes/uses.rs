@@ -6,33 +6,56 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_trust::name_of;
-use sgc_wire::{Catalogue, CatalogueEntry, Kind, Name, NodeId, Qos, SourceId};
+use sgc_wire::{Catalogue, CatalogueEntry, ENTRY_SOURCES_MAX, Metadata, Name, NodeId, Qos, SourceId};
 
 use super::{
-    Command, Direction, ENTRIES_PER_RULE_MAX, Problem, Routes, UNREACHABLE_HOLD, UseRoute, describe,
+    Cause, Command, Direction, ENTRIES_PER_RULE_MAX, Problem, ROUTES_PER_WILDCARD_MAX, Routes, Settling,
+    UNREACHABLE_HOLD, UseRoute, UseRule,
 };
-use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
+use crate::names::{dds_topic, dds_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 
 impl<R: RngCore> Routes<R> {
     /// An owner's catalogue arrived or changed.
-    pub fn handle_catalogue(&mut self, owner: NodeId, catalogue: Catalogue) {
+    pub fn handle_catalogue(&mut self, now: Instant, owner: NodeId, catalogue: Catalogue) {
         self.owners.remove(&owner);
-        let mut listed = BTreeSet::new();
+        self.owner_is_back(now, owner, &catalogue);
         self.catalogues.insert(owner, catalogue.clone());
+        self.list(owner, catalogue);
+        self.reconsider();
+    }
+
+    /// Brings the routes to an owner's interfaces in line with what it lists.
+    pub(super) fn list(&mut self, owner: NodeId, catalogue: Catalogue) {
+        let mut listed = BTreeSet::new();
+        let said = self.problems.take(Cause::Catalogue(owner));
+        let mut running: BTreeMap<usize, usize> = BTreeMap::new();
+        for route in self.uses.values() {
+            *running.entry(route.rule).or_default() += 1;
+        }
         for entry in catalogue.entries {
             let Some(rule) = self.rule_for(owner, &entry) else { continue };
             let name = name_of(&owner, &entry.blind);
-            let here = self.uses.iter().filter(|(n, u)| u.rule == rule && **n != name).count();
-            if here >= ENTRIES_PER_RULE_MAX {
-                let topic = self.use_rules[rule].topic.clone();
-                let owner = self.use_rules[rule].owner_name.clone();
-                self.report(Problem::TooManyEntries { topic, owner });
-                continue;
+            if self.uses.get(&name).is_none_or(|route| route.rule != rule) {
+                let here = running.entry(rule).or_default();
+                let is_pattern = self.use_rules[rule].is_pattern();
+                if *here >= if is_pattern { ROUTES_PER_WILDCARD_MAX } else { ENTRIES_PER_RULE_MAX } {
+                    self.too_many(owner, rule);
+                    continue;
+                }
+                if let Some(problem) = self.why_not_used(rule, &entry.metadata) {
+                    self.waits = true;
+                    self.report(Cause::Catalogue(owner), problem);
+                    continue;
+                }
+                *here += 1;
             }
             listed.insert(name);
+            self.check_merged(rule, &entry.metadata);
+            self.listed_again(name);
             self.entry_there(name, rule, entry);
         }
+        self.problems.release(said);
         let gone: Vec<_> = self
             .uses
             .iter()
@@ -40,7 +63,35 @@ impl<R: RngCore> Routes<R> {
             .map(|(n, _)| *n)
             .collect();
         for name in gone {
-            self.drop_use(name);
+            self.not_listed(name);
+        }
+    }
+
+    fn too_many(&mut self, owner_id: NodeId, rule: usize) {
+        let rule = &self.use_rules[rule];
+        let (topic, owner) = (rule.topic.clone(), rule.owner_name.clone());
+        let problem = match rule.is_pattern() {
+            true => Problem::TooManyMatches { topic, verb: "brought here" },
+            false => Problem::TooManyEntries { topic, owner },
+        };
+        self.waits = true;
+        self.report(Cause::Catalogue(owner_id), problem);
+    }
+
+    /// Looks again at what was left out for the sake of a route that has ended since.
+    pub(super) fn reconsider(&mut self) {
+        if !std::mem::take(&mut self.freed) || !std::mem::take(&mut self.waits) {
+            return;
+        }
+        let shared: BTreeSet<_> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
+        let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
+        for writer in self.endpoints.values().filter(is_new).cloned().collect::<Vec<_>>() {
+            if !self.service_end_there(&writer) {
+                self.share_writer(writer);
+            }
+        }
+        for (owner, catalogue) in self.catalogues.clone() {
+            self.list(owner, catalogue);
         }
     }
 
@@ -49,9 +100,12 @@ impl<R: RngCore> Routes<R> {
     pub fn handle_owner_lost(&mut self, owner: NodeId, reason: LostReason) {
         if !matches!(reason, LostReason::Withdrawn | LostReason::Refused(_)) {
             self.owners.insert(owner, "is out of reach".into());
+            self.settling.insert(owner, Settling::Away);
             return;
         }
         self.catalogues.remove(&owner);
+        self.settle(Cause::Catalogue(owner), BTreeSet::new());
+        self.settling.remove(&owner);
         self.owners.insert(owner, "has gone".into());
         let names: Vec<_> = self
             .uses
@@ -62,6 +116,7 @@ impl<R: RngCore> Routes<R> {
         for name in names {
             self.drop_use(name);
         }
+        self.reconsider();
     }
 
     /// An owner does not let this node follow it.
@@ -105,13 +160,8 @@ impl<R: RngCore> Routes<R> {
     /// The rule that asks for a catalogue entry.
     pub(super) fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<usize> {
         let metadata = &entry.metadata;
-        let (index, rule) = self.use_rules.iter().enumerate().find(|(_, r)| {
-            let may = match r.direction {
-                Direction::Bring => entry.subscribe,
-                Direction::Publish => entry.publish,
-            };
-            may && r.is_of_catalogue(&owner) && r.topic == metadata.ros_name && metadata.kind == Kind::Topic
-        })?;
+        let index = self.use_rule(&owner, entry)?;
+        let rule = &self.use_rules[index];
         match &rule.type_name {
             Some(expected) if *expected != metadata.type_name => {
                 let problem = Problem::UseType {
@@ -120,7 +170,7 @@ impl<R: RngCore> Routes<R> {
                     expected: expected.clone(),
                     found: metadata.type_name.clone(),
                 };
-                self.report(problem);
+                self.report(Cause::Catalogue(owner), problem);
                 None
             }
             _ => Some(index),
@@ -129,11 +179,27 @@ impl<R: RngCore> Routes<R> {
 
     pub(super) fn entry_there(&mut self, name: Name, rule: usize, entry: CatalogueEntry) {
         let transient_local = entry.qos.is_transient_local();
+        let local_name = self.use_rules[rule].local_name(&entry.metadata);
+        let goes_on = |route: &UseRoute| {
+            self.use_rules[route.rule].direction == self.use_rules[rule].direction
+                && route.local_name == local_name
+        };
+        if self.uses.get(&name).is_some_and(|route| !goes_on(route)) {
+            self.drop_use(name);
+        }
         match self.uses.get_mut(&name) {
-            Some(route) if self.use_rules[route.rule].direction == Direction::Publish => route.entry = entry,
+            Some(route) if self.use_rules[route.rule].direction == Direction::Publish => {
+                if std::mem::replace(&mut route.entry, entry.clone()) != entry {
+                    self.check_later();
+                }
+                self.refresh_server(name);
+            }
             Some(route) if route.entry.qos.is_transient_local() == transient_local => {
-                route.entry = entry;
+                let is_news = std::mem::replace(&mut route.entry, entry.clone()) != entry;
                 self.refresh_use(name);
+                if is_news {
+                    self.check_later();
+                }
             }
             // Another durability is another kind of sink: start over.
             Some(_) => {
@@ -141,17 +207,23 @@ impl<R: RngCore> Routes<R> {
                 self.entry_there(name, rule, entry);
             }
             None => {
-                let owner = self.use_rules[rule].owner;
-                let (suite, class, reliable) = (entry.suite, entry.class, entry.qos.is_reliable());
-                self.uses.insert(name, UseRoute::new(rule, entry));
+                let UseRule { owner, class, shaping, frame_prefix, .. } = self.use_rules[rule].clone();
+                let (suite, reliable) = (entry.suite, entry.qos.is_reliable());
+                let class = class.unwrap_or(entry.class);
+                self.uses.insert(name, UseRoute::new(rule, local_name, entry));
+                if self.use_rules[rule].is_service() {
+                    return self.commands.push_back(Command::Call { name, owner, suite, class });
+                }
                 if self.publishes(rule) {
                     self.commands.push_back(Command::Publish { name, owner, suite, class, reliable });
+                    self.shape(name, shaping);
+                    self.check_later();
                     return self.find_publishers();
                 }
                 self.commands.push_back(Command::Join { name, owner, transient_local, describe: false });
-                for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
-                    self.check_local(&endpoint);
-                }
+                self.shape(name, shaping);
+                self.frames(name, frame_prefix);
+                self.check_later();
             }
         }
     }
@@ -159,7 +231,7 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn hold_use(&mut self, now: Instant, name: Name) {
         if let Some(route) = self.uses.get_mut(&name) {
             route.granted = false;
-            if !route.writers.is_empty() || route.reader.is_some() {
+            if !route.writers.is_empty() || route.reader.is_some() || route.server.is_some() {
                 route.unreachable_until.get_or_insert(now + UNREACHABLE_HOLD);
             }
         }
@@ -177,68 +249,101 @@ impl<R: RngCore> Routes<R> {
     /// Ends what a use has on the local network; its name stays joined.
     pub(super) fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
+            self.freed = true;
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
             }
             if route.reader.is_some() {
                 self.commands.push_back(Command::CloseReader { name });
             }
+            if route.server.is_some() {
+                self.commands.push_back(Command::CloseServer { name });
+            }
+            self.check_later();
         }
     }
 
-    /// Brings the local writers of a granted route in line with its catalogue entry: one for each transient-local
-    /// source, so that each keeps its own history, and one for all others.
+    /// Brings the local writers of a granted route in line with its catalogue entry: one for each publisher that it
+    /// lists, with that publisher's QoS, history and node, and one for all others where there are any.
     pub(super) fn refresh_use(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
         let entry = &route.entry;
         let spec = |qos: &Qos| EndpointSpec {
-            topic: dds_topic(&entry.metadata.ros_name),
+            topic: dds_topic(&route.local_name),
             type_name: dds_type(&entry.metadata.type_name),
             keyless: entry.keyless,
             type_hash: entry.type_hash.clone(),
             qos: qos.clone(),
         };
         let mut wanted: BTreeMap<Option<SourceId>, EndpointSpec> =
-            entry.sources.iter().map(|s| (Some(s.source), spec(&s.qos))).collect();
-        if wanted.is_empty() {
+            entry.sources.iter().map(|s| (s.source.told_apart(), spec(&s.qos))).collect();
+        if wanted.is_empty() || entry.sources.len() >= ENTRY_SOURCES_MAX {
             wanted.insert(None, spec(&entry.qos));
         }
+        // A publisher whose node started anew has another source. To the local network it is the one that it was.
+        let mut moved = BTreeSet::new();
+        for (to, spec) in wanted.iter().filter_map(|(to, spec)| Some(((*to)?, spec))) {
+            let is_gone = |from: &SourceId| {
+                !wanted.contains_key(&Some(*from))
+                    && from.publisher() == to.publisher()
+                    && !moved.contains(from)
+            };
+            let mut alike =
+                route.writers.iter().filter(|(_, old)| *old == spec).filter_map(|(from, _)| *from);
+            let from = alike.find(is_gone);
+            if let Some(from) = from.filter(|_| !route.writers.contains_key(&Some(to))) {
+                moved.extend([from, to]);
+                self.commands.push_back(Command::MoveWriter { name, from, to });
+            }
+        }
+        // Those that their owner has to find first stay as they are.
+        if matches!(self.settling.get(&self.use_rules[route.rule].owner), Some(Settling::Until(_))) {
+            for (source, old) in &route.writers {
+                if source.is_some_and(|source| !moved.contains(&source)) {
+                    wanted.entry(*source).or_insert_with(|| old.clone());
+                }
+            }
+        }
+        let has_moved = |source: &Option<SourceId>| source.is_some_and(|source| moved.contains(&source));
         for (source, old) in &route.writers {
-            if wanted.get(source) != Some(old) {
+            if wanted.get(source) != Some(old) && !has_moved(source) {
+                route.nodes.remove(source);
                 self.commands.push_back(Command::CloseWriter { name, source: *source });
             }
         }
         for (source, spec) in &wanted {
-            if route.writers.get(source) != Some(spec) {
+            if route.writers.get(source) != Some(spec) && !has_moved(source) {
                 let spec = spec.clone();
                 self.commands.push_back(Command::OpenWriter { name, source: *source, spec });
             }
         }
         route.writers = wanted;
+        self.name_writers(name);
     }
 
-    /// Says so if a local endpoint cannot talk to a used topic.
-    pub(super) fn check_local(&mut self, endpoint: &DiscoveredEndpoint) {
-        let Some(topic) = ros_topic(&endpoint.topic) else { return };
-        let mut problems = Vec::new();
-        let brought = |u: &&UseRoute| !self.publishes(u.rule) && u.entry.metadata.ros_name == topic;
-        for route in self.uses.values().filter(brought) {
-            let (topic, owner) = (topic.to_owned(), self.use_rules[route.rule].owner_name.clone());
-            let (remote, local) = (route.entry.metadata.type_name.clone(), ros_type(&endpoint.type_name));
-            let reader = endpoint.kind == EndpointKind::Reader;
-            if remote != local {
-                let end = if reader { "subscriber" } else { "publisher" };
-                problems.push(Problem::LocalType { topic, owner, remote, end, local });
-            } else if reader
-                && (endpoint.qos.reliability > route.entry.qos.reliability
-                    || endpoint.qos.durability > route.entry.qos.durability)
-            {
-                let (offered, requested) = (describe(&route.entry.qos), describe(&endpoint.qos));
-                problems.push(Problem::LocalQos { topic, owner, offered, requested });
-            }
+    /// Says so if what comes from several owners under one name cannot be one topic.
+    fn check_merged(&mut self, rule: usize, metadata: &Metadata) {
+        let found = &metadata.type_name;
+        let local_name = self.use_rules[rule].local_name(metadata);
+        let differs = |u: &&UseRoute| {
+            let other = &u.entry.metadata;
+            !self.publishes(u.rule)
+                && u.local_name == local_name
+                && other.kind == metadata.kind
+                && other.type_name != *found
+        };
+        if self.publishes(rule) {
+            return;
         }
-        for problem in problems {
-            self.report(problem);
+        if let Some(other) = self.uses.values().find(differs) {
+            let problem = Problem::MergedTypes {
+                topic: local_name,
+                owner: self.use_rules[rule].owner_name.clone(),
+                found: found.clone(),
+                other: self.use_rules[other.rule].owner_name.clone(),
+                known: other.entry.metadata.type_name.clone(),
+            };
+            self.report(Cause::Catalogue(self.use_rules[rule].owner), problem);
         }
     }
 }

@@ -1,46 +1,61 @@
-//! The settings of QUIC and TLS. One place for every number and every choice that security depends on.
+//! The settings of QUIC; those of the TLS inside are in [`crate::tls`].
 
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::{hmac, rand};
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
-use quinn::{ConnectionId, ConnectionIdGenerator, EndpointConfig, IdleTimeout, TransportConfig, VarInt};
-use rustls::crypto::aws_lc_rs::kx_group;
-use rustls::crypto::{CryptoProvider, SupportedKxGroup};
-use rustls::server::NoServerSessionStorage;
-use rustls::sign::SingleCertAndKey;
+use quinn::{
+    ConnectionId, ConnectionIdGenerator, EndpointConfig, IdleTimeout, MtuDiscoveryConfig, TransportConfig,
+    VarInt,
+};
 
-use super::verifier::{Findings, PeerVerifier, Presenter};
+use super::clear::Clear;
+use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
+use crate::tls::{self, Findings};
 
-static CLASSICAL: LazyLock<Arc<CryptoProvider>> =
-    LazyLock::new(|| provider_with(vec![kx_group::X25519, kx_group::X25519MLKEM768]));
-static POST_QUANTUM: LazyLock<Arc<CryptoProvider>> =
-    LazyLock::new(|| provider_with(vec![kx_group::X25519MLKEM768]));
+/// What lies below QUIC, and whether its packets can be read. Each has an application protocol (RFC 7301) of its own, so that
+/// none passes for another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Flavor {
+    /// QUIC as it is.
+    Quic,
+    /// Inside of DTLS.
+    Dtls,
+    /// With packets that are authenticated and not encrypted.
+    Udp,
+}
 
-/// The application protocol (RFC 7301) of version 1.
-const ALPN: &[u8] = b"sgc/1";
+impl Flavor {
+    /// The application protocol of version 1.
+    fn alpn(self) -> &'static [u8] {
+        match self {
+            Self::Quic => b"sgc/1",
+            Self::Dtls => b"sgc-dtls/1",
+            Self::Udp => b"sgc-udp/1",
+        }
+    }
+}
+
 /// Most bytes that are kept of one peer before its handshake is worked on.
 const INCOMING_BYTES_MAX: u64 = 64 << 10;
 /// The same for all peers together.
 const INCOMING_BYTES_TOTAL_MAX: u64 = 8 << 20;
+/// How many packets may overtake one before it counts as lost: the network reorders.
+const PACKET_THRESHOLD: u32 = 16;
+/// What a round trip is taken to be before the first was seen: it sets the time after which a first packet is sent again.
+const INITIAL_RTT: Duration = Duration::from_millis(150);
+/// Longest QUIC packet inside of DTLS, bytes. With records, ids, UDP and IPv6 around it, it fits 1420 bytes, which is
+/// what a WireGuard tunnel carries; whether the path does is found out from 1200 on, which fits 1280. Beginning with it
+/// would not do: one that does not fit takes what is sent with it along, and so quinn never sees that it was its length.
+const DTLS_MTU: u16 = 1340;
 const RESET_DOMAIN: &[u8] = b"sgc stateless reset v1";
 const CONNECTION_ID_BYTES: usize = 8;
 
-fn provider_with(kx_groups: Vec<&'static dyn SupportedKxGroup>) -> Arc<CryptoProvider> {
-    Arc::new(CryptoProvider { kx_groups, ..rustls::crypto::aws_lc_rs::default_provider() })
-}
-
-/// A node that does not require post-quantum key exchange still has it, second: so a fleet can be switched node by node,
-/// and one that has not been reached yet is not locked out by those that have.
-fn provider(post_quantum: bool) -> &'static Arc<CryptoProvider> {
-    if post_quantum { &POST_QUANTUM } else { &CLASSICAL }
-}
-
-/// Everything that belongs to neither side's handshake.
-pub(super) fn transport(options: &LinkOptions) -> Arc<TransportConfig> {
+/// Everything that belongs to neither side's handshake, for one connection, and the gate of that one.
+pub(crate) fn transport(flavor: Flavor, options: &LinkOptions) -> (Arc<TransportConfig>, Arc<Gate>) {
     let millis = |d: Duration| VarInt::from_u32(u32::try_from(d.as_millis()).unwrap_or(u32::MAX));
     let mut config = TransportConfig::default();
     config
@@ -52,55 +67,49 @@ pub(super) fn transport(options: &LinkOptions) -> Arc<TransportConfig> {
         .receive_window(VarInt::from_u32(options.receive_window_bytes))
         .stream_receive_window(VarInt::from_u32(options.flow_window_bytes))
         .send_window(options.send_window_bytes.into())
+        .packet_threshold(PACKET_THRESHOLD)
+        .initial_rtt(INITIAL_RTT)
         .datagram_send_buffer_size(options.datagram_send_bytes)
         .datagram_receive_buffer_size(Some(options.datagram_receive_bytes));
-    if let Some(factory) = &options.congestion {
-        config.congestion_controller_factory(Arc::clone(factory));
+    config.enable_segmentation_offload(options.offload);
+    let mut discovery = MtuDiscoveryConfig::default();
+    if flavor == Flavor::Dtls {
+        discovery.upper_bound(DTLS_MTU);
     }
-    Arc::new(config)
+    config.mtu_discovery_config(options.mtu_discovery.then_some(discovery));
+    let (controllers, gate) = options.congestion.for_connection();
+    config.congestion_controller_factory(controllers);
+    (Arc::new(config), gate)
 }
 
 /// For one incoming connection, with a verdict of its own.
 pub(super) fn server(
+    flavor: Flavor,
     credentials: &CredentialStore,
     options: &LinkOptions,
-    transport: &Arc<TransportConfig>,
-) -> (quinn::ServerConfig, Arc<Findings>) {
-    let identity = credentials.identity();
-    let post_quantum = options.post_quantum || identity.post_quantum();
-    let provider = provider(post_quantum);
-    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
-    let presenter = Presenter {
-        key: identity.certified_key(),
-        accepted: provider.kx_groups.iter().map(|g| g.name()).collect(),
-        findings: Arc::clone(&findings),
-    };
-    let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(provider))
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .expect("the provider has cipher suites of TLS 1.3")
-        .with_client_cert_verifier(verifier)
-        .with_cert_resolver(Arc::new(presenter));
-    tls.alpn_protocols = vec![ALPN.to_vec()];
-    // A resumed session would skip the certificate, and with it expiry and revocation.
-    tls.session_storage = Arc::new(NoServerSessionStorage {});
-    tls.send_tls13_tickets = 0;
-    tls.max_early_data_size = 0;
+) -> (quinn::ServerConfig, Arc<Findings>, Arc<Gate>) {
+    let (tls, findings) = tls::server(credentials, options, flavor.alpn());
     let crypto =
         QuicServerConfig::try_from(tls).expect("the provider has the cipher suite of QUIC's first packets");
-    let mut config = quinn::ServerConfig::with_crypto(Arc::new(crypto));
-    config.transport_config(Arc::clone(transport));
+    let crypto: Arc<dyn quinn::crypto::ServerConfig> = match flavor {
+        Flavor::Quic | Flavor::Dtls => Arc::new(crypto),
+        Flavor::Udp => Arc::new(Clear(Arc::new(crypto))),
+    };
+    let mut config = quinn::ServerConfig::with_crypto(crypto);
+    let (transport, gate) = transport(flavor, options);
+    config.transport_config(transport);
     // Retry makes its own tokens; those for later connections are not worth their state.
     config.validation_token.sent(0);
-    (config, findings)
+    (config, findings, gate)
 }
 
 /// For the listening endpoint itself.
 pub(super) fn listener(
+    flavor: Flavor,
     credentials: &CredentialStore,
     options: &LinkOptions,
-    transport: &Arc<TransportConfig>,
 ) -> quinn::ServerConfig {
-    let (mut config, _) = server(credentials, options, transport);
+    let (mut config, ..) = server(flavor, credentials, options);
     config
         .max_incoming(options.handshakes_max)
         .incoming_buffer_size(INCOMING_BYTES_MAX)
@@ -109,44 +118,42 @@ pub(super) fn listener(
 }
 
 /// For one outgoing connection, with a verdict of its own.
-pub(super) fn client(
+pub(crate) fn client(
+    flavor: Flavor,
     credentials: &CredentialStore,
     options: &LinkOptions,
-    transport: &Arc<TransportConfig>,
-) -> (quinn::ClientConfig, Arc<Findings>) {
-    let identity = credentials.identity();
-    let post_quantum = options.post_quantum || identity.post_quantum();
-    let provider = provider(post_quantum);
-    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
-    let key = identity.certified_key();
-    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(provider))
-        .with_protocol_versions(&[&rustls::version::TLS13])
-        .expect("the provider has cipher suites of TLS 1.3")
-        .dangerous()
-        .with_custom_certificate_verifier(verifier)
-        .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(key)));
-    tls.alpn_protocols = vec![ALPN.to_vec()];
-    tls.resumption = rustls::client::Resumption::disabled();
-    tls.enable_early_data = false;
-    // No one routes by it, and it would tell the network where a node thinks it is going.
-    tls.enable_sni = false;
+) -> (quinn::ClientConfig, Arc<Findings>, Arc<Gate>) {
+    let (tls, findings) = tls::client(credentials, options, flavor.alpn());
     let crypto =
         QuicClientConfig::try_from(tls).expect("the provider has the cipher suite of QUIC's first packets");
-    let mut config = quinn::ClientConfig::new(Arc::new(crypto));
-    config.transport_config(Arc::clone(transport));
+    let crypto: Arc<dyn quinn::crypto::ClientConfig> = match flavor {
+        Flavor::Quic | Flavor::Dtls => Arc::new(crypto),
+        Flavor::Udp => Arc::new(Clear(Arc::new(crypto))),
+    };
+    let mut config = quinn::ClientConfig::new(crypto);
+    let (transport, gate) = transport(flavor, options);
+    config.transport_config(transport);
     config.token_store(Arc::new(quinn::NoneTokenStore));
-    (config, findings)
+    (config, findings, gate)
 }
 
 /// For the socket of a listener. With the identity's reset key, peers of a listener that was killed and started again on
 /// the same port learn it from the first packet that they send (RFC 9000, 10.3), instead of by a time-out. The port is
 /// part of the derivation, so that two listeners of one identity cannot be used against each other (21.11).
-pub(super) fn endpoint(reset_key: Option<&[u8; 32]>, port: u16) -> EndpointConfig {
-    let Some(key) = reset_key else { return EndpointConfig::default() };
-    let key = hmac::Key::new(hmac::HMAC_SHA256, key);
-    let derived = hmac::sign(&key, &[RESET_DOMAIN, &port.to_be_bytes()].concat());
-    let mut config = EndpointConfig::new(Arc::new(hmac::Key::new(hmac::HMAC_SHA256, derived.as_ref())));
-    config.cid_generator(|| Box::new(RandomIds));
+pub(crate) fn endpoint(flavor: Flavor, reset_key: Option<&[u8; 32]>, port: u16) -> EndpointConfig {
+    let mut config = match reset_key {
+        None => EndpointConfig::default(),
+        Some(key) => {
+            let key = hmac::Key::new(hmac::HMAC_SHA256, key);
+            let derived = hmac::sign(&key, &[RESET_DOMAIN, &port.to_be_bytes()].concat());
+            let mut config =
+                EndpointConfig::new(Arc::new(hmac::Key::new(hmac::HMAC_SHA256, derived.as_ref())));
+            config.cid_generator(|| Box::new(RandomIds));
+            config
+        }
+    };
+    // Inside of DTLS the bit tells packets from what is said beside them.
+    config.grease_quic_bit(flavor != Flavor::Dtls);
     config
 }
 

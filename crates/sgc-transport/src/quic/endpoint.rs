@@ -4,41 +4,42 @@
 //! also how a dialer learns that it was accepted: in TLS 1.3 the client's handshake is over before the
 //! server has looked at its certificate.
 
-use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quinn::crypto::rustls::HandshakeData;
-use quinn::{Connecting, Connection, ConnectionError, Endpoint, Incoming, TransportConfig, VarInt};
+use quinn::{
+    AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, TokioRuntime, VarInt,
+};
 use rustls::NamedGroup;
 use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
 use tokio::task::JoinSet;
-use tokio::time::{sleep, timeout};
+use tokio::time::timeout;
 
-use super::reserve::Reserve;
-use super::verifier::Findings;
+use super::config::Flavor;
 use super::{
-    ControlRx, Fate, Inlet, Outlet, PRIORITY_CONTROL, QuicLink, Shared, canonical, close, config, send_frame,
+    ControlRx, Fate, Inlet, Outlet, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
 };
+use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
+use crate::dtls::{Claim, Mux};
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, Pieces};
 use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
+use crate::overload::Overload;
+use crate::race;
+use crate::socket;
+use crate::tls::Findings;
 use crate::url::LinkUrl;
 
 /// TLS requires a name; ours is neither sent nor compared.
-const SERVER_NAME: &str = "sgc.invalid";
-/// Most addresses of one host that are tried.
-const ADDRESSES_MAX: usize = 8;
-/// How long one address may be silent before the next is tried beside it (as in RFC 8305).
-const STAGGER: Duration = Duration::from_millis(300);
-/// How often refusals for want of capacity are reported one by one.
-const OVERLOAD_REPORT_INTERVAL: Duration = Duration::from_secs(1);
+pub(crate) const SERVER_NAME: &str = "sgc.invalid";
 /// How long a closing endpoint waits for its peers to have heard of it.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
+pub(crate) const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Awaits QUIC links on one socket.
 pub(crate) struct QuicListener {
@@ -51,45 +52,41 @@ pub(crate) struct QuicListener {
 
 /// What every incoming handshake needs.
 struct Acceptor {
+    flavor: Flavor,
     credentials: CredentialStore,
     options: LinkOptions,
-    transport: Arc<TransportConfig>,
     metrics: Arc<TransportMetrics>,
-}
-
-/// Refusals for want of capacity come in floods; one report in a while tells as much.
-#[derive(Default)]
-struct Overload {
-    last_report: Option<Instant>,
-    unreported: u64,
-}
-
-impl Overload {
-    fn note(&mut self, pending: usize) -> Option<Refusal> {
-        self.unreported += 1;
-        let is_due = self.last_report.is_none_or(|t| t.elapsed() >= OVERLOAD_REPORT_INTERVAL);
-        is_due.then(|| {
-            self.last_report = Some(Instant::now());
-            Refusal::TooMany { pending, unreported: std::mem::take(&mut self.unreported) - 1 }
-        })
-    }
+    /// The associations that these links travel in.
+    dtls: Option<Arc<Mux>>,
 }
 
 impl QuicListener {
     pub(crate) fn bind(
+        flavor: Flavor,
         addr: SocketAddr,
         credentials: CredentialStore,
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> std::io::Result<Self> {
-        let socket = UdpSocket::bind(addr)?;
+        let (socket, _) = socket::bind(addr, &options)?;
+        Self::on(flavor, socket, None, credentials, options, metrics)
+    }
+
+    /// On a socket that is there, and over these associations.
+    pub(crate) fn on(
+        flavor: Flavor,
+        socket: Arc<dyn AsyncUdpSocket>,
+        dtls: Option<Arc<Mux>>,
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> std::io::Result<Self> {
         let local = socket.local_addr()?;
-        let transport = config::transport(&options);
-        let server = config::listener(&credentials, &options, &transport);
-        let runtime = quinn::default_runtime().ok_or_else(|| std::io::Error::other("no tokio runtime"))?;
-        let endpoint_config = config::endpoint(credentials.identity().reset_key(), local.port());
-        let endpoint = Endpoint::new(endpoint_config, Some(server), socket, runtime)?;
-        let acceptor = Arc::new(Acceptor { credentials, options, transport, metrics });
+        let server = config::listener(flavor, &credentials, &options);
+        let endpoint_config = config::endpoint(flavor, credentials.identity().reset_key(), local.port());
+        let runtime = Arc::new(TokioRuntime);
+        let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
+        let acceptor = Arc::new(Acceptor { flavor, credentials, options, metrics, dtls });
         Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), overload: Overload::default() })
     }
 
@@ -158,21 +155,37 @@ impl Acceptor {
     }
 
     async fn link(&self, incoming: Incoming) -> Result<QuicLink, Refusal> {
-        let (server, findings) = config::server(&self.credentials, &self.options, &self.transport);
+        let (server, findings, gate) = config::server(self.flavor, &self.credentials, &self.options);
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         let fate = Fate::new(self.options.idle_timeout);
-        let reserve = Arc::new(Reserve::new(&connection, self.options.send_window_bytes.into()));
+        let claim = match &self.dtls {
+            None => None,
+            Some(mux) => {
+                let peer = findings.verdict().and_then(|verdict| verdict.as_ref().ok());
+                let claim = peer.and_then(|peer| mux.claim(connection.remote_address(), peer));
+                let other = || ungreeted(&connection, &fate, ProtocolError::OtherNode.into());
+                Some(claim.ok_or_else(other)?)
+            }
+        };
         let greeted = async {
             let (tx, rx) = connection.accept_bi().await.map_err(|e| fate.explain(&e))?;
-            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate, &reserve);
+            let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
             let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
-            hear_greeting(&mut rx).await?;
-            send_frame(&mut tx, Greeting.to_bytes()).await?;
-            Ok((tx, rx))
+            let greeting = hear_greeting(&mut rx).await?;
+            send_frame(&mut tx, Greeting::default().to_bytes()).await?;
+            Ok((greeting, (tx, rx)))
         };
         match greeted.await {
-            Ok(control) => link(connection, &findings, false, control, fate).map_err(Refusal::Certificate),
+            Ok((greeting, control)) => {
+                let ended = claim.as_ref().map(Claim::ended);
+                let link = link(connection, &findings, false, greeting, control, fate, claim);
+                let link = link.map_err(Refusal::Certificate)?;
+                if let Some(ended) = ended {
+                    link.end_with(ended);
+                }
+                Ok(link)
+            }
             Err(error) => Err(ungreeted(&connection, &fate, error)),
         }
     }
@@ -180,9 +193,9 @@ impl Acceptor {
 
 /// Dials QUIC links, all from one socket for each address family.
 pub(crate) struct QuicDialer {
+    flavor: Flavor,
     credentials: CredentialStore,
     options: LinkOptions,
-    transport: Arc<TransportConfig>,
     metrics: Arc<TransportMetrics>,
     endpoints: Mutex<Endpoints>,
 }
@@ -195,32 +208,34 @@ struct Endpoints {
 
 impl QuicDialer {
     pub(crate) fn new(
+        flavor: Flavor,
         credentials: CredentialStore,
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> Self {
-        let transport = config::transport(&options);
-        Self { credentials, options, transport, metrics, endpoints: Mutex::default() }
-    }
-
-    pub(crate) async fn dial(&self, url: &LinkUrl) -> Result<QuicLink, DialError> {
-        let addresses = self.resolve(url).await?;
-        self.dial_at(url, addresses).await
+        Self { flavor, credentials, options, metrics, endpoints: Mutex::default() }
     }
 
     /// Dials these addresses in this order, and says `url` of them.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
-        mut addresses: Vec<SocketAddr>,
+        addresses: Vec<SocketAddr>,
+        greeting: Greeting,
     ) -> Result<QuicLink, DialError> {
-        addresses.truncate(ADDRESSES_MAX);
-        if addresses.is_empty() {
-            return Err(DialError::NoAddress(url.clone()));
-        }
         let failed = |attempts| DialError::Failed { url: url.clone(), attempts };
-        let (remote, connection, findings) = self.connect(addresses).await.map_err(failed)?;
-        let link = self.greet(connection, findings).await.map_err(|e| failed(vec![(remote, e)]))?;
+        let connect = |address| {
+            let started = self.start(address);
+            let options = self.options.clone();
+            async move {
+                let (connecting, findings, gate) = started?;
+                Ok((finish(connecting, &findings, &options).await?, (findings, gate)))
+            }
+        };
+        let (remote, (connection, (findings, gate))) =
+            race::first(addresses, connect).await.map_err(failed)?;
+        let greeted = greet(connection, findings, gate, greeting, &self.options).await;
+        let link = greeted.map_err(|e| failed(vec![(remote, e)]))?;
         self.metrics.count_dialed();
         Ok(link)
     }
@@ -233,106 +248,75 @@ impl QuicDialer {
         }
     }
 
-    async fn resolve(&self, url: &LinkUrl) -> Result<Vec<SocketAddr>, DialError> {
-        let lookup = tokio::net::lookup_host((url.host.as_str(), url.port));
-        let late = || std::io::Error::new(std::io::ErrorKind::TimedOut, "the resolver does not answer");
-        let found = timeout(self.options.resolve_timeout, lookup).await.unwrap_or_else(|_| Err(late()));
-        let found = found.map_err(|source| DialError::Resolve { url: url.clone(), source })?;
-        let mut addresses: Vec<SocketAddr> = Vec::new();
-        for address in found.take(ADDRESSES_MAX) {
-            if !addresses.contains(&address) {
-                addresses.push(address);
-            }
-        }
-        if addresses.is_empty() { Err(DialError::NoAddress(url.clone())) } else { Ok(addresses) }
-    }
-
-    /// Connects to the first address that answers. A later one is tried when an earlier fails or is silent.
-    async fn connect(
-        &self,
-        addresses: Vec<SocketAddr>,
-    ) -> Result<(SocketAddr, Connection, Arc<Findings>), Vec<(SocketAddr, LinkError)>> {
-        let mut rest = addresses.into_iter();
-        let mut racing = JoinSet::new();
-        let mut failed = Vec::new();
-        loop {
-            match rest.next() {
-                Some(address) => match self.start(address) {
-                    Ok((connecting, findings)) => {
-                        let options = self.options.clone();
-                        racing.spawn(async move {
-                            (address, finish(connecting, &findings, &options).await.map(|c| (c, findings)))
-                        });
-                    }
-                    Err(error) => {
-                        failed.push((address, error));
-                        continue;
-                    }
-                },
-                None if racing.is_empty() => return Err(failed),
-                None => {}
-            }
-            let has_more = rest.len() > 0;
-            tokio::select! {
-                Some(done) = racing.join_next() => match done {
-                    // The others are dropped with the set, before any of them has become a link over there.
-                    Ok((address, Ok((connection, findings)))) => return Ok((address, connection, findings)),
-                    Ok((address, Err(error))) => failed.push((address, error)),
-                    Err(error) => tracing::error!(%error, "an attempt to connect ended abnormally"),
-                },
-                () = sleep(STAGGER), if has_more => {}
-            }
-        }
-    }
-
-    fn start(&self, address: SocketAddr) -> Result<(Connecting, Arc<Findings>), LinkError> {
-        let (client, findings) = config::client(&self.credentials, &self.options, &self.transport);
+    fn start(&self, address: SocketAddr) -> Result<(Connecting, Arc<Findings>, Arc<Gate>), LinkError> {
+        let (client, findings, gate) = config::client(self.flavor, &self.credentials, &self.options);
         let endpoint = self.endpoint(address)?;
         let connecting = endpoint
             .connect_with(client, address, SERVER_NAME)
             .map_err(|e| LinkError::Transport(e.to_string()))?;
-        Ok((connecting, findings))
+        Ok((connecting, findings, gate))
     }
 
     fn endpoint(&self, remote: SocketAddr) -> Result<Endpoint, LinkError> {
         let mut endpoints = self.endpoints.lock().unwrap_or_else(PoisonError::into_inner);
-        let (slot, any) = match remote {
-            SocketAddr::V4(_) => (&mut endpoints.v4, SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0))),
-            SocketAddr::V6(_) => (&mut endpoints.v6, SocketAddr::from((Ipv6Addr::UNSPECIFIED, 0))),
+        let slot = match remote {
+            SocketAddr::V4(_) => &mut endpoints.v4,
+            SocketAddr::V6(_) => &mut endpoints.v6,
         };
-        match slot {
-            Some(endpoint) => Ok(endpoint.clone()),
-            None => Ok(slot.insert(Endpoint::client(any)?).clone()),
+        if let Some(endpoint) = slot {
+            return Ok(endpoint.clone());
         }
+        let (socket, _) = socket::bind(socket::any_like(remote), &self.options)?;
+        let config = config::endpoint(self.flavor, None, 0);
+        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(TokioRuntime))?;
+        Ok(slot.insert(endpoint).clone())
     }
 
-    async fn greet(&self, connection: Connection, findings: Arc<Findings>) -> Result<QuicLink, LinkError> {
-        let fate = Fate::new(self.options.idle_timeout);
-        let reserve = Arc::new(Reserve::new(&connection, self.options.send_window_bytes.into()));
-        let after = self.options.handshake_timeout;
-        let greeted = async {
-            let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
-            let mut tx = Outlet::new(tx, PRIORITY_CONTROL, &fate, &reserve);
-            let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
-            // At once: the listener learns of the stream from what is sent on it.
-            send_frame(&mut tx, Greeting.to_bytes()).await?;
-            hear_greeting(&mut rx).await?;
-            Ok((tx, rx))
-        };
-        match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
-            Ok(control) => link(connection, &findings, true, control, fate).map_err(LinkError::RefusedHere),
-            Err(error) => {
-                if let LinkError::Protocol(why) = &error {
-                    close(&connection, &fate, &CloseReason::Protocol(why.to_string()), error.clone());
-                }
-                Err(error)
+    /// Moves every link to a fresh socket, so that it leaves by the interface that the system would choose now.
+    pub(crate) fn rebind(&self) -> std::io::Result<()> {
+        let endpoints = self.endpoints.lock().unwrap_or_else(PoisonError::into_inner);
+        for endpoint in [&endpoints.v4, &endpoints.v6].into_iter().flatten() {
+            let (socket, _) = socket::bind(socket::any_like(endpoint.local_addr()?), &self.options)?;
+            endpoint.rebind_abstract(socket)?;
+        }
+        Ok(())
+    }
+}
+
+/// Makes a link of an outgoing connection.
+pub(crate) async fn greet(
+    connection: Connection,
+    findings: Arc<Findings>,
+    gate: Arc<Gate>,
+    greeting: Greeting,
+    options: &LinkOptions,
+) -> Result<QuicLink, LinkError> {
+    let fate = Fate::new(options.idle_timeout);
+    let after = options.handshake_timeout;
+    let greeted = async {
+        let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
+        let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
+        let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
+        // At once: the listener learns of the stream from what is sent on it.
+        send_frame(&mut tx, greeting.to_bytes()).await?;
+        hear_greeting(&mut rx).await?;
+        Ok((tx, rx))
+    };
+    match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
+        Ok(control) => {
+            link(connection, &findings, true, greeting, control, fate, None).map_err(LinkError::RefusedHere)
+        }
+        Err(error) => {
+            if let LinkError::Protocol(why) = &error {
+                close(&connection, &fate, &CloseReason::Protocol(why.to_string()), error.clone());
             }
+            Err(error)
         }
     }
 }
 
 /// Waits for an outgoing handshake.
-async fn finish(
+pub(crate) async fn finish(
     connecting: Connecting,
     findings: &Findings,
     options: &LinkOptions,
@@ -348,27 +332,39 @@ async fn finish(
     }
 }
 
-async fn hear_greeting(rx: &mut ControlRx) -> Result<(), LinkError> {
+async fn hear_greeting(rx: &mut ControlRx) -> Result<Greeting, LinkError> {
     let frame = rx.recv().await?;
-    Greeting::from_slice(&frame).map_err(ProtocolError::Greeting)?;
-    Ok(())
+    Ok(Greeting::from_slice(&frame).map_err(ProtocolError::Greeting)?)
 }
 
 fn link(
     connection: Connection,
     findings: &Findings,
     is_dialer: bool,
+    Greeting { lane }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
     fate: Arc<Fate>,
+    claim: Option<Claim>,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
     let key_exchange = key_exchange(&connection);
-    let reserve = Arc::clone(&control_tx.reserve);
+    let gate = Arc::clone(&control_tx.gate);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
     let labels = Arc::default();
-    let shared =
-        Shared { connection, peer, is_dialer, key_exchange, control_tx, control_rx, labels, fate, reserve };
+    let shared = Shared {
+        connection,
+        peer,
+        is_dialer,
+        lane,
+        key_exchange,
+        control_tx,
+        control_rx,
+        labels,
+        fate,
+        gate,
+        _claim: claim,
+    };
     Ok(QuicLink { shared: Arc::new(shared) })
 }
 

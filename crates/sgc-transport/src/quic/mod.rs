@@ -3,13 +3,14 @@
 //! The first bidirectional stream, opened by the dialer, is the control stream; each flow is a unidirectional
 //! stream; datagrams are datagrams. How connections are made and authenticated is in the modules below.
 
+mod clear;
 mod config;
 mod endpoint;
-mod reserve;
-mod verifier;
 
-pub(crate) use endpoint::{QuicDialer, QuicListener};
-use reserve::Reserve;
+#[cfg(test)]
+pub(crate) use config::transport;
+pub(crate) use config::{Flavor, client, endpoint as endpoint_config};
+pub(crate) use endpoint::{DRAIN_TIMEOUT, QuicDialer, QuicListener, SERVER_NAME, finish, greet};
 
 use std::fmt;
 use std::future::{Future as _, poll_fn};
@@ -19,22 +20,25 @@ use std::sync::{Arc, OnceLock};
 use std::task::Poll;
 use std::time::Duration;
 
-use bytes::Bytes;
+use bytes::{Buf as _, Bytes};
 use quinn::{
     Connection, ConnectionError, ReadError, RecvStream, SendDatagramError, SendStream, StoppedError, VarInt,
-    WriteError, Written,
+    WriteError,
 };
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, Name, Packet};
+use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
 use tokio::sync::Mutex;
 
+use crate::congestion::Gate;
+use crate::dtls::Claim;
 use crate::error::{CloseReason, FlowEnd, FlowError, LabelError, LinkError, ProtocolError};
 use crate::flow::{self, Chunks, FlowRx, FlowTx};
 use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
 use crate::labels::Labels;
 use crate::link::{KeyExchange, Link, LinkStats};
 
-const PRIORITY_CONTROL: i32 = 3;
+/// How long QUIC has to end a connection by itself when what it travels in has ended.
+const LAST_WORD: Duration = Duration::from_millis(500);
 /// How many pieces one read takes at most: it bounds what is received and not yet consumed.
 const READ_PIECES: usize = 32;
 
@@ -48,12 +52,15 @@ struct Shared {
     connection: Connection,
     peer: VerifiedPeer,
     is_dialer: bool,
+    lane: Option<LaneToken>,
     key_exchange: KeyExchange,
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
     labels: Arc<Labels>,
     fate: Arc<Fate>,
-    reserve: Arc<Reserve>,
+    gate: Arc<Gate>,
+    /// Its hold on what it travels in.
+    _claim: Option<Claim>,
 }
 
 /// How the connection came to end, where this side knows better than QUIC.
@@ -76,22 +83,39 @@ impl Fate {
     }
 }
 
+/// What comes before what on a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Urgency {
+    Of(Class),
+    /// Always at once.
+    Control,
+}
+
+impl Urgency {
+    fn priority(self) -> i32 {
+        match self {
+            Self::Of(class) => class as i32,
+            Self::Control => Class::Realtime as i32 + 1,
+        }
+    }
+}
+
 /// The sending half of a stream. What it was given goes out whole and in order, also when a writer is cancelled.
 #[derive(Debug)]
 pub(crate) struct Outlet {
     stream: SendStream,
-    priority: i32,
+    urgency: Urgency,
     pending: Chunks,
     fate: Arc<Fate>,
-    reserve: Arc<Reserve>,
+    gate: Arc<Gate>,
 }
 
 impl Outlet {
-    fn new(stream: SendStream, priority: i32, fate: &Arc<Fate>, reserve: &Arc<Reserve>) -> Self {
+    fn new(stream: SendStream, urgency: Urgency, fate: &Arc<Fate>, gate: &Arc<Gate>) -> Self {
         // Fails only on a stream that is closed already, which the first write then says.
-        let _ = stream.set_priority(priority);
-        let (fate, reserve) = (Arc::clone(fate), Arc::clone(reserve));
-        Self { stream, priority, pending: Vec::new(), fate, reserve }
+        let _ = stream.set_priority(urgency.priority());
+        let (fate, gate) = (Arc::clone(fate), Arc::clone(gate));
+        Self { stream, urgency, pending: Vec::new(), fate, gate }
     }
 
     pub(crate) fn queue(&mut self, chunks: impl Iterator<Item = Bytes>) {
@@ -100,34 +124,59 @@ impl Outlet {
 
     pub(crate) async fn flush(&mut self) -> Result<(), LinkError> {
         while !self.pending.is_empty() {
-            let written = self.write().await;
-            match written {
-                Ok(written) => drop(self.pending.drain(..written.chunks)),
-                Err(error) => {
-                    self.pending.clear();
-                    return Err(self.explain(error));
-                }
+            let written = match self.urgency {
+                Urgency::Control => self.write_all().await,
+                Urgency::Of(class) => self.write_piece(class).await,
+            };
+            if let Err(error) = written {
+                self.pending.clear();
+                return Err(self.explain(error));
             }
         }
         Ok(())
     }
 
-    /// Writes some of what is pending: into the send window if it has room, else into the reserve, else later.
-    async fn write(&mut self) -> Result<Written, WriteError> {
-        let Self { stream, priority, pending, reserve, .. } = self;
-        let at_once = poll_fn(|cx| {
-            let mut attempt = || match pin!(stream.write_chunks(pending)).poll(cx) {
-                Poll::Ready(written) => Some(written),
-                Poll::Pending => None,
-            };
-            let written = attempt();
-            let opens = written.is_none() && *priority > 0;
-            Poll::Ready(if opens { reserve.open(*priority, attempt) } else { written })
+    /// Writes what is pending, whatever else waits.
+    async fn write_all(&mut self) -> Result<(), WriteError> {
+        let written = self.stream.write_chunks(&mut self.pending).await?;
+        self.pending.drain(..written.chunks);
+        self.gate.note_written(written.bytes);
+        Ok(())
+    }
+
+    /// Writes a piece of what is pending, as soon as the gate lets it.
+    async fn write_piece(&mut self, class: Class) -> Result<(), WriteError> {
+        let want = self.pending.iter().map(Bytes::len).sum();
+        let permit = match self.gate.try_admit(class, want) {
+            Some(permit) => permit,
+            None => tokio::select! {
+                permit = self.gate.admit(class, want) => permit,
+                // It ends before it is finished only if the peer or the connection ends it.
+                ended = self.stream.stopped() => return Err(match ended {
+                    Ok(Some(code)) => WriteError::Stopped(code),
+                    Ok(None) | Err(StoppedError::ZeroRttRejected) => WriteError::ClosedStream,
+                    Err(StoppedError::ConnectionLost(e)) => WriteError::ConnectionLost(e),
+                }),
+            },
+        };
+        let mut piece = front(&self.pending, permit.bytes());
+        let mut permit = Some(permit);
+        let (stream, gate) = (&mut self.stream, &self.gate);
+        let mut write = pin!(stream.write_chunks(&mut piece));
+        let written = poll_fn(|cx| {
+            let result = write.as_mut().poll(cx);
+            // The peer takes no more of this flow: others need not wait for it.
+            let leave = permit.take();
+            match (&result, leave) {
+                (Poll::Ready(Ok(written)), Some(leave)) => leave.written(written.bytes),
+                (Poll::Ready(Ok(written)), None) => gate.note_written(written.bytes),
+                _ => {}
+            }
+            result
         });
-        match at_once.await {
-            Some(written) => written,
-            None => self.stream.write_chunks(&mut self.pending).await,
-        }
+        let written = written.await?;
+        skip(&mut self.pending, written.bytes);
+        Ok(())
     }
 
     pub(crate) async fn finish(&mut self) -> Result<(), LinkError> {
@@ -148,6 +197,7 @@ impl Outlet {
     pub(crate) fn reset(&mut self, end: FlowEnd) {
         self.pending.clear();
         let _ = self.stream.reset(VarInt::from_u32(end.to_wire()));
+        self.gate.forget_unsent();
     }
 
     fn explain(&self, error: WriteError) -> LinkError {
@@ -165,6 +215,37 @@ impl Drop for Outlet {
         if !self.pending.is_empty() {
             self.reset(FlowEnd::Unwanted);
         }
+    }
+}
+
+/// The first `bytes` of these, or all.
+fn front(chunks: &[Bytes], mut bytes: usize) -> Chunks {
+    let mut out = Chunks::new();
+    for chunk in chunks {
+        let n = chunk.len().min(bytes);
+        out.push(chunk.slice(..n));
+        bytes -= n;
+        if bytes == 0 {
+            break;
+        }
+    }
+    out
+}
+
+/// Drops the first `bytes` of these, and what is empty then.
+fn skip(chunks: &mut Chunks, mut bytes: usize) {
+    let whole = chunks
+        .iter()
+        .take_while(|c| {
+            c.len() <= bytes && {
+                bytes -= c.len();
+                true
+            }
+        })
+        .count();
+    chunks.drain(..whole);
+    if let Some(first) = chunks.first_mut() {
+        first.advance(bytes);
     }
 }
 
@@ -224,6 +305,24 @@ impl ControlRx {
 }
 
 impl QuicLink {
+    /// Ends the link when what it travels in ends before it, with the error that comes of that.
+    pub(crate) fn end_with(&self, lower: impl Future<Output = LinkError> + Send + 'static) {
+        let shared = Arc::downgrade(&self.shared);
+        tokio::spawn(async move {
+            let error = lower.await;
+            if !matches!(error, LinkError::PeerRestarted) {
+                // QUIC may have been told more, which it has yet to read.
+                tokio::time::sleep(LAST_WORD).await;
+            }
+            // Closing what is closed would change the reason.
+            if let Some(shared) = shared.upgrade()
+                && shared.connection.close_reason().is_none()
+            {
+                close(&shared.connection, &shared.fate, &CloseReason::Goodbye, error);
+            }
+        });
+    }
+
     /// Ends the link because of what the peer did, unless it has ended already.
     fn fail(&self, error: LinkError) -> LinkError {
         if let LinkError::Protocol(why) = &error {
@@ -247,6 +346,10 @@ impl Link for QuicLink {
         self.shared.is_dialer
     }
 
+    fn lane(&self) -> Option<LaneToken> {
+        self.shared.lane
+    }
+
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
         if frame.len() > CONTROL_FRAME_BYTES_MAX {
             return Err(LinkError::FrameTooLong { bytes: frame.len() });
@@ -263,9 +366,9 @@ impl Link for QuicLink {
     }
 
     async fn open_flow(&self, class: Class) -> Result<FlowTx, LinkError> {
-        let Shared { connection, fate, reserve, .. } = &*self.shared;
+        let Shared { connection, fate, gate, .. } = &*self.shared;
         let stream = connection.open_uni().await.map_err(|e| fate.explain(&e))?;
-        Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, class as i32, fate, reserve))))
+        Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, Urgency::Of(class), fate, gate))))
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
@@ -279,12 +382,20 @@ impl Link for QuicLink {
     }
 
     async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let Shared { connection, fate, .. } = &*self.shared;
+        let Shared { connection, fate, gate, .. } = &*self.shared;
         let bytes = packet.encoded_bytes_as(label);
         let max = connection.max_datagram_size().unwrap_or(0);
         if bytes > max {
             return Err(LinkError::DatagramTooLong { bytes, max });
         }
+        let permit = match gate.try_admit(packet.header.class, bytes) {
+            Some(permit) => permit,
+            None => tokio::select! {
+                permit = gate.admit(packet.header.class, bytes) => permit,
+                error = connection.closed() => return Err(fate.explain(&error)),
+            },
+        };
+        permit.written(bytes);
         connection.send_datagram_wait(datagram(packet, label)).await.map_err(|e| match e {
             SendDatagramError::ConnectionLost(e) => fate.explain(&e),
             // The path may have narrowed in between.

@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use bytes::{Bytes, BytesMut};
 use quinn::crypto::rustls::QuicClientConfig;
 use quinn::{Connection, ConnectionError, Endpoint};
 use rand_chacha::ChaCha20Rng;
@@ -15,7 +16,7 @@ use rustls::sign::SingleCertAndKey;
 use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
 use sgc_transport::*;
 use sgc_trust::{EnrollRequest, Fleet, Identity};
-use sgc_wire::UnixMillis;
+use sgc_wire::{Class, HOP_LIMIT, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis};
 use tokio::sync::mpsc;
 
 pub const MINUTE: u64 = 60_000;
@@ -39,6 +40,37 @@ pub fn enroll_at(fleet: &Fleet, node: &str, now: UnixMillis) -> Arc<Identity> {
     Arc::new(fleet.issue(&request, &mut ChaCha20Rng::seed_from_u64(node.len() as u64)).unwrap())
 }
 
+/// A whole message in one reliable packet.
+pub fn packet(seq: u64, payload: Bytes) -> Packet {
+    packet_of(Class::Default, seq, payload)
+}
+
+/// The same in a class.
+pub fn packet_of(class: Class, seq: u64, payload: Bytes) -> Packet {
+    let header = PacketHeader {
+        reliable: true,
+        class,
+        hops: HOP_LIMIT,
+        suite: 1,
+        epoch: 1,
+        name: Name([1; 32]),
+        source: SourceId([2; 16]),
+        seq,
+        total: payload.len() as u32,
+        index: 0,
+        grid: 16_384,
+        to: None,
+    };
+    Packet::new(header, payload.into()).unwrap()
+}
+
+/// A payload in one piece.
+pub fn joined(payload: &Payload) -> Bytes {
+    let mut out = BytesMut::new();
+    payload.copy_into(&mut out);
+    out.freeze()
+}
+
 /// Whatever hangs fails.
 pub async fn soon<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(30), future).await.expect("it hangs")
@@ -55,6 +87,11 @@ pub struct Server {
 impl Server {
     pub fn start(identity: impl Into<CredentialStore>, options: LinkOptions) -> Self {
         Self::start_at("quic://127.0.0.1:0", identity, options)
+    }
+
+    /// By the transport of this scheme.
+    pub fn start_on(scheme: &str, identity: impl Into<CredentialStore>, options: LinkOptions) -> Self {
+        Self::start_at(&format!("{scheme}://127.0.0.1:0"), identity, options)
     }
 
     pub fn start_at(addr: &str, identity: impl Into<CredentialStore>, options: LinkOptions) -> Self {
@@ -102,8 +139,13 @@ pub async fn dial_with(dialer: &Dialer, url: &LinkUrl) -> Result<AnyLink, LinkEr
 
 /// A dialled link and its other end.
 pub async fn pair(options: LinkOptions) -> (AnyLink, AnyLink) {
+    pair_on("quic", options).await
+}
+
+/// The same by the transport of this scheme.
+pub async fn pair_on(scheme: &str, options: LinkOptions) -> (AnyLink, AnyLink) {
     let fleet = fleet(1);
-    let mut server = Server::start(enroll(&fleet, "router"), options.clone());
+    let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options.clone());
     let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
     let near = soon(dialer.dial(&server.url)).await.unwrap();
     (near, server.link().await)

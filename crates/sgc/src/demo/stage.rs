@@ -7,7 +7,7 @@ use std::io;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
-use sgc_node::config::{SOCKET_PATH_BYTES_MAX, ShareConfig, ShareMetadata};
+use sgc_node::config::{SOCKET_PATH_BYTES_MAX, Shaping, ShareConfig, ShareMetadata};
 use sgc_trust::{EnrollRequest, Fleet, Identity, NodeName, Suite};
 use sgc_wire::{Class, Name};
 use tempfile::TempDir;
@@ -120,11 +120,15 @@ impl Stage {
     pub(crate) fn name_of(&self, topic: Topic) -> Result<Name, CliError> {
         let owner: NodeName = topic.owner().name().parse()?;
         let share = ShareConfig {
+            interface: Default::default(),
             topic: topic.ros_name().to_owned(),
+            naming: Default::default(),
             type_name: Some(topic.type_name().to_owned()),
             to: Vec::new(),
             publish: Vec::new(),
             priority: Class::default(),
+            shaping: Shaping::default(),
+            dedicated: false,
             suite: Suite::Group,
             metadata: ShareMetadata::default(),
         };

@@ -108,7 +108,11 @@ impl Peer {
 
     /// SIGTERM; its summary follows.
     pub(crate) fn end(&mut self) {
-        kill_process(Pid::from_child(&self.child), Signal::TERM).unwrap();
+        self.signal(Signal::TERM);
+    }
+
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
     /// What it sums up at its end.

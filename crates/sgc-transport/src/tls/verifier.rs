@@ -24,35 +24,35 @@ use crate::credentials::CredentialStore;
 
 /// What a handshake found out about the peer.
 #[derive(Debug, Default)]
-pub(super) struct Findings {
+pub(crate) struct Findings {
     /// Empty as long as no certificate came.
     verdict: OnceLock<Result<VerifiedPeer, CertError>>,
     /// Whether only post-quantum key exchanges are accepted.
-    pub(super) post_quantum: bool,
+    pub(crate) post_quantum: bool,
     /// Whether a dialer's groups hold one that is accepted here; empty as long as it offered none.
     offers_group: OnceLock<bool>,
 }
 
 impl Findings {
     /// Who the peer is, or why it is not believed.
-    pub(super) fn verdict(&self) -> Option<&Result<VerifiedPeer, CertError>> {
+    pub(crate) fn verdict(&self) -> Option<&Result<VerifiedPeer, CertError>> {
         self.verdict.get()
     }
 
     /// True if it was heard out and offers no key exchange that is accepted here.
-    pub(super) fn lacks_key_exchange(&self) -> bool {
+    pub(crate) fn lacks_key_exchange(&self) -> bool {
         self.offers_group.get() == Some(&false)
     }
 }
 
-pub(super) struct PeerVerifier {
+pub(crate) struct PeerVerifier {
     credentials: CredentialStore,
     algorithms: WebPkiSupportedAlgorithms,
     findings: Arc<Findings>,
 }
 
 impl PeerVerifier {
-    pub(super) fn new(
+    pub(crate) fn new(
         credentials: &CredentialStore,
         provider: &CryptoProvider,
         post_quantum: bool,
@@ -72,15 +72,7 @@ impl PeerVerifier {
         attaches: bool,
     ) -> Result<(), Error> {
         let chain: Vec<CertificateDer<'_>> = std::iter::once(leaf).chain(intermediates).cloned().collect();
-        // Read here and not when the handshake began: what was revoked since counts.
-        let anchors = self.credentials.anchors();
-        let mut result = anchors.verify(&chain, UnixMillis(now.as_secs().saturating_mul(1000)));
-        if let Ok(peer) = &result
-            && attaches
-            && !self.credentials.admits(peer)
-        {
-            result = Err(CertError::NotAdmitted { ca: peer.ca });
-        }
+        let result = judge(&self.credentials, &chain, now, attaches);
         let answer = result.as_ref().map(drop).map_err(|e| Error::InvalidCertificate(alert(e)));
         // The first verdict stands: a handshake asks once.
         let _ = self.findings.verdict.set(result);
@@ -88,12 +80,28 @@ impl PeerVerifier {
     }
 }
 
+/// Who shows this chain, leaf first, or why it is not believed now. `attaches`: the peer came to a listener of this node.
+pub(crate) fn judge(
+    credentials: &CredentialStore,
+    chain: &[CertificateDer<'_>],
+    now: UnixTime,
+    attaches: bool,
+) -> Result<VerifiedPeer, CertError> {
+    // Read here and not when the handshake began: what was revoked since counts.
+    let anchors = credentials.anchors();
+    let peer = anchors.verify(chain, UnixMillis(now.as_secs().saturating_mul(1000)))?;
+    if attaches && !credentials.admits(&peer) {
+        return Err(CertError::NotAdmitted { ca: peer.ca });
+    }
+    Ok(peer)
+}
+
 /// Shows the listener's certificate, and notes what the dialer offers: an alert says nothing of it.
 #[derive(Debug)]
-pub(super) struct Presenter {
-    pub(super) key: Arc<CertifiedKey>,
-    pub(super) accepted: Vec<NamedGroup>,
-    pub(super) findings: Arc<Findings>,
+pub(crate) struct Presenter {
+    pub(crate) key: Arc<CertifiedKey>,
+    pub(crate) accepted: Vec<NamedGroup>,
+    pub(crate) findings: Arc<Findings>,
 }
 
 impl ResolvesServerCert for Presenter {
@@ -171,8 +179,35 @@ impl ClientCertVerifier for PeerVerifier {
     handshake_signatures!();
 }
 
+/// Believes whatever certificate, for TLS that only hides: what it carries is authenticated within.
+#[derive(Debug)]
+pub(crate) struct Anyone {
+    algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl Anyone {
+    pub(crate) fn new(provider: &CryptoProvider) -> Self {
+        Self { algorithms: provider.signature_verification_algorithms }
+    }
+}
+
+impl ServerCertVerifier for Anyone {
+    fn verify_server_cert(
+        &self,
+        _end_entity: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        _server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        _now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        Ok(ServerCertVerified::assertion())
+    }
+
+    handshake_signatures!();
+}
+
 /// What the peer is told: the alert that fits, and no more.
-fn alert(error: &CertError) -> CertificateError {
+pub(crate) fn alert(error: &CertError) -> CertificateError {
     match error {
         CertError::UnknownIssuer => CertificateError::UnknownIssuer,
         CertError::NotAdmitted { .. } => CertificateError::ApplicationVerificationFailure,

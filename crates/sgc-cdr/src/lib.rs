@@ -1,0 +1,29 @@
+//! ROS 2 message definitions, and serialised messages decoded by them.
+//!
+//! [`Library`] holds definitions: those that come with ROS 2 ship inside, others are parsed from the text of `.msg`,
+//! `.srv` and `.action` files, which the caller finds. [`Library::layout`] resolves a type to what its CDR looks like;
+//! [`Layout::decode`] turns a payload into a [`Value`], which is shown as YAML or JSON. Where definitions are looked for,
+//! and where payloads come from, is for others; so is writing CDR.
+//!
+//! Payloads and definitions are anybody's: sizes, depths and counts are bounded, and what does not fit is a typed error.
+#![forbid(unsafe_code)]
+
+mod decode;
+mod definition;
+mod hash;
+mod json;
+mod layout;
+mod library;
+mod parse;
+mod value;
+mod yaml;
+
+pub use decode::{DecodeError, VALUES_MAX};
+pub use definition::{
+    Base, Constant, DUMMY_MEMBER, Definition, Field, FieldType, Primitive, Shape, TypeName, TypeNameError,
+};
+pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};
+pub use library::{Library, LookUp, TypeError};
+pub use parse::{DEFINITION_BYTES_MAX, ParseError, ParseProblem, parse};
+pub use value::Value;
+pub use yaml::YamlStyle;

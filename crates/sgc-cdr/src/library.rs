@@ -1,0 +1,224 @@
+//! The definitions that are known, and looking up those that are not.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use crate::definition::{Base, Definition, TypeName};
+use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, Struct};
+use crate::parse::{ParseError, parse};
+
+/// The interfaces that ship inside: `common.txt`, written by `scripts/make-interfaces.py`.
+const COMMON: &str = include_str!("common.txt");
+/// What a file in it begins with.
+const COMMON_HEAD: &str = "== ";
+
+/// Finds the text of the file that defines a type: `std_srvs/srv/SetBool` for `std_srvs/srv/SetBool_Request`.
+pub type LookUp<'a> = dyn FnMut(&TypeName) -> Option<String> + 'a;
+
+/// Why a type cannot be decoded.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TypeError {
+    /// Nobody defines it.
+    #[error("no definition of {name}{}", within(.needed_by))]
+    Unknown {
+        /// The type.
+        name: TypeName,
+        /// The type that contains it, if it is not the one that was asked for.
+        needed_by: Option<Box<TypeName>>,
+    },
+    /// Its definition is wrong.
+    #[error(transparent)]
+    Parse(#[from] ParseError),
+    /// It contains itself.
+    #[error("{name} contains itself")]
+    Circle {
+        /// The type.
+        name: TypeName,
+    },
+    /// It contains types in types in types.
+    #[error("{name} is nested deeper than {LAYOUT_DEPTH_MAX} types")]
+    TooDeep {
+        /// The type.
+        name: TypeName,
+    },
+    /// It contains too many types.
+    #[error("{name} consists of more than {LAYOUT_STRUCTS_MAX} types")]
+    TooLarge {
+        /// The type.
+        name: TypeName,
+    },
+}
+
+fn within(needed_by: &Option<Box<TypeName>>) -> String {
+    needed_by.as_ref().map(|name| format!(", which {name} contains")).unwrap_or_default()
+}
+
+/// Definitions by name.
+#[derive(Clone, Debug, Default)]
+pub struct Library {
+    definitions: BTreeMap<TypeName, Definition>,
+}
+
+impl Library {
+    /// Knows nothing.
+    pub fn empty() -> Self {
+        Self::default()
+    }
+
+    /// The text of the file among the shipped interfaces that defines this type.
+    pub fn shipped(file: &TypeName) -> Option<String> {
+        let head = format!("{COMMON_HEAD}{file}\n");
+        let begin = match COMMON.find(&format!("\n{head}")) {
+            Some(before) => before + 1 + head.len(),
+            None if COMMON.starts_with(&head) => head.len(),
+            None => return None,
+        };
+        let text = COMMON.get(begin..)?;
+        let end = text.find(&format!("\n{COMMON_HEAD}")).map_or(text.len(), |end| end + 1);
+        text.get(..end).filter(|text| !text.starts_with(COMMON_HEAD)).or(Some("")).map(str::to_owned)
+    }
+
+    /// Files among the shipped interfaces: `std_msgs/msg/String`, `std_srvs/srv/SetBool`.
+    pub fn shipped_files() -> impl Iterator<Item = TypeName> {
+        COMMON.lines().filter_map(|line| line.strip_prefix(COMMON_HEAD)?.parse().ok())
+    }
+
+    /// Adds what a file defines; what was known under those names is replaced.
+    pub fn add(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
+        for definition in parse(file, text)? {
+            self.definitions.insert(definition.name.clone(), definition);
+        }
+        Ok(())
+    }
+
+    /// The definition of a type, if it is known.
+    pub fn definition(&self, name: &TypeName) -> Option<&Definition> {
+        self.definitions.get(name)
+    }
+
+    /// What the CDR of a type looks like. Asks `look_up` for what is not known, and takes what ships where it has
+    /// nothing.
+    pub fn layout(&mut self, name: &TypeName, look_up: &mut LookUp<'_>) -> Result<Layout, TypeError> {
+        let mut resolver = Resolver { library: self, look_up, structs: Vec::new(), places: BTreeMap::new() };
+        resolver.resolve(name, None, &mut BTreeSet::new())?;
+        Ok(Layout { structs: resolver.structs })
+    }
+
+    fn known(
+        &mut self,
+        name: &TypeName,
+        needed_by: Option<&TypeName>,
+        look_up: &mut LookUp<'_>,
+    ) -> Result<&Definition, TypeError> {
+        let unknown =
+            || TypeError::Unknown { name: name.clone(), needed_by: needed_by.cloned().map(Box::new) };
+        if !self.definitions.contains_key(name) {
+            let file = TypeName::new(name.package(), name.kind(), name.file_stem()).ok_or_else(unknown)?;
+            let text = look_up(&file).or_else(|| Self::shipped(&file)).ok_or_else(unknown)?;
+            self.add(&file, &text)?;
+        }
+        self.definitions.get(name).ok_or_else(unknown)
+    }
+}
+
+struct Resolver<'a, 'b> {
+    library: &'a mut Library,
+    look_up: &'a mut LookUp<'b>,
+    structs: Vec<Struct>,
+    places: BTreeMap<TypeName, usize>,
+}
+
+impl Resolver<'_, '_> {
+    /// Puts a type behind what it contains; gives its place. `above` are those that contain it.
+    fn resolve(
+        &mut self,
+        name: &TypeName,
+        needed_by: Option<&TypeName>,
+        above: &mut BTreeSet<TypeName>,
+    ) -> Result<usize, TypeError> {
+        if let Some(place) = self.places.get(name) {
+            return Ok(*place);
+        }
+        if above.len() >= LAYOUT_DEPTH_MAX {
+            return Err(TypeError::TooDeep { name: name.clone() });
+        }
+        if !above.insert(name.clone()) {
+            return Err(TypeError::Circle { name: name.clone() });
+        }
+        let definition = self.library.known(name, needed_by, self.look_up)?.clone();
+        let mut members = Vec::with_capacity(definition.fields.len());
+        for field in definition.fields {
+            let element = match &field.field_type.base {
+                Base::Primitive(primitive) => Element::Primitive(*primitive),
+                Base::String { bound } => Element::String { bound: *bound },
+                Base::WString { bound } => Element::WString { bound: *bound },
+                Base::Message(inner) => Element::Struct(self.resolve(inner, Some(name), above)?),
+            };
+            let shape = field.field_type.shape;
+            members.push(Member {
+                name: Arc::from(field.name),
+                element,
+                shape,
+                field_type: field.field_type,
+            });
+        }
+        above.remove(name);
+        if self.structs.len() >= LAYOUT_STRUCTS_MAX {
+            return Err(TypeError::TooLarge { name: name.clone() });
+        }
+        self.structs.push(Struct { name: name.clone(), members });
+        self.places.insert(name.clone(), self.structs.len() - 1);
+        Ok(self.structs.len() - 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_that_ships_can_be_laid_out() {
+        let mut files = 0;
+        let mut library = Library::empty();
+        for file in Library::shipped_files() {
+            files += 1;
+            for definition in parse(&file, &Library::shipped(&file).unwrap()).unwrap() {
+                let layout = library.layout(&definition.name, &mut |_| None).unwrap();
+                assert_eq!(layout.name(), Some(&definition.name));
+            }
+        }
+        assert!(files > 200, "{files}");
+    }
+
+    #[test]
+    fn what_is_given_comes_before_what_ships() {
+        let name = "std_msgs/msg/String".parse().unwrap();
+        let layout = Library::empty().layout(&name, &mut |_| Some("int8 a\nint8 b\n".into())).unwrap();
+        assert_eq!(layout.structs[0].members.len(), 2);
+    }
+
+    #[test]
+    fn what_cannot_be_laid_out_is_said() {
+        let name = |text: &str| text.parse::<TypeName>().unwrap();
+        let mut texts = |file: &TypeName| match file.name() {
+            "A" => Some("B b".to_owned()),
+            "B" => Some("A[] a".to_owned()),
+            "Lacks" => Some("Nobody[2] x".to_owned()),
+            "Wrong" => Some("int33".to_owned()),
+            deep => deep.strip_prefix("D")?.parse::<u32>().ok().map(|n| format!("D{} d", n + 1)),
+        };
+        let mut of = |text: &str| Library::empty().layout(&name(text), &mut texts).map(|_| ()).unwrap_err();
+        assert_eq!(of("p/msg/A"), TypeError::Circle { name: name("p/msg/A") });
+        assert!(matches!(of("p/msg/D0"), TypeError::TooDeep { .. }));
+        assert!(matches!(of("p/msg/Wrong"), TypeError::Parse(_)));
+        assert_eq!(of("p/msg/Nobody").to_string(), "no definition of p/msg/Nobody");
+        let lacks = of("p/msg/Lacks").to_string();
+        assert_eq!(lacks, "no definition of p/msg/Nobody, which p/msg/Lacks contains");
+        let mut wide = |file: &TypeName| match file.name() {
+            "W" => Some((0..=LAYOUT_STRUCTS_MAX).map(|n| format!("N{n} n{n}\n")).collect()),
+            _ => Some("int8 a".to_owned()),
+        };
+        let too_large = Library::empty().layout(&name("p/msg/W"), &mut wide).map(|_| ()).unwrap_err();
+        assert!(matches!(too_large, TypeError::TooLarge { .. }), "{too_large}");
+    }
+}

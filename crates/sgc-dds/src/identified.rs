@@ -1,0 +1,493 @@
+//! Samples with a related identity in their inline QoS: a sertype of our own.
+//!
+//! Cyclone DDS 11 neither reads nor writes that parameter. But it lets the type of a topic (de)serialise, and that is
+//! enough: coming in, it hands out the received packet, so the inline QoS in front of the payload can be read; going
+//! out, it asks for the payload when the submessage's header is in the message and before its length is set, so
+//! parameters can still be added. The latter reaches into `struct ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0
+//! builds; [`add_related`] says what it relies on, and leaves the message alone where that does not hold.
+//!
+//! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
+
+use std::ffi::{c_int, c_void};
+use std::mem::offset_of;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use bytes::Bytes;
+use cyclors::{
+    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, dds_create_topic_sertype, ddsi_keyhash, ddsi_serdata,
+    ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA, ddsi_serdata_kind_SDK_KEY,
+    ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini, ddsi_sertype_init_flags,
+    ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
+};
+use sgc_ros::EndpointSpec;
+
+use crate::entity::{Entity, c_string};
+use crate::identity::{IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity};
+use crate::network::Participant;
+use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
+
+/// What a received message says besides its payload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Origin {
+    /// Vendor of the sender, from the header of the RTPS message.
+    pub(crate) vendor: [u8; 2],
+    /// Sequence number of the message at its writer.
+    pub(crate) number: i64,
+    /// Which message it refers to.
+    pub(crate) related: Option<SampleIdentity>,
+}
+
+/// A sample of the sertype made here. `common` is first: Cyclone knows no more of it.
+#[repr(C)]
+struct Identified {
+    common: ddsi_serdata,
+    /// Encapsulation header, body and padding.
+    payload: Vec<u8>,
+    /// What to put into the inline QoS.
+    related: Option<SampleIdentity>,
+    /// What was in the message that it came in.
+    origin: Option<Origin>,
+}
+
+/// One reference to a sample of the sertype made here.
+#[derive(Debug)]
+pub(crate) struct IdentifiedSample(*mut ddsi_serdata);
+
+impl IdentifiedSample {
+    /// Takes over a reference.
+    ///
+    /// # Safety
+    /// The caller owns one reference to `sample`, which is of a topic that [`topic`] made.
+    pub(crate) unsafe fn from_raw(sample: *mut ddsi_serdata) -> Self {
+        Self(sample)
+    }
+
+    /// A sample to write, with the identity of the request that it belongs to, or none.
+    ///
+    /// # Safety
+    /// `sertype` must be that of a topic that [`topic`] made; Cyclone keeps it while the sample is in use.
+    pub(crate) unsafe fn build(
+        sertype: *const ddsi_sertype,
+        frame: &Frame<'_>,
+        related: Option<SampleIdentity>,
+        source_timestamp_ns: i64,
+    ) -> Self {
+        let mut payload = Vec::with_capacity(frame.bytes());
+        payload.extend_from_slice(&frame.header);
+        payload.extend_from_slice(&frame.prefix[..frame.prefix_bytes]);
+        payload.extend_from_slice(frame.body);
+        payload.resize(frame.bytes(), 0);
+        // SAFETY: valid by contract.
+        let sample =
+            unsafe { Identified::allocate(sertype, ddsi_serdata_kind_SDK_DATA, payload, related, None) };
+        // SAFETY: just made, and not shared yet.
+        unsafe { (*sample).timestamp.v = source_timestamp_ns };
+        Self(sample)
+    }
+
+    /// Gives the reference away, to a call that consumes it.
+    pub(crate) fn into_raw(self) -> *mut ddsi_serdata {
+        let sample = self.0;
+        std::mem::forget(self);
+        sample
+    }
+
+    /// Where a received sample came from, and a copy of its payload: what goes through here is small.
+    pub(crate) fn read(&self) -> (Option<Origin>, Bytes) {
+        // SAFETY: of the sertype made here, by the contract of both constructors; a reference is held.
+        let sample = unsafe { &*self.0.cast::<Identified>() };
+        (sample.origin, Bytes::copy_from_slice(&sample.payload))
+    }
+}
+
+impl Drop for IdentifiedSample {
+    fn drop(&mut self) {
+        // SAFETY: one reference is owned and given back once.
+        unsafe { ddsi_serdata_unref(self.0) }
+    }
+}
+
+/// Makes the topic of a spec with the sertype of this module.
+pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<Entity, String> {
+    let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
+    // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
+    let mut sertype = Box::into_raw(Box::new(unsafe { std::mem::zeroed::<ddsi_sertype>() }));
+    let flags = if spec.keyless { DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY } else { 0 };
+    // SAFETY: `sertype` has room, the name is copied, and both tables live for ever.
+    unsafe { ddsi_sertype_init_flags(sertype, type_name.as_ptr(), &SERTYPE.0, &SERDATA.0, flags) };
+    // SAFETY: the handle is checked by Cyclone, the name is copied; null means defaults, no listener and no
+    // parameters. If it succeeds it has taken over the reference to the sertype.
+    let handle = unsafe {
+        dds_create_topic_sertype(
+            participant.entity().handle(),
+            name.as_ptr(),
+            &mut sertype,
+            std::ptr::null(),
+            std::ptr::null(),
+            std::ptr::null(),
+        )
+    };
+    if handle < 0 {
+        // SAFETY: the reference is still ours.
+        unsafe { ddsi_sertype_unref(sertype) };
+    }
+    Entity::new(handle)
+}
+
+/// How many messages were sent without the identity that they should carry, since the Cyclone that this was linked with is
+/// not the one that it was written for. Always 0 with the version that `Cargo.toml` asks for.
+pub fn unidentified_messages() -> u64 {
+    UNIDENTIFIED.load(Ordering::Relaxed)
+}
+
+static UNIDENTIFIED: AtomicU64 = AtomicU64::new(0);
+
+// Functions of Cyclone that `cyclors` has no binding for. `ddsi__xmsg.h`, `ddsi_serdata.h`.
+#[allow(improper_ctypes)]
+unsafe extern "C" {
+    fn ddsi_serdata_ref(sample: *const ddsi_serdata) -> *mut ddsi_serdata;
+    fn ddsi_xmsg_addpar(message: *mut Xmsg, pid: u16, bytes: usize) -> *mut c_void;
+    fn ddsi_xmsg_addpar_sentinel(message: *mut Xmsg);
+    fn ddsi_xmsg_submsg_from_marker(message: *mut Xmsg, marker: XmsgMarker) -> *mut c_void;
+}
+
+/// The beginning of `struct ddsi_xmsg` (`ddsi_xmsg.c`), a message under construction.
+#[repr(C)]
+struct Xmsg {
+    pool: *mut c_void,
+    bytes_max: usize,
+    bytes: usize,
+    have_parameters: c_int,
+    payload: *mut ddsi_serdata,
+    payload_view: ddsrt_iovec_t,
+}
+
+/// `struct ddsi_xmsg_marker`: where in a message a submessage begins.
+#[repr(C)]
+struct XmsgMarker {
+    offset: usize,
+}
+
+/// The beginning of `struct ddsi_rdata` (`ddsi_radmin.h`), a fragment of a received sample.
+#[repr(C)]
+struct ReceivedFragment {
+    message: *const ReceivedMessage,
+    next: *const ReceivedFragment,
+    first: u32,
+    end: u32,
+    submessage_offset: u16,
+    payload_offset: u16,
+}
+
+/// `struct ddsi_rmsg` (`ddsi_radmin.h`); the packet follows it.
+#[repr(C)]
+struct ReceivedMessage {
+    references: u32,
+    last_chunk: *mut c_void,
+    trace: bool,
+    chunk_buffer: *mut c_void,
+    chunk_next: *mut c_void,
+    chunk_bytes: u64,
+}
+
+/// RTPS submessage kinds and their lengths up to the inline QoS, bytes (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
+const DATA: (u8, usize) = (0x15, 24);
+const DATA_FRAG: (u8, usize) = (0x16, 36);
+
+/// Where `octetsToInlineQos` ends, which it counts from: bytes from the beginning of the submessage.
+const INLINE_QOS_BASE: usize = 8;
+
+/// Where the sequence number is in either submessage: bytes from its beginning.
+const NUMBER_OFFSET: usize = 16;
+
+/// Flags of submessages (RTPS 2.5, 9.4.5.4.1).
+const FLAG_LITTLE_ENDIAN: u8 = 0x01;
+const FLAG_INLINE_QOS: u8 = 0x02;
+
+/// Length of the RTPS header, bytes (RTPS 2.5, 9.4.4).
+const RTPS_HEADER_BYTES: usize = 20;
+
+impl Identified {
+    /// # Safety
+    /// `sertype` must be of this module and outlive the sample.
+    unsafe fn allocate(
+        sertype: *const ddsi_sertype,
+        kind: ddsi_serdata_kind,
+        payload: Vec<u8>,
+        related: Option<SampleIdentity>,
+        origin: Option<Origin>,
+    ) -> *mut ddsi_serdata {
+        // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
+        let common = unsafe { std::mem::zeroed::<ddsi_serdata>() };
+        let sample = Box::into_raw(Box::new(Self { common, payload, related, origin }));
+        // SAFETY: `sample` is valid, the sertype by contract.
+        unsafe { ddsi_serdata_init(&raw mut (*sample).common, sertype, kind) };
+        sample.cast()
+    }
+}
+
+/// Adds the identity to a message, into whose header the submessage of this sample has just been written. `view` is where
+/// the message keeps its payload.
+///
+/// # Safety
+/// `view` must be the `refd_payload_iov` of a `struct ddsi_xmsg` of Cyclone DDS 11 as `cyclors` =0.4.0 builds it:
+/// `ddsi_xmsg_serdata` is the only function there that asks for the payload of a sample of this sertype. (Others ask for
+/// keys, or copy samples for local readers of another sertype, which do not exist: endpoints ignore their own participant.)
+unsafe fn add_related(view: *mut ddsrt_iovec_t, related: SampleIdentity) -> bool {
+    // SAFETY: by contract the view is that field of that struct.
+    let message = unsafe { view.cast::<u8>().sub(offset_of!(Xmsg, payload_view)).cast::<Xmsg>() };
+    // SAFETY: valid by contract.
+    let (bytes, busy) =
+        unsafe { ((*message).bytes, (*message).have_parameters != 0 || !(*message).payload.is_null()) };
+    if busy {
+        return false;
+    }
+    let Some(offset) = [DATA, DATA_FRAG].into_iter().find_map(|(kind, length)| {
+        let offset = bytes.checked_sub(length).filter(|at| at % 4 == 0)?;
+        // SAFETY: the offset is in the message, `length` bytes from its end.
+        let header = unsafe {
+            let at = ddsi_xmsg_submsg_from_marker(message, XmsgMarker { offset }).cast::<u8>();
+            at.cast::<[u8; INLINE_QOS_BASE]>().read()
+        };
+        let to_inline_qos = usize::from(u16::from_ne_bytes([header[6], header[7]]));
+        let plain = header[1] & FLAG_INLINE_QOS == 0;
+        (header[0] == kind && INLINE_QOS_BASE + to_inline_qos == length && plain).then_some(offset)
+    }) else {
+        return false;
+    };
+    let value = related.to_bytes();
+    for pid in [PID_RELATED, PID_RELATED_FAST] {
+        // SAFETY: returns room for as many bytes as asked for.
+        unsafe {
+            let place = ddsi_xmsg_addpar(message, pid, IDENTITY_BYTES).cast::<u8>();
+            place.copy_from_nonoverlapping(value.as_ptr(), IDENTITY_BYTES);
+        }
+    }
+    // SAFETY: as above; the header is looked up again, since adding may have moved the message.
+    unsafe {
+        ddsi_xmsg_addpar(message, PID_NOT_FOR_CYCLONE, 4).cast::<[u8; 4]>().write([0; 4]);
+        ddsi_xmsg_addpar_sentinel(message);
+        let header = ddsi_xmsg_submsg_from_marker(message, XmsgMarker { offset }).cast::<u8>();
+        *header.add(1) |= FLAG_INLINE_QOS;
+    }
+    true
+}
+
+/// Reads what the first fragment's message says of its origin.
+///
+/// # Safety
+/// `fragment` must be a fragment that Cyclone hands to a sertype: its message is valid, and both offsets are in it.
+unsafe fn origin(fragment: &ReceivedFragment) -> Option<Origin> {
+    let (submessage, payload) =
+        (usize::from(fragment.submessage_offset), usize::from(fragment.payload_offset));
+    if submessage < RTPS_HEADER_BYTES || payload < submessage + DATA.1 {
+        return None;
+    }
+    // SAFETY: the packet follows the struct, and is at least as long as the offset of the payload in it.
+    let packet = unsafe { std::slice::from_raw_parts(fragment.message.add(1).cast::<u8>(), payload) };
+    let vendor = [packet[6], packet[7]];
+    let head = packet[..4] == *b"RTPS";
+    let submessage = &packet[submessage..];
+    let (kind, flags) = (submessage[0], submessage[1]);
+    if !head || !matches!(kind, 0x15 | 0x16) {
+        return None;
+    }
+    // Cyclone has put the fixed part into the byte order of this machine; the inline QoS is as it came.
+    let number = submessage[NUMBER_OFFSET..].first_chunk::<8>()?;
+    let (high, low) = (number.first_chunk::<4>()?, number.last_chunk::<4>()?);
+    let number = i64::from(i32::from_ne_bytes(*high)) << 32 | i64::from(u32::from_ne_bytes(*low));
+    let related = if flags & FLAG_INLINE_QOS == 0 {
+        None
+    } else {
+        let at = INLINE_QOS_BASE + usize::from(u16::from_ne_bytes([submessage[6], submessage[7]]));
+        submessage.get(at..).and_then(|qos| SampleIdentity::related(qos, flags & FLAG_LITTLE_ENDIAN == 0))
+    };
+    Some(Origin { vendor, number, related })
+}
+
+/// A table of functions that Cyclone reads from any thread.
+struct Table<T>(T);
+
+// SAFETY: the tables hold function pointers and null pointers, and are never written to.
+unsafe impl<T> Sync for Table<T> {}
+
+static SERTYPE: Table<ddsi_sertype_ops> = Table(ddsi_sertype_ops {
+    version: Some(cyclors::ddsi_sertype_v0),
+    arg: std::ptr::null_mut(),
+    free: Some(sertype_free),
+    zero_samples: None,
+    realloc_samples: None,
+    free_samples: None,
+    equal: Some(sertype_equal),
+    hash: Some(sertype_hash),
+    type_id: None,
+    type_map: None,
+    type_info: None,
+    derive_sertype: None,
+    get_serialized_size: None,
+    serialize_into: None,
+});
+
+static SERDATA: Table<ddsi_serdata_ops> = Table(ddsi_serdata_ops {
+    eqkey: Some(eqkey),
+    get_size: Some(size),
+    from_ser: Some(from_ser),
+    from_ser_iov: Some(from_ser_iov),
+    from_keyhash: Some(from_keyhash),
+    from_sample: None,
+    to_ser: Some(to_ser),
+    to_ser_ref: Some(to_ser_ref),
+    to_ser_unref: Some(to_ser_unref),
+    to_sample: None,
+    to_untyped: Some(to_untyped),
+    untyped_to_sample: None,
+    free: Some(free),
+    print: None,
+    get_keyhash: Some(get_keyhash),
+    from_loaned_sample: None,
+    from_psmx: None,
+});
+
+// What follows is called by Cyclone, from its own threads, with arguments that are valid as its headers say.
+
+unsafe extern "C" fn sertype_free(sertype: *mut ddsi_sertype) {
+    // SAFETY: the last reference to what `topic` made of a box.
+    unsafe {
+        ddsi_sertype_fini(sertype);
+        drop(Box::from_raw(sertype));
+    }
+}
+
+/// Nothing here goes beyond the fields that Cyclone has compared already.
+unsafe extern "C" fn sertype_equal(_: *const ddsi_sertype, _: *const ddsi_sertype) -> bool {
+    true
+}
+
+unsafe extern "C" fn sertype_hash(_: *const ddsi_sertype) -> u32 {
+    0
+}
+
+unsafe extern "C" fn eqkey(_: *const ddsi_serdata, _: *const ddsi_serdata) -> bool {
+    true
+}
+
+unsafe extern "C" fn size(sample: *const ddsi_serdata) -> u32 {
+    // SAFETY: of this sertype. The length is at most `PAYLOAD_BYTES_MAX`.
+    unsafe { (*sample.cast::<Identified>()).payload.len() as u32 }
+}
+
+unsafe extern "C" fn from_ser(
+    sertype: *const ddsi_sertype,
+    kind: ddsi_serdata_kind,
+    fragments: *const cyclors::ddsi_rdata,
+    bytes: usize,
+) -> *mut ddsi_serdata {
+    if bytes > PAYLOAD_BYTES_MAX {
+        return std::ptr::null_mut();
+    }
+    let mut payload = Vec::with_capacity(bytes);
+    let mut from = None;
+    let mut at = fragments.cast::<ReceivedFragment>();
+    // SAFETY: a chain of fragments that ends with null; each one's message holds its bytes at the offset of its payload.
+    unsafe {
+        while let Some(fragment) = at.as_ref() {
+            let had = payload.len();
+            if fragment.first == 0 && from.is_none() {
+                from = origin(fragment);
+            }
+            let (first, end) = (fragment.first as usize, fragment.end as usize);
+            // They may overlap, and never leave a gap.
+            if end > had && first <= had && end <= bytes {
+                let start = fragment.message.add(1).cast::<u8>().add(usize::from(fragment.payload_offset));
+                payload.extend_from_slice(std::slice::from_raw_parts(start.add(had - first), end - had));
+            }
+            at = fragment.next;
+        }
+        if payload.len() != bytes {
+            return std::ptr::null_mut();
+        }
+        Identified::allocate(sertype, kind, payload, None, from)
+    }
+}
+
+unsafe extern "C" fn from_ser_iov(
+    sertype: *const ddsi_sertype,
+    kind: ddsi_serdata_kind,
+    count: usize,
+    pieces: *const ddsrt_iovec_t,
+    bytes: usize,
+) -> *mut ddsi_serdata {
+    let mut payload = Vec::with_capacity(bytes);
+    // SAFETY: an array of so many pieces, each valid for its length.
+    unsafe {
+        for i in 0..count {
+            let piece = &*pieces.add(i);
+            payload.extend_from_slice(std::slice::from_raw_parts(piece.iov_base.cast::<u8>(), piece.iov_len));
+        }
+        Identified::allocate(sertype, kind, payload, None, None)
+    }
+}
+
+unsafe extern "C" fn from_keyhash(_: *const ddsi_sertype, _: *const ddsi_keyhash) -> *mut ddsi_serdata {
+    std::ptr::null_mut()
+}
+
+unsafe extern "C" fn to_ser(sample: *const ddsi_serdata, offset: usize, bytes: usize, to: *mut c_void) {
+    // SAFETY: of this sertype; Cyclone asks for what is in it, and has room for it.
+    unsafe {
+        let payload = &(*sample.cast::<Identified>()).payload;
+        if let Some(part) = payload.get(offset..offset + bytes) {
+            to.cast::<u8>().copy_from_nonoverlapping(part.as_ptr(), bytes);
+        }
+    }
+}
+
+unsafe extern "C" fn to_ser_ref(
+    sample: *const ddsi_serdata,
+    offset: usize,
+    bytes: usize,
+    view: *mut ddsrt_iovec_t,
+) -> *mut ddsi_serdata {
+    // SAFETY: of this sertype; payloads that are written are whole multiples of four, so the part is in it. Only a
+    // message under construction asks a sample with an identity for its payload.
+    unsafe {
+        let identified = &*sample.cast::<Identified>();
+        // The first fragment carries it, as Cyclone has it for parameters of its own.
+        if offset == 0
+            && let Some(related) = identified.related
+            && !add_related(view, related)
+        {
+            UNIDENTIFIED.fetch_add(1, Ordering::Relaxed);
+        }
+        let offset = offset.min(identified.payload.len());
+        (*view).iov_base = identified.payload.as_ptr().add(offset).cast_mut().cast();
+        (*view).iov_len = bytes.min(identified.payload.len() - offset);
+        ddsi_serdata_ref(sample)
+    }
+}
+
+unsafe extern "C" fn to_ser_unref(sample: *mut ddsi_serdata, _: *const ddsrt_iovec_t) {
+    // SAFETY: gives back what `to_ser_ref` took.
+    unsafe { ddsi_serdata_unref(sample) }
+}
+
+unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdata {
+    // SAFETY: a sample of this sertype; the copy has no type, as Cyclone wants it.
+    unsafe {
+        let copy = Identified::allocate((*sample).type_, ddsi_serdata_kind_SDK_KEY, Vec::new(), None, None);
+        (*copy).type_ = std::ptr::null();
+        (*copy).hash = (*sample).hash;
+        (*copy).timestamp.v = i64::MIN;
+        copy
+    }
+}
+
+unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
+    // SAFETY: the last reference to what `allocate` made of a box.
+    drop(unsafe { Box::from_raw(sample.cast::<Identified>()) });
+}
+
+unsafe extern "C" fn get_keyhash(_: *const ddsi_serdata, hash: *mut ddsi_keyhash, _: bool) {
+    // SAFETY: room for a hash. There is no key, as for the sertype of `cyclors`.
+    unsafe { hash.write_bytes(0, 1) };
+}

@@ -1,0 +1,49 @@
+//! [`KnownWriters`]: who wrote a sample, as its reader is told by a handle. Each is asked for once.
+
+use std::collections::HashMap;
+
+use cyclors::{dds_builtintopic_free_endpoint, dds_get_matched_publication_data, dds_instance_handle_t};
+use sgc_ros::Guid;
+
+use crate::entity::Entity;
+use crate::{qos, user_data};
+
+/// Bound on the writers that one reader remembers.
+const WRITERS_MAX: usize = 1024;
+
+/// Who wrote a sample.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct KnownWriter {
+    pub(crate) guid: Guid,
+    /// True if it carries a tag: an SGC proxy made it, this one's or another's.
+    pub(crate) tagged: bool,
+}
+
+/// The writers that one reader has heard.
+#[derive(Debug, Default)]
+pub(crate) struct KnownWriters(HashMap<dds_instance_handle_t, KnownWriter>);
+
+impl KnownWriters {
+    /// Who a writer of `reader` is; `None` if it is gone already and was never asked for.
+    pub(crate) fn find(&mut self, reader: &Entity, handle: dds_instance_handle_t) -> Option<KnownWriter> {
+        if let Some(writer) = self.0.get(&handle) {
+            return Some(*writer);
+        }
+        // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
+        let data = unsafe { dds_get_matched_publication_data(reader.handle(), handle) };
+        // SAFETY: null or valid, see above.
+        let endpoint = unsafe { data.as_ref() }?;
+        let guid = Guid(endpoint.key.v);
+        // SAFETY: not null, and valid as long as the endpoint is.
+        let tagged =
+            !endpoint.qos.is_null() && user_data::is_tagged(&unsafe { qos::user_data(endpoint.qos) });
+        // SAFETY: not null, not used any more, freed once.
+        unsafe { dds_builtintopic_free_endpoint(data) };
+        if self.0.len() >= WRITERS_MAX {
+            self.0.clear();
+        }
+        let writer = KnownWriter { guid, tagged };
+        self.0.insert(handle, writer);
+        Some(writer)
+    }
+}

@@ -1,0 +1,338 @@
+//! [`CycloneClient`] and [`CycloneServer`]: services, for programs of any vendor.
+//!
+//! A service is two topics. Where a message says to which request it belongs depends on the vendor ([`Mapping`]). With
+//! Cyclone, in front of each body stand 16 bytes in the byte order of the payload: the client's id, 8
+//! bytes that mean nothing to anybody else, and the number of its request (`cdds_request_header_t` of
+//! rmw_cyclonedds_cpp). With others a request has its sequence number, and names the client's reader in its inline QoS or
+//! else is known by its writer; a reply repeats both there. A server answers each client as that one asks, a client
+//! calls servers as those expect: so vendors that do not understand each other on one network do so through SGC.
+//!
+//! What is written before the other side is matched is lost, since services are volatile: so both wait for that, on
+//! Cyclone's conditions.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use bytes::{BufMut, Bytes, BytesMut};
+use cyclors::{
+    dds_builtintopic_endpoint_t, dds_builtintopic_free_endpoint, dds_entity_t, dds_get_instance_handle,
+    dds_get_matched_publication_data, dds_get_matched_publications, dds_get_matched_subscription_data,
+    dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask,
+    dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID, dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID,
+    dds_take_status,
+};
+use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, ServiceSpec};
+
+use crate::entity::check;
+use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
+use crate::network::Participant;
+use crate::payload::{Frame, HEADER_BYTES, PREFIX_BYTES, is_little_endian};
+use crate::rpc::{Message, RpcReader, RpcWriter};
+use crate::wait::wait_for_status;
+use crate::{qos, user_data};
+
+/// How long a request waits for a server, and a reply for its client, milliseconds.
+const MATCH_WAIT_MAX_MS: u64 = 1000;
+
+/// Matched endpoints that are looked at.
+const MATCHES_MAX: usize = 1024;
+
+/// Bytes of a client's id in the header; the rest of [`RequestId::client`] is zero.
+const ID_BYTES: usize = 8;
+
+/// A client; dropping it ends the thread that reads its replies.
+#[derive(Debug)]
+pub struct CycloneClient {
+    ends: Ends,
+    id: u64,
+    mixed: AtomicBool,
+    /// Number of the last request in the mapping of Cyclone.
+    last_in_body: Arc<AtomicI64>,
+}
+
+/// A server; dropping it ends the thread that reads requests.
+#[derive(Debug)]
+pub struct CycloneServer {
+    ends: Ends,
+}
+
+impl CycloneClient {
+    pub(crate) fn new(
+        participant: &Arc<Participant>,
+        spec: &ServiceSpec,
+        mut handler: RequestHandler,
+    ) -> Result<Self, String> {
+        let user_data = Ends::user_data("clientid", participant);
+        let writer = RpcWriter::new(participant, &spec.request, &user_data)?;
+        let mut id: dds_instance_handle_t = 0;
+        // SAFETY: the handle is checked by Cyclone, and `id` is a valid place for the result.
+        check(unsafe { dds_get_instance_handle(writer.entity().handle(), &mut id) })?;
+        let (mut reader, service) = RpcReader::new(participant, &spec.reply, &user_data)?;
+        let (reading, writing) = (reader.guid().0, writer.entity().guid()?.0);
+        let last_in_body = Arc::new(AtomicI64::new(0));
+        let in_body_until = Arc::clone(&last_in_body);
+        let on_message = Box::new(move |message: Message| {
+            let Some((client, number, payload)) = reply_of(message) else {
+                tracing::debug!("a reply that says of no request is dropped");
+                return;
+            };
+            // Replies to all clients are on one topic.
+            let is_ours = if client == writing {
+                // Who names the writer may have been matched just after a request was written in the other mapping,
+                // and have answered what nobody asked.
+                number > in_body_until.load(Relaxed)
+            } else {
+                client == reading || client == id_bytes(id)
+            };
+            if is_ours {
+                handler(RequestId { client: id_bytes(id), number, asker: None }, payload);
+            }
+        });
+        reader.start(service, on_message)?;
+        let (ends, mixed) = (Ends::new(participant, reader, writer)?, AtomicBool::new(false));
+        Ok(Self { ends, id, mixed, last_in_body })
+    }
+
+    /// Where servers look for the request's identity. Whoever reads requests counts, whether it can answer yet or not,
+    /// since only one way can be used: else somebody would read an id as part of the request. It is that of the others, which
+    /// Cyclone's servers leave out.
+    fn mapping(&self) -> Mapping {
+        let readers = self.ends.readers();
+        let inline = readers.iter().filter(|r| Mapping::of([r[0], r[1]]) == Mapping::InlineQos).count();
+        let is_mixed = inline > 0 && inline < readers.len();
+        if self.mixed.swap(is_mixed, Relaxed) != is_mixed && is_mixed {
+            tracing::warn!(
+                "a service has servers of Cyclone DDS and of others here: only the others are called"
+            );
+        }
+        if inline > 0 { Mapping::InlineQos } else { Mapping::Body }
+    }
+}
+
+impl RosClient for CycloneClient {
+    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+        self.ends.wait(|| self.matched_servers() > 0)?;
+        let number = match self.mapping() {
+            Mapping::Body => self.ends.writer.write(None, |number| {
+                self.last_in_body.store(number, Relaxed);
+                Frame::with_prefix(&payload, |little| prefix(self.id, number, little))
+            })?,
+            // As rmw_fastrtps: which reader waits for the reply; the number is that of the message.
+            Mapping::InlineQos => {
+                let related = SampleIdentity { guid: self.ends.reader.guid(), number: NUMBER_UNKNOWN };
+                self.ends.writer.write(Some(related), |_| Frame::new(&payload))?
+            }
+        };
+        Ok(RequestId { client: id_bytes(self.id), number, asker: None })
+    }
+
+    fn matched_servers(&self) -> u32 {
+        self.ends.readers().intersection(&self.ends.writers()).count() as u32
+    }
+
+    fn guids(&self) -> [Guid; 2] {
+        self.ends.guids
+    }
+}
+
+impl CycloneServer {
+    pub(crate) fn new(
+        participant: &Arc<Participant>,
+        spec: &ServiceSpec,
+        mut handler: RequestHandler,
+    ) -> Result<Self, String> {
+        let user_data = Ends::user_data("serviceid", participant);
+        // The writer first: who sees a server's reader may ask at once.
+        let writer = RpcWriter::new(participant, &spec.reply, &user_data)?;
+        let (mut reader, service) = RpcReader::new(participant, &spec.request, &user_data)?;
+        let on_message = Box::new(move |message: Message| {
+            let asker = Some(message.writer);
+            match request_of(message) {
+                Some((client, number, payload)) => handler(RequestId { client, number, asker }, payload),
+                None => tracing::debug!("a request without its header is dropped"),
+            }
+        });
+        reader.start(service, on_message)?;
+        Ok(Self { ends: Ends::new(participant, reader, writer)? })
+    }
+}
+
+impl RosServer for CycloneServer {
+    fn reply(&self, request: &RequestId, payload: Bytes) -> Result<(), RosError> {
+        let number = request.number;
+        let (related, frame) = match cyclone_id(&request.client) {
+            Some(id) => (None, Frame::with_prefix(&payload, |little| prefix(id, number, little))?),
+            None => (Some(SampleIdentity { guid: Guid(request.client), number }), Frame::new(&payload)?),
+        };
+        self.ends.wait(|| {
+            let readers = self.ends.readers();
+            request.asker.map_or(!readers.is_empty(), |asker| readers.contains(&asker.prefix()))
+        })?;
+        self.ends.writer.write(related, |_| Ok(frame)).map(drop)
+    }
+
+    fn guids(&self) -> [Guid; 2] {
+        self.ends.guids
+    }
+}
+
+/// Both endpoints of a client or a server.
+#[derive(Debug)]
+struct Ends {
+    reader: RpcReader,
+    writer: RpcWriter,
+    /// Of both, in this order.
+    guids: [Guid; 2],
+    participant: Arc<Participant>,
+}
+
+impl Ends {
+    fn new(participant: &Arc<Participant>, reader: RpcReader, writer: RpcWriter) -> Result<Self, String> {
+        // SAFETY: takes numbers only; the handles are checked by Cyclone.
+        check(unsafe { dds_set_status_mask(writer.entity().handle(), READERS_MATCHED) })?;
+        // SAFETY: as above.
+        check(unsafe { dds_set_status_mask(reader.handle(), WRITERS_MATCHED) })?;
+        let guids = [reader.guid(), writer.entity().guid()?];
+        Ok(Self { reader, writer, guids, participant: Arc::clone(participant) })
+    }
+
+    /// By this rmw_cyclonedds knows which two endpoints are one client or one server, and waits for both.
+    fn user_data(key: &str, participant: &Participant) -> String {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let prefix = participant.guid().prefix();
+        let number = NUMBER.fetch_add(1, Relaxed).to_be_bytes();
+        let hex: Vec<_> = prefix.iter().chain(&number).map(|b| format!("{b:02x}")).collect();
+        format!("{key}={};", hex.join("."))
+    }
+
+    /// Waits until something is so that changes with what is matched.
+    fn wait(&self, is_so: impl Fn() -> bool) -> Result<(), RosError> {
+        if is_so() {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        let until = begin + Duration::from_millis(MATCH_WAIT_MAX_MS);
+        let handles = [self.writer.entity().handle(), self.reader.handle()];
+        loop {
+            for (handle, matched) in handles.into_iter().zip([READERS_MATCHED, WRITERS_MATCHED]) {
+                let mut status = 0;
+                // What happens from here on wakes the wait below.
+                // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
+                unsafe { dds_take_status(handle, &mut status, matched) };
+            }
+            if is_so() {
+                return Ok(());
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(RosError::NoPeer { waited_ms: begin.elapsed().as_millis() as u64 });
+            }
+            wait_for_status(&self.participant, &handles, left)
+                .map_err(|reason| RosError::Write { reason })?;
+        }
+    }
+
+    /// Participants that read what is written here.
+    fn readers(&self) -> BTreeSet<[u8; 12]> {
+        let writer = self.writer.entity().handle();
+        self.matched(writer, dds_get_matched_subscriptions, dds_get_matched_subscription_data)
+    }
+
+    /// Participants that write what is read here.
+    fn writers(&self) -> BTreeSet<[u8; 12]> {
+        self.matched(self.reader.handle(), dds_get_matched_publications, dds_get_matched_publication_data)
+    }
+
+    fn matched(
+        &self,
+        handle: dds_entity_t,
+        list: ListMatches,
+        describe: DescribeMatch,
+    ) -> BTreeSet<[u8; 12]> {
+        let mut matches: [dds_instance_handle_t; MATCHES_MAX] = [0; MATCHES_MAX];
+        // SAFETY: the handle is checked by Cyclone, and there is room for as many as is said.
+        let found = unsafe { list(handle, matches.as_mut_ptr(), MATCHES_MAX) };
+        let found = usize::try_from(found).unwrap_or(0).min(MATCHES_MAX);
+        let endpoints = matches[..found].iter().filter_map(|matched| {
+            // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
+            let data = unsafe { describe(handle, *matched) };
+            // SAFETY: null or valid, see above.
+            let endpoint = unsafe { data.as_ref() }?;
+            let guid = Guid(endpoint.key.v);
+            let tagged = !endpoint.qos.is_null() && {
+                // SAFETY: not null, and valid as long as the endpoint is.
+                user_data::is_tagged(&unsafe { qos::user_data(endpoint.qos) })
+            };
+            // SAFETY: not null, not used any more, freed once.
+            unsafe { dds_builtintopic_free_endpoint(data) };
+            (!(tagged && self.participant.ignores_tagged())).then(|| guid.prefix())
+        });
+        endpoints.collect()
+    }
+}
+
+type ListMatches = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;
+type DescribeMatch =
+    unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
+
+/// Cyclone's status bits for what changes with matches.
+const READERS_MATCHED: u32 = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;
+const WRITERS_MATCHED: u32 = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
+
+/// Client, number and payload of a request; `None` if it is too short for its mapping.
+fn request_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {
+    if message.mapping() == Mapping::Body {
+        return split(&message.payload);
+    }
+    // Fast DDS names the reader that waits; RustDDS leaves it at the writer. What would pass for an id of Cyclone's is none.
+    let named =
+        message.origin.related.map(|related| related.guid).filter(|guid| cyclone_id(&guid.0).is_none());
+    Some((named.unwrap_or(message.writer).0, message.origin.number, message.payload))
+}
+
+/// Client, number and payload of a reply; `None` if it says of no request.
+fn reply_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {
+    if message.mapping() == Mapping::Body {
+        return split(&message.payload);
+    }
+    let related = message.origin.related?;
+    Some((related.guid.0, related.number, message.payload))
+}
+
+/// The same of a payload with an id of Cyclone's; `None` if it is too short to hold one.
+fn split(payload: &Bytes) -> Option<([u8; 16], i64, Bytes)> {
+    let (&header, rest) = payload.split_first_chunk::<HEADER_BYTES>()?;
+    let (prefix, body) = rest.split_first_chunk::<PREFIX_BYTES>()?;
+    let mut halves = prefix.chunks_exact(ID_BYTES).map(|half| {
+        let mut bytes = [0; ID_BYTES];
+        bytes.copy_from_slice(half);
+        if is_little_endian(header) { u64::from_le_bytes(bytes) } else { u64::from_be_bytes(bytes) }
+    });
+    let (client, number) = (halves.next()?, halves.next()? as i64);
+    let mut payload = BytesMut::with_capacity(HEADER_BYTES + body.len());
+    payload.put_slice(&header);
+    payload.put_slice(body);
+    Some((id_bytes(client), number, payload.freeze()))
+}
+
+fn prefix(client: u64, number: i64, little: bool) -> [u8; PREFIX_BYTES] {
+    let bytes = |n: u64| if little { n.to_le_bytes() } else { n.to_be_bytes() };
+    let mut prefix = [0; PREFIX_BYTES];
+    prefix[..ID_BYTES].copy_from_slice(&bytes(client));
+    prefix[ID_BYTES..].copy_from_slice(&bytes(number as u64));
+    prefix
+}
+
+fn id_bytes(client: u64) -> [u8; 16] {
+    let mut id = [0; 16];
+    id[..ID_BYTES].copy_from_slice(&client.to_be_bytes());
+    id
+}
+
+/// The reverse; `None` for a GUID, which never ends with zeros.
+fn cyclone_id(client: &[u8; 16]) -> Option<u64> {
+    let (id, rest) = client.split_first_chunk::<ID_BYTES>()?;
+    (*rest == [0; 16 - ID_BYTES]).then(|| u64::from_be_bytes(*id))
+}

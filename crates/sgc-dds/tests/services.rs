@@ -1,0 +1,194 @@
+//! Services of [`CycloneNetwork`] between participants that talk over the loopback interface. An untagged network
+//! stands in for a plain ROS 2 process.
+
+#![allow(clippy::unwrap_used)]
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_dds::{CycloneClient, CycloneNetwork, CycloneServer, DdsConfig, DiscoveryRange};
+use sgc_ros::{
+    EndpointSpec, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleKind,
+    ServiceSpec, ServiceTopic, service_qos,
+};
+
+/// Longest wait for an event, far beyond what any takes.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// How long nothing must happen where nothing may.
+const QUIET: Duration = Duration::from_millis(300);
+
+fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
+    let tag = tag.map(str::to_owned);
+    CycloneNetwork::open(&DdsConfig {
+        domain,
+        discovery: DiscoveryRange::LocalHost,
+        tag,
+        ..DdsConfig::default()
+    })
+    .unwrap()
+}
+
+fn spec() -> ServiceSpec {
+    let half = |half: ServiceTopic| EndpointSpec {
+        topic: half.dds_topic("/add"),
+        type_name: half.dds_type("example_interfaces/srv/AddTwoInts"),
+        keyless: true,
+        type_hash: None,
+        qos: service_qos(),
+    };
+    ServiceSpec { request: half(ServiceTopic::Request), reply: half(ServiceTopic::Reply) }
+}
+
+type Heard = Receiver<(RequestId, Bytes)>;
+
+fn client(network: &CycloneNetwork) -> (CycloneClient, Heard) {
+    let (tx, rx) = channel();
+    let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
+    (network.create_client(&spec(), handler).unwrap(), rx)
+}
+
+fn server(network: &CycloneNetwork) -> (CycloneServer, Heard) {
+    let (tx, rx) = channel();
+    let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
+    (network.create_server(&spec(), handler).unwrap(), rx)
+}
+
+fn next(heard: &Heard) -> (RequestId, Bytes) {
+    heard.recv_timeout(PATIENCE).expect("a request or a reply")
+}
+
+fn quiet(heard: &Heard) {
+    assert_eq!(heard.recv_timeout(QUIET), Err(RecvTimeoutError::Timeout));
+}
+
+/// Asks until there is a server.
+fn ask(client: &CycloneClient, payload: &[u8]) -> RequestId {
+    for _ in 0..PATIENCE.as_secs() {
+        match client.request(Bytes::copy_from_slice(payload)) {
+            Err(RosError::NoPeer { .. }) => {}
+            asked => return asked.unwrap(),
+        }
+    }
+    panic!("no server was found");
+}
+
+#[test]
+fn requests_and_replies_find_each_other_in_either_byte_order() {
+    let (ros, sgc) = (open(120, None), open(120, Some("arm-1")));
+    for (asker, answerer) in [(&ros, &sgc), (&sgc, &ros)] {
+        let (server, requests) = server(answerer);
+        let clients = [client(asker), client(asker)];
+        for order in [0, 1] {
+            let asked: Vec<_> = clients.iter().map(|(c, _)| ask(c, &[0, order, 0, 0, 1, 2, 3, 4])).collect();
+            let mut got = [next(&requests), next(&requests)];
+            got.sort_by_key(|(id, _)| asked.iter().position(|a| a.client == id.client));
+            for (n, (id, payload)) in got.into_iter().enumerate() {
+                assert_eq!((id.client, id.number), (asked[n].client, asked[n].number));
+                assert_eq!(payload, [0, order, 0, 0, 1, 2, 3, 4].as_slice());
+                server.reply(&id, Bytes::copy_from_slice(&[0, order, 0, 0, n as u8])).unwrap();
+            }
+            for (n, (_, replies)) in clients.iter().enumerate() {
+                assert_eq!(
+                    next(replies),
+                    (asked[n], Bytes::copy_from_slice(&[0, order, 0, 3, n as u8, 0, 0, 0]))
+                );
+            }
+        }
+        quiet(&clients[0].1);
+        assert_eq!(clients[1].0.matched_servers(), 1);
+    }
+}
+
+/// The bytes of rmw_cyclonedds: behind the encapsulation header the client's id and the number, then the body.
+#[test]
+fn the_header_is_that_of_rmw_cyclonedds() {
+    let (ros, sgc) = (open(121, None), open(121, Some("arm-1")));
+    let (server, requests) = server(&sgc);
+    let (tx, replies) = channel();
+    let on_reply = Box::new(move |sample: Sample| drop(tx.send(sample.payload)));
+    let _reader = ros.create_reader(&spec().reply, on_reply).unwrap();
+    let writer = ros.create_writer(&spec().request).unwrap();
+    let end = std::time::Instant::now() + PATIENCE;
+    while writer.matched_readers() == 0 {
+        assert!(std::time::Instant::now() < end);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let header = |little: bool| {
+        let bytes = |n: u64| if little { n.to_le_bytes() } else { n.to_be_bytes() };
+        [[0, u8::from(little), 0, 0].as_slice(), &bytes(0x1122_3344_5566_7788), &bytes(u64::MAX - 6)].concat()
+    };
+    for little in [true, false] {
+        let request = [header(little), vec![9, 9, 9, 9]].concat();
+        writer.write(SampleKind::Write, 1, request.into()).unwrap();
+        let (id, payload) = next(&requests);
+        assert_eq!(
+            (id.number, &id.client[..9]),
+            (-7, &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88, 0][..])
+        );
+        assert_eq!(
+            (id.asker, payload),
+            (Some(writer.guid()), vec![0, u8::from(little), 0, 0, 9, 9, 9, 9].into())
+        );
+        server.reply(&id, vec![0, u8::from(little), 0, 0, 5, 5, 5, 5].into()).unwrap();
+        assert_eq!(replies.recv_timeout(PATIENCE).unwrap(), [header(little), vec![5; 4]].concat());
+    }
+    // What is too short to hold one is dropped.
+    writer.write(SampleKind::Write, 1, vec![0, 1, 0, 0, 1, 2, 3, 4].into()).unwrap();
+    quiet(&requests);
+}
+
+#[test]
+fn a_request_without_a_server_says_so_and_sgc_does_not_call_itself() {
+    let (first, second) = (open(122, Some("a")), open(122, Some("b")));
+    let (client, _replies) = client(&first);
+    let (_server, requests) = server(&second);
+    let refused = client.request(Bytes::from_static(&[0, 1, 0, 0]));
+    assert!(matches!(refused, Err(RosError::NoPeer { .. })), "{refused:?}");
+    assert_eq!(client.matched_servers(), 0);
+    quiet(&requests);
+}
+
+#[test]
+fn a_server_made_anew_answers_what_the_one_before_was_asked() {
+    let (ros, sgc) = (open(123, None), open(123, Some("arm-1")));
+    let (client, replies) = client(&ros);
+    let (first, requests) = server(&sgc);
+    let asked = ask(&client, &[0, 1, 0, 0]);
+    let (id, _) = next(&requests);
+    drop(first);
+    let (second, _requests) = server(&sgc);
+    second.reply(&id, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])).unwrap();
+    assert_eq!(next(&replies), (asked, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])));
+    drop(client);
+    let gone = second.reply(&id, Bytes::from_static(&[0, 1, 0, 0]));
+    assert!(matches!(gone, Err(RosError::NoPeer { .. })), "{gone:?}");
+}
+
+/// Requests are made on the thread of a caller while replies come on another.
+#[test]
+fn many_calls_at_once_are_each_answered_once() {
+    const CALLS: usize = 300;
+    let (ros, sgc) = (open(124, None), open(124, Some("arm-1")));
+    let (tx, requests) = channel();
+    let answers = Arc::new(Mutex::new(None::<CycloneServer>));
+    let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
+    *answers.lock().unwrap() = Some(ros.create_server(&spec(), handler).unwrap());
+    let answering = answers.clone();
+    let echo = std::thread::spawn(move || {
+        for (id, payload) in requests.iter().take(CALLS) {
+            answering.lock().unwrap().as_ref().unwrap().reply(&id, payload).unwrap();
+        }
+    });
+    let (client, replies) = client(&sgc);
+    let payload = |n: usize| [vec![0, 1, 0, 0], (n as u32).to_le_bytes().to_vec()].concat();
+    let mut open: std::collections::BTreeMap<_, _> =
+        (0..CALLS).map(|n| (ask(&client, &payload(n)), payload(n))).collect();
+    for _ in 0..CALLS {
+        let (id, reply) = next(&replies);
+        assert_eq!(open.remove(&id).as_deref(), Some(&reply[..]));
+    }
+    echo.join().unwrap();
+    quiet(&replies);
+}

@@ -1,0 +1,333 @@
+//! What is there and where it goes, put together for who asks; and what they want to see.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+
+use sgc_endpoint::JoinStatus;
+use sgc_ros::{
+    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, dds_topic,
+    dds_type, reader_for, ros_topic, ros_type, weakest,
+};
+use sgc_transport::Link as _;
+use sgc_trust::Grantees;
+use sgc_wire::{CatalogueEntry, Kind, Name, NodeId};
+use tokio::sync::oneshot;
+
+use super::Core;
+use crate::graph::{
+    Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side, Use,
+    UseRoute,
+};
+use crate::tap::{Tap, TapError, TapQueue, TapWish, Tapped, Taps};
+
+/// Names whose refusals are remembered.
+const REFUSED_NAMES_MAX: usize = 256;
+/// Refused nodes remembered for one name.
+const REFUSED_NODES_MAX: usize = 16;
+
+/// Refusals by name and node.
+type Refusals = BTreeMap<Name, BTreeMap<NodeId, String>>;
+
+/// Keeps who was refused, for who asks why nothing flows.
+pub(super) fn remember_refusal(all: &mut Refusals, name: Name, peer: NodeId, reason: &impl ToString) {
+    if all.len() >= REFUSED_NAMES_MAX && !all.contains_key(&name) {
+        all.pop_first();
+    }
+    let of_name = all.entry(name).or_default();
+    if of_name.len() >= REFUSED_NODES_MAX && !of_name.contains_key(&peer) {
+        of_name.pop_first();
+    }
+    of_name.insert(peer, reason.to_string());
+}
+
+/// It may by now.
+pub(super) fn forget_refusal(all: &mut Refusals, name: &Name, peer: &NodeId) {
+    if let Some(of_name) = all.get_mut(name) {
+        of_name.remove(peer);
+    }
+}
+
+impl<N: RosNetwork> Core<N> {
+    pub(super) fn graph(&self, asked: Option<Name>) -> Graph {
+        let mut graph = Graph {
+            node: self.identity.node_name().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            has_ros: self.network.is_some(),
+            drops: self.data.drops().snapshot(),
+            ..Graph::default()
+        };
+        graph.drops.extend(self.control_drops.snapshot());
+        graph.drops.extend(self.ros_failures.snapshot());
+        let links = self.links.iter().map(|(id, entry)| {
+            let peer = entry.link.peer().node_id;
+            let (_, silent) = self.router.link_cost(*id).unwrap_or_default();
+            Link {
+                id: id.0,
+                peer: peer.to_string(),
+                name: self.audit.name_of(&peer),
+                remote: entry.link.remote().to_string(),
+                rtt_us: entry.link.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                silent,
+            }
+        });
+        graph.links = links.collect();
+        let searches = self.board.snapshot().into_iter();
+        graph.routers = searches
+            .map(|s| Search { router: s.router, state: s.state.to_string(), last_failure: s.last_failure })
+            .collect();
+        let mut names: BTreeSet<Name> = self.entries.keys().chain(&asked).copied().collect();
+        self.add_routes(&mut graph, &mut names);
+        graph.names = names.into_iter().map(|name| (name.to_string(), self.name_line(&name))).collect();
+        graph
+    }
+
+    fn add_routes(&self, graph: &mut Graph, names: &mut BTreeSet<Name>) {
+        let Some(routes) = &self.routes else { return };
+        let known = routes.local_endpoints().count();
+        graph.endpoints_left_out = known.saturating_sub(GRAPH_ENDPOINTS_MAX);
+        let endpoint = |e: &DiscoveredEndpoint| Endpoint {
+            topic: ros_topic(&e.topic).unwrap_or(&e.topic).to_owned(),
+            is_ros_topic: ros_topic(&e.topic).is_some(),
+            type_name: ros_type(&e.type_name),
+            type_hash: e.type_hash.clone(),
+            writes: e.kind == EndpointKind::Writer,
+            guid: format!("{:?}", e.guid),
+            node: routes
+                .node_of(&e.guid)
+                .map(|node| format!("{}/{}", node.namespace().trim_end_matches('/'), node.name())),
+            qos: (&e.qos).into(),
+            shared_by: ros_topic(&e.topic)
+                .and_then(|topic| routes.shared_by(Kind::Topic, topic, &ros_type(&e.type_name))),
+        };
+        graph.endpoints = routes.local_endpoints().take(GRAPH_ENDPOINTS_MAX).map(endpoint).collect();
+        graph.problems = routes.problems().map(ToString::to_string).collect();
+        for view in routes.share_views() {
+            let is_service = view.metadata.kind == Kind::Service;
+            let mut share = Share {
+                kind: view.metadata.kind.into(),
+                topic: view.metadata.ros_name.clone(),
+                wanted_type: Some(view.metadata.type_name.clone()).filter(|t| !t.is_empty()),
+                // Who may call a service publishes under its name; to its users that is no publishing.
+                to: count(if is_service { &view.policy.publish } else { &view.policy.subscribe }),
+                publish: if is_service { [0; 3] } else { count(&view.policy.publish) },
+                routes: Vec::new(),
+            };
+            for route in view.routes {
+                names.insert(route.name);
+                let granted: BTreeSet<_> = self
+                    .endpoint
+                    .granted(&route.name)
+                    .into_iter()
+                    .map(|(_, peer)| self.called(&peer))
+                    .collect();
+                let refused = self.refused.get(&route.name).into_iter().flatten();
+                let sink = self.sinks.get(&route.name);
+                share.routes.push(ShareRoute {
+                    topic: route.local_name,
+                    type_name: route.type_name,
+                    name: route.name.to_string(),
+                    writers: route.writers,
+                    is_read: route.is_read,
+                    is_written: route.is_written,
+                    qos: route.qos.as_ref().map(Into::into),
+                    granted: granted.into_iter().collect(),
+                    refused: refused.map(|(peer, why)| (self.called(peer), why.clone())).collect(),
+                    messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
+                    written: sink.map_or(0, |sink| sink.delivered()),
+                    matched: sink.map_or(0, |sink| sink.matched()),
+                });
+            }
+            graph.shares.push(share);
+        }
+        let mut owners = BTreeMap::new();
+        for view in routes.use_views() {
+            owners.insert(view.owner, view.owner_name.to_owned());
+            let publishes = view.direction == Direction::Publish && view.kind == Kind::Topic;
+            let (name, refused) = view.token.map_or((None, None), |(name, refused)| {
+                names.insert(name);
+                (Some(name.to_string()), refused.map(|by| by.to_string()))
+            });
+            let mut used = Use {
+                kind: view.kind.into(),
+                publishes,
+                topic: view.topic.to_owned(),
+                local_topic: view.local_topic,
+                wanted_type: view.wanted_type.map(str::to_owned),
+                owner_id: view.owner.to_string(),
+                owner: view.owner_name.to_owned(),
+                owner_state: view.owner_state.map(str::to_owned),
+                follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
+                has_catalogue: view.has_catalogue,
+                is_token: name.is_some(),
+                name,
+                refused,
+                routes: Vec::new(),
+            };
+            for route in view.routes {
+                names.insert(route.name);
+                let published = self.shares.get(&route.name).map(|share| share.published());
+                let sink = self.sinks.get(&route.name);
+                used.routes.push(UseRoute {
+                    topic: route.local_name,
+                    type_name: route.entry.metadata.type_name.clone(),
+                    type_hash: route.entry.type_hash.clone(),
+                    name: route.name.to_string(),
+                    qos: (&route.entry.qos).into(),
+                    is_granted: route.is_granted,
+                    refused: route.refused.map(|by| by.to_string()),
+                    join: self.endpoint.join_status(&route.name).map(|s| label(&s).to_owned()),
+                    writers: route.writers,
+                    matched: sink.map_or(0, |sink| sink.matched()),
+                    publishers: route.publishers,
+                    is_read: route.is_read,
+                    messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
+                });
+            }
+            graph.uses.push(used);
+        }
+        let offer = |offer: sgc_ros::OfferView<'_>| Offer {
+            owner_id: offer.owner.to_string(),
+            owner: owners.get(&offer.owner).cloned(),
+            kind: offer.entry.metadata.kind.into(),
+            topic: offer.entry.metadata.ros_name.clone(),
+            type_name: offer.entry.metadata.type_name.clone(),
+            type_hash: offer.entry.type_hash.clone(),
+            qos: (&offer.entry.qos).into(),
+            name: offer.name.to_string(),
+            subscribe: offer.entry.subscribe || is_called(offer.entry),
+            publish: offer.entry.publish && !is_called(offer.entry),
+            is_used: offer.is_used,
+        };
+        graph.offers = routes.offers().map(offer).collect();
+    }
+
+    fn name_line(&self, name: &Name) -> NameLine {
+        let mut line = NameLine {
+            way: self.router.route(name).map(|(link, cost)| (link.0, cost)),
+            ..NameLine::default()
+        };
+        if let Some((entry, stats)) = self.entries.get(name) {
+            line.has_branch = true;
+            line.out = entry.links().iter().map(|link| link.0).collect();
+            line.up = entry.trees.iter().map(|tree| tree.up.0).collect();
+            line.packets = stats.packets.load(Relaxed);
+            line.bytes = stats.bytes.load(Relaxed);
+            line.dropped = stats.reasons();
+        }
+        line
+    }
+
+    /// A peer's name, or the beginning of its id.
+    fn called(&self, peer: &NodeId) -> String {
+        self.audit.name_of(peer).unwrap_or_else(|| peer.short())
+    }
+
+    /// Lets somebody look at what goes by. A topic that comes from the far side is looked at there, since what this node
+    /// writes is hidden from its own readers.
+    pub(super) fn tap(&mut self, wish: TapWish, reply: oneshot::Sender<Result<Tap, TapError>>) {
+        let TapWish { topic, side } = wish;
+        let Some(routes) = &self.routes else {
+            let _ = reply.send(Err(TapError::NoTopic { topic }));
+            return;
+        };
+        let views = routes.use_views();
+        let brought = views.iter().filter(|view| view.direction == Direction::Bring).flat_map(|v| &v.routes);
+        let brought = brought.filter(|route| route.local_name == topic);
+        // What is granted comes first, then what may be.
+        let brought = brought.max_by_key(|route| route.is_granted);
+        let shares = routes.share_views();
+        let shared = shares.iter().flat_map(|view| &view.routes).find(|route| route.local_name == topic);
+        let not_there = |why| Err(TapError::NotThere { topic: topic.clone(), why });
+        let of = |taps: &Taps, side, type_name: &str, type_hash: Option<&String>| match taps.add() {
+            Some(queue) => {
+                let (type_name, type_hash) = (type_name.to_owned(), type_hash.cloned());
+                Ok(Tap { side, type_name, type_hash, queue, reader: None })
+            }
+            None => Err(TapError::TooMany { topic: topic.clone() }),
+        };
+        let result = match (side, brought) {
+            (Some(Side::Far) | None, Some(route)) => match self.sinks.get(&route.name) {
+                Some(sink) => {
+                    let metadata = &route.entry.metadata;
+                    of(sink.taps(), Side::Far, &metadata.type_name, route.entry.type_hash.as_ref())
+                }
+                None => not_there("it does not come from another node yet"),
+            },
+            (Some(Side::Far), None) => match shared.and_then(|r| Some((r, self.sinks.get(&r.name)?))) {
+                Some((route, sink)) => of(sink.taps(), Side::Far, &route.type_name, None),
+                None => not_there("this node does not bring it from another"),
+            },
+            (Some(Side::Sent), _) => {
+                let published = views.iter().filter(|view| view.direction == Direction::Publish);
+                let published = published.flat_map(|v| &v.routes).find(|route| route.local_name == topic);
+                let published = published.map(|r| (r.name, r.entry.metadata.type_name.as_str()));
+                let sent = shared.map(|r| (r.name, r.type_name.as_str())).or(published);
+                match sent.and_then(|(name, type_name)| Some((self.shares.get(&name)?, type_name))) {
+                    Some((share, type_name)) => of(share.taps(), Side::Sent, type_name, None),
+                    None => not_there("this node does not send it to others"),
+                }
+            }
+            (Some(Side::Local) | None, _) => return self.tap_local(topic, reply),
+        };
+        let _ = reply.send(result);
+    }
+
+    /// Makes a reader on the local network that matches every publisher there is.
+    fn tap_local(&mut self, topic: String, reply: oneshot::Sender<Result<Tap, TapError>>) {
+        let (Some(routes), Some(network)) = (&self.routes, self.network.clone()) else { return };
+        let writers: Vec<_> = routes
+            .local_endpoints()
+            .filter(|e| e.kind == EndpointKind::Writer && ros_topic(&e.topic) == Some(topic.as_str()))
+            .collect();
+        // Of several types that of the first publisher.
+        let Some(first) = writers.first() else {
+            let _ = reply.send(Err(TapError::NoTopic { topic }));
+            return;
+        };
+        let same: Vec<_> = writers.iter().filter(|w| w.type_name == first.type_name).collect();
+        let Some(offer) = weakest(same.iter().map(|w| &w.qos)) else { return };
+        let type_name = ros_type(&first.type_name);
+        let spec = EndpointSpec {
+            topic: dds_topic(&topic),
+            type_name: dds_type(&type_name),
+            keyless: first.keyless,
+            type_hash: first.type_hash.clone(),
+            qos: reader_for(&offer, same.len()),
+        };
+        let alive = self.alive.clone();
+        let queue = Arc::new(TapQueue::default());
+        self.local_taps.retain(|tap| !tap.is_closed());
+        self.local_taps.push(queue.clone());
+        tokio::task::spawn_blocking(move || {
+            let into = queue.clone();
+            let handler: SampleHandler =
+                Box::new(move |sample: Sample| into.push(Tapped::of_sample(&sample)));
+            let type_hash = spec.type_hash.clone();
+            let tap = network.create_reader(&spec, handler).map(|reader| {
+                let reader: Box<dyn std::any::Any + Send> = Box::new((reader, alive));
+                Tap { side: Side::Local, type_name, type_hash, queue, reader: Some(reader) }
+            });
+            // Who asked may have gone; then the reader ends here, where it may block.
+            let _ = reply.send(tap.map_err(|why| TapError::Network(why.to_string())));
+        });
+    }
+}
+
+/// Whether it is for calling.
+fn is_called(entry: &CatalogueEntry) -> bool {
+    entry.metadata.kind == Kind::Service && entry.publish
+}
+
+fn count(grantees: &Grantees) -> [usize; 3] {
+    [grantees.nodes.len(), grantees.groups.len(), grantees.fleets.len()]
+}
+
+fn label(status: &JoinStatus) -> &'static str {
+    match status {
+        JoinStatus::Waiting => "waiting",
+        JoinStatus::Asked => "asked",
+        JoinStatus::Refused(_) => "refused",
+        JoinStatus::Granted => "granted",
+    }
+}

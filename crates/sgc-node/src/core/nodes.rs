@@ -1,0 +1,195 @@
+//! What the local ROS graph shows of this proxy: the far nodes that its writers stand for, and one of its own for the
+//! rest.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use sgc_ros::{GraphNode, Guid, RosNetwork};
+use sgc_wire::{Name, NodeId, RosNode, SourceId};
+use tracing::debug;
+
+use super::Core;
+
+/// A local writer: the joined name, and the source that it is for.
+type WriterKey = (Name, Option<SourceId>);
+
+/// Which endpoints are here, and whose.
+pub(super) struct LocalGraph {
+    own: Option<RosNode>,
+    writers: BTreeMap<WriterKey, Guid>,
+    /// Each with the node of SGC that it is of: nodes of two robots may have one name.
+    nodes: BTreeMap<WriterKey, (NodeId, RosNode)>,
+    readers: BTreeMap<Name, Guid>,
+    has_changed: bool,
+    /// What is to be shown, for the thread that shows it; `None` once that has taken it.
+    wanted: Arc<Mutex<Option<Vec<GraphNode>>>>,
+    /// Held while something is shown, so that the newest is shown last.
+    showing: Arc<Mutex<()>>,
+}
+
+impl LocalGraph {
+    /// The graph of the SGC node of this name, without any endpoint.
+    pub(super) fn new(node: &str) -> Self {
+        Self {
+            own: own_node(node),
+            writers: BTreeMap::new(),
+            nodes: BTreeMap::new(),
+            readers: BTreeMap::new(),
+            has_changed: true,
+            wanted: Arc::default(),
+            showing: Arc::default(),
+        }
+    }
+
+    pub(super) fn writer_there(&mut self, key: WriterKey, guid: Guid) {
+        self.has_changed |= self.writers.insert(key, guid) != Some(guid);
+    }
+
+    /// A writer is closed, and stands for nobody.
+    pub(super) fn writer_gone(&mut self, key: &WriterKey) {
+        self.nodes.remove(key);
+        self.has_changed |= self.writers.remove(key).is_some();
+    }
+
+    /// A writer is for another source from here on, and for nobody until it is told.
+    pub(super) fn writer_moved(&mut self, name: Name, from: SourceId, to: SourceId) {
+        let guid = self.writers.get(&(name, Some(from))).copied();
+        self.writer_gone(&(name, Some(from)));
+        if let Some(guid) = guid {
+            self.writer_there((name, Some(to)), guid);
+        }
+    }
+
+    pub(super) fn reader_there(&mut self, name: Name, guid: Guid) {
+        self.has_changed |= self.readers.insert(name, guid) != Some(guid);
+    }
+
+    pub(super) fn reader_gone(&mut self, name: &Name) {
+        self.has_changed |= self.readers.remove(name).is_some();
+    }
+
+    /// An end of a service, of its reader and its writer.
+    pub(super) fn service_there(&mut self, name: Name, [reader, writer]: [Guid; 2]) {
+        self.reader_there(name, reader);
+        self.writer_there((name, None), writer);
+    }
+
+    pub(super) fn service_gone(&mut self, name: &Name) {
+        self.reader_gone(name);
+        self.writer_gone(&(*name, None));
+    }
+
+    /// Whose node a writer, here or on its way, stands for; the reader of the name with it, if it is for all sources.
+    pub(super) fn set_node(&mut self, key: WriterKey, owner: NodeId, node: Option<RosNode>) {
+        self.has_changed |= match node {
+            Some(node) => {
+                let node = (owner, node);
+                self.nodes.insert(key, node.clone()) != Some(node)
+            }
+            None => self.nodes.remove(&key).is_some(),
+        };
+    }
+
+    /// All nodes, each of one owner once, if something changed since this was asked.
+    fn changed(&mut self) -> Option<Vec<GraphNode>> {
+        if !std::mem::take(&mut self.has_changed) {
+            return None;
+        }
+        let mut own = (Vec::new(), Vec::new());
+        let mut far = BTreeMap::<_, (Vec<Guid>, Vec<Guid>)>::new();
+        for (name, guid) in &self.readers {
+            match self.nodes.get(&(*name, None)) {
+                Some(node) => far.entry(node).or_default().0.push(*guid),
+                None => own.0.push(*guid),
+            }
+        }
+        for (key, guid) in &self.writers {
+            match self.nodes.get(key) {
+                Some(node) => far.entry(node).or_default().1.push(*guid),
+                None => own.1.push(*guid),
+            }
+        }
+        let own = self.own.clone().map(|node| GraphNode { node, readers: own.0, writers: own.1 });
+        let far = far.into_iter().map(|((_, node), (readers, writers))| GraphNode {
+            node: node.clone(),
+            readers,
+            writers,
+        });
+        Some(own.into_iter().chain(far).collect())
+    }
+}
+
+/// The ROS 2 node that stands for the SGC node of this name.
+fn own_node(node: &str) -> Option<RosNode> {
+    let word: String = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
+    let word = &word[..word.len().min(RosNode::NAME_BYTES_MAX - 4)];
+    RosNode::new("/", &format!("sgc_{word}"), None)
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// Has the local graph show what changed, on a thread where that may block.
+    pub(super) fn show_graph(&mut self) {
+        let Some(network) = self.network.clone() else { return };
+        let Some(nodes) = self.graph.changed() else { return };
+        let (wanted, showing) = (self.graph.wanted.clone(), self.graph.showing.clone());
+        let is_under_way = lock(&wanted).replace(nodes).is_some();
+        if is_under_way {
+            return;
+        }
+        let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let _turn = lock(&showing);
+            let Some(nodes) = lock(&wanted).take() else { return };
+            if let Err(error) = network.announce(&nodes) {
+                failures.count("announce_nodes");
+                debug!(%error, "the local graph does not show the far nodes");
+            }
+        });
+    }
+}
+
+fn lock<T>(value: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    value.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_are_those_of_far_nodes_or_of_this_proxy() {
+        let (name, source) = (Name([1; 32]), |n| Some(SourceId([n; 16])));
+        let guid = |n| Guid([n; 16]);
+        let talker = || RosNode::new("/", "talker", None);
+        let mut graph = LocalGraph::new("arm-1.lab");
+        let shown = |graph: &mut LocalGraph| {
+            let nodes = graph.changed()?.into_iter();
+            let shown = nodes.map(|n| (n.node.to_string(), n.readers.len(), n.writers.len()));
+            Some(shown.collect::<Vec<_>>())
+        };
+        let of = |name: &str, readers, writers| (name.to_owned(), readers, writers);
+        assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 0, 0)]);
+        assert_eq!(shown(&mut graph), None);
+        graph.reader_there(name, guid(1));
+        graph.writer_there((name, None), guid(2));
+        // Which node it is may be known before the writer is there, and two robots may have one of a name.
+        graph.set_node((name, source(1)), NodeId([1; 32]), talker());
+        graph.set_node((name, source(2)), NodeId([2; 32]), talker());
+        assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 1)]);
+        graph.writer_there((name, source(1)), guid(3));
+        graph.writer_there((name, source(2)), guid(4));
+        let talkers = [of("/talker", 0, 1), of("/talker", 0, 1)];
+        assert_eq!(shown(&mut graph).unwrap()[1..], talkers);
+        // One node with several endpoints is one node.
+        graph.writer_there((name, source(3)), guid(5));
+        graph.set_node((name, source(3)), NodeId([2; 32]), talker());
+        assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 0, 1), of("/talker", 0, 2)]);
+        graph.writer_gone(&(name, source(1)));
+        graph.set_node((name, source(3)), NodeId([2; 32]), None);
+        assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 2), of("/talker", 0, 1)]);
+        graph.reader_gone(&name);
+        [None, source(2), source(3)].iter().for_each(|s| graph.writer_gone(&(name, *s)));
+        assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 0, 0)]);
+    }
+}

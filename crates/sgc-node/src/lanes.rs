@@ -1,0 +1,359 @@
+//! Lanes: connections beside a link, each for the packets of one name, so that a camera has a congestion controller and a
+//! queue of its own (`link = "dedicated"`; `docs/spec/wire.md`, lanes).
+//!
+//! The node that dialled the link dials its lanes, since the other may be unable to. To everyone else a lane is a part of
+//! its link: what comes by it came over the link, and without it the link carries its name as well.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
+use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
+use sgc_wire::{Control, LaneToken, Name, NodeId};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::AbortHandle;
+use tokio::time::{sleep, timeout};
+use tracing::{debug, info, warn};
+
+use crate::finding::{BACKOFF_MAX, wait};
+use crate::links::Inflow;
+
+/// Lanes of one link.
+pub(crate) const LANES_MAX: usize = 8;
+/// Lanes of all links together that were agreed on and have not come.
+const EXPECTED_MAX: usize = 1024;
+/// How long the answer to an offer may take.
+const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// How long a lane may take to come once it was agreed on.
+const ARRIVAL_MAX: Duration = Duration::from_secs(15);
+
+/// The lanes that this node was told to await. Clones share.
+#[derive(Clone, Default)]
+pub(crate) struct LaneDoor {
+    expected: Arc<Mutex<BTreeMap<LaneToken, Expected>>>,
+}
+
+/// A lane that was agreed on.
+struct Expected {
+    node: NodeId,
+    name: Name,
+    lanes: Weak<Lanes>,
+    until: Instant,
+}
+
+impl LaneDoor {
+    /// Awaits a lane; false if too many are awaited.
+    fn expect(&self, token: LaneToken, name: Name, lanes: &Arc<Lanes>) -> bool {
+        let now = Instant::now();
+        let mut expected = self.expected.lock().unwrap_or_else(PoisonError::into_inner);
+        expected.retain(|_, lane| lane.until > now);
+        if expected.len() >= EXPECTED_MAX || expected.contains_key(&token) {
+            return false;
+        }
+        let node = lanes.link.peer().node_id;
+        expected
+            .insert(token, Expected { node, name, lanes: Arc::downgrade(lanes), until: now + ARRIVAL_MAX });
+        true
+    }
+
+    /// Brings a lane that came to its link. One that nobody awaits, or of another node, is closed.
+    pub(crate) fn enter(&self, token: LaneToken, lane: AnyLink) {
+        let found = self.expected.lock().unwrap_or_else(PoisonError::into_inner).remove(&token);
+        let found = found.filter(|e| e.node == lane.peer().node_id && e.until > Instant::now());
+        match found.and_then(|e| Some((e.lanes.upgrade()?, e.name))) {
+            Some((lanes, name)) => lanes.attach(name, lane),
+            None => {
+                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "a connection as a lane that was not agreed on; it is closed");
+                lane.close(CloseReason::Denied("no such lane was agreed on".into()));
+            }
+        }
+    }
+}
+
+/// How lanes of a link are dialled.
+pub(crate) type Dial = (Arc<Dialer>, LinkUrl);
+
+/// The lanes of one link.
+pub(crate) struct Lanes {
+    link: AnyLink,
+    frames: mpsc::Sender<Control>,
+    /// Nothing if the peer dialled the link.
+    dial: Option<Dial>,
+    door: LaneDoor,
+    /// What packets of a lane go through; there once the link has its number.
+    inflow: OnceLock<Inflow>,
+    table: Mutex<Table>,
+    /// Whether the table holds any, so that links without lanes take no lock for a packet.
+    has_any: AtomicBool,
+    /// The number of the last lane that came up.
+    number: AtomicU64,
+}
+
+#[derive(Default)]
+struct Table {
+    lanes: BTreeMap<Name, Lane>,
+    answers: BTreeMap<LaneToken, oneshot::Sender<bool>>,
+}
+
+#[derive(Default)]
+struct Lane {
+    up: Option<(u64, AnyLink)>,
+    wanted_here: bool,
+    /// Dials it; there if this node dials.
+    keeper: Option<AbortHandle>,
+}
+
+/// Why there is no lane.
+#[derive(Debug, thiserror::Error)]
+enum LaneFailure {
+    #[error("the peer takes no more lanes")]
+    Refused,
+    #[error("the peer does not answer the offer")]
+    NoAnswer,
+    #[error("another node answers where the link leads")]
+    OtherNode,
+    #[error(transparent)]
+    Dial(#[from] DialError),
+}
+
+impl Lanes {
+    /// Of a link without any so far; `dial` if this node dialled it.
+    pub(crate) fn new(
+        link: AnyLink,
+        frames: mpsc::Sender<Control>,
+        dial: Option<Dial>,
+        door: LaneDoor,
+    ) -> Arc<Self> {
+        Arc::new(Self {
+            link,
+            frames,
+            dial,
+            door,
+            inflow: OnceLock::new(),
+            table: Mutex::default(),
+            has_any: AtomicBool::new(false),
+            number: AtomicU64::new(0),
+        })
+    }
+
+    /// From here on packets of lanes are taken in.
+    pub(crate) fn start(&self, inflow: Inflow) {
+        // It is called once.
+        let _ = self.inflow.set(inflow);
+    }
+
+    /// The lane of a name, if one is up, and a number that no other lane of the link had.
+    pub(crate) fn of(&self, name: &Name) -> Option<(u64, AnyLink)> {
+        if !self.has_any.load(Ordering::Relaxed) {
+            return None;
+        }
+        self.table().lanes.get(name)?.up.clone()
+    }
+
+    /// How many are up.
+    pub(crate) fn count(&self) -> usize {
+        self.table().lanes.values().filter(|lane| lane.up.is_some()).count()
+    }
+
+    /// Wants a lane for a name, or no longer.
+    pub(crate) fn set_wanted(self: &Arc<Self>, name: Name, wanted: bool) {
+        if !wanted && !self.has_any.load(Ordering::Relaxed) {
+            return;
+        }
+        let mut table = self.table();
+        if !wanted {
+            if table.lanes.get(&name).is_some_and(|lane| lane.wanted_here)
+                && let Some(lane) = table.lanes.remove(&name)
+            {
+                end(lane);
+            }
+            return;
+        }
+        let is_known = table.lanes.get(&name).is_some_and(|lane| lane.wanted_here);
+        if is_known {
+            return;
+        }
+        if !self.admit(&mut table, name) {
+            warn!(remote = %self.link.remote(), "a topic is to have a connection of its own and {LANES_MAX} others have; it shares the link");
+            return;
+        }
+        if let Some(lane) = table.lanes.get_mut(&name) {
+            lane.wanted_here = true;
+        }
+        drop(table);
+        if self.dial.is_none() && self.frames.try_send(Control::LaneWanted { name }).is_err() {
+            debug!(name = %name.short(), "the peer takes no control frames; no lane is asked for");
+        }
+    }
+
+    /// Takes in what the peer says of lanes; the error is its mistake.
+    pub(crate) fn handle(self: &Arc<Self>, frame: &Control) -> Result<(), String> {
+        match (frame, &self.dial) {
+            (Control::LaneOffer { token, name }, None) => {
+                let mut table = self.table();
+                let has_room = table.lanes.contains_key(name) || table.lanes.len() < LANES_MAX;
+                let accepted = has_room && self.door.expect(*token, *name, self);
+                if accepted {
+                    table.lanes.entry(*name).or_default();
+                    self.has_any.store(true, Ordering::Relaxed);
+                }
+                drop(table);
+                let answer = Control::LaneAnswer { token: *token, accepted };
+                self.frames.try_send(answer).map_err(|_| "it does not take control frames".to_owned())
+            }
+            (Control::LaneAnswer { token, accepted }, Some(_)) => {
+                // One that nobody waits for came too late.
+                if let Some(waiting) = self.table().answers.remove(token) {
+                    let _ = waiting.send(*accepted);
+                }
+                Ok(())
+            }
+            (Control::LaneWanted { name }, Some(_)) => {
+                let mut table = self.table();
+                if !self.admit(&mut table, *name) {
+                    debug!(name = %name.short(), "the peer wants more lanes than there may be");
+                }
+                Ok(())
+            }
+            (frame, Some(_)) => Err(format!("a lane is not the dialled node's to offer: {frame:?}")),
+            (frame, None) => Err(format!("a lane is not this node's to dial: {frame:?}")),
+        }
+    }
+
+    /// Ends all lanes, with the link.
+    pub(crate) fn close(&self) {
+        let lanes = std::mem::take(&mut self.table().lanes);
+        self.has_any.store(false, Ordering::Relaxed);
+        lanes.into_values().for_each(end);
+    }
+
+    /// Makes a place for a lane, and dials it if this node does; false if there is none.
+    fn admit(self: &Arc<Self>, table: &mut Table, name: Name) -> bool {
+        if !table.lanes.contains_key(&name) && table.lanes.len() >= LANES_MAX {
+            return false;
+        }
+        let lane = table.lanes.entry(name).or_default();
+        self.has_any.store(true, Ordering::Relaxed);
+        if let Some(dial) = &self.dial
+            && lane.keeper.is_none()
+        {
+            let keep = self.clone().keep(name, dial.clone());
+            lane.keeper = Some(tokio::spawn(keep).abort_handle());
+        }
+        true
+    }
+
+    /// Dials a lane, and again whenever it ends, until it is no longer wanted.
+    async fn keep(self: Arc<Self>, name: Name, dial: Dial) {
+        // For jitter alone.
+        let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
+        let mut failures = 0;
+        loop {
+            match self.open(name, &dial).await {
+                Ok(lane) => {
+                    failures = 0;
+                    self.attach(name, lane.clone());
+                    let end = lane.closed().await;
+                    let goodbye = matches!(&end, LinkError::Closed { reason: CloseReason::Goodbye, .. });
+                    let mut table = self.table();
+                    if goodbye && table.lanes.get(&name).is_some_and(|lane| !lane.wanted_here) {
+                        table.lanes.remove(&name);
+                        return;
+                    }
+                    drop(table);
+                    debug!(name = %name.short(), "a lane ended: {end}");
+                }
+                Err(LaneFailure::Refused) => {
+                    info!(remote = %self.link.remote(), "{}; the topic shares the link", LaneFailure::Refused);
+                    return;
+                }
+                Err(why) if failures == 0 => {
+                    warn!(remote = %self.link.remote(), "no connection of its own for a topic: {why}; it shares the link and it is tried again");
+                }
+                Err(why) => debug!("no lane: {why}"),
+            }
+            sleep(wait(failures, BACKOFF_MAX, &mut rng)).await;
+            failures = failures.saturating_add(1);
+        }
+    }
+
+    /// Agrees on a lane and dials it.
+    async fn open(&self, name: Name, (dialer, url): &Dial) -> Result<AnyLink, LaneFailure> {
+        let mut token = [0; 16];
+        OsRng.try_fill_bytes(&mut token).map_err(|_| LaneFailure::NoAnswer)?;
+        let token = LaneToken(token);
+        let (answer, answered) = oneshot::channel();
+        self.table().answers.insert(token, answer);
+        let asked = async {
+            self.frames.send(Control::LaneOffer { token, name }).await.ok()?;
+            answered.await.ok()
+        };
+        let accepted = timeout(ANSWER_MAX, asked).await;
+        self.table().answers.remove(&token);
+        match accepted {
+            Ok(Some(true)) => {}
+            Ok(Some(false)) => return Err(LaneFailure::Refused),
+            Ok(None) | Err(_) => return Err(LaneFailure::NoAnswer),
+        }
+        let lane = dialer.dial_lane(url, self.link.remote(), token).await?;
+        if lane.peer().node_id != self.link.peer().node_id {
+            lane.close(CloseReason::Denied("this is not the node that the lane was agreed on with".into()));
+            return Err(LaneFailure::OtherNode);
+        }
+        Ok(lane)
+    }
+
+    /// Takes a lane into use.
+    fn attach(self: &Arc<Self>, name: Name, lane: AnyLink) {
+        let Some(inflow) = self.inflow.get() else { return lane.close(CloseReason::Goodbye) };
+        let number = self.number.fetch_add(1, Ordering::Relaxed) + 1;
+        let mut table = self.table();
+        let Some(entry) = table.lanes.get_mut(&name) else {
+            drop(table);
+            return lane.close(CloseReason::Goodbye);
+        };
+        let old = entry.up.replace((number, lane.clone()));
+        drop(table);
+        if let Some((_, old)) = old {
+            old.close(CloseReason::Replaced);
+        }
+        debug!(remote = %lane.remote(), name = %name.short(), "a lane is up");
+        inflow.by_lane(lane.clone(), name).spawn();
+        let lanes = Arc::downgrade(self);
+        tokio::spawn(async move {
+            lane.closed().await;
+            if let Some(lanes) = lanes.upgrade() {
+                lanes.detach(&name, number);
+            }
+        });
+    }
+
+    fn detach(&self, name: &Name, number: u64) {
+        let mut table = self.table();
+        let Some(lane) = table.lanes.get_mut(name).filter(|l| l.up.as_ref().is_some_and(|up| up.0 == number))
+        else {
+            return;
+        };
+        lane.up = None;
+        // Here it is only known as long as it is up: who dials offers it again.
+        if self.dial.is_none() && !lane.wanted_here {
+            table.lanes.remove(name);
+        }
+    }
+
+    fn table(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn end(lane: Lane) {
+    if let Some(keeper) = lane.keeper {
+        keeper.abort();
+    }
+    if let Some((_, up)) = lane.up {
+        up.close(CloseReason::Goodbye);
+    }
+}

@@ -1,0 +1,158 @@
+//! The ROS graph over whole nodes: local networks in memory, each with nodes in it, and what the far ones show of them.
+
+#![allow(clippy::unwrap_used)]
+
+#[path = "support/lab.rs"]
+mod lab;
+mod support;
+
+use lab::{Lab, share, uses};
+use sgc_ros::{EndpointKind, GraphNode, Guid, RosNetwork, RosWriter};
+use sgc_testkit::{FakeDomain, FakeRos, FakeWriter};
+use sgc_wire::{Qos, Reliability, RosNode};
+use support::*;
+
+/// A participant with one node of this name, which has a writer on each topic.
+struct RosProcess {
+    net: FakeRos,
+    writers: Vec<FakeWriter>,
+}
+
+impl RosProcess {
+    fn new(domain: &FakeDomain, node: &str, topics: &[&str]) -> Self {
+        let net = domain.join(false);
+        let create = |topic: &&str| net.create_writer(&spec(topic, Qos::default())).unwrap();
+        let process = Self { writers: topics.iter().map(create).collect(), net };
+        process.is_called(node);
+        process
+    }
+
+    fn is_called(&self, node: &str) {
+        let writers: Vec<Guid> = self.writers.iter().map(|w| w.guid()).collect();
+        let node = RosNode::new("/robot", node, None).unwrap();
+        self.net.announce(&[GraphNode { node, readers: vec![], writers }]).unwrap();
+    }
+}
+
+/// Waits until proxies on a network announce exactly these nodes, each with so many writers.
+fn shows(net: &FakeDomain, expected: &[(&str, usize)]) {
+    let shown = || net.mirrored().into_iter().map(|(node, _, writers)| (node, writers)).collect::<Vec<_>>();
+    let expected: Vec<_> = expected.iter().map(|(node, writers)| ((*node).to_owned(), *writers)).collect();
+    let deadline = std::time::Instant::now() + PATIENCE;
+    while shown() != expected {
+        assert!(std::time::Instant::now() < deadline, "{:?} instead of {expected:?}", shown());
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn far_nodes_appear_with_what_is_shared_of_them_and_vanish() {
+    let trio = Trio::new();
+    let (_cloud, _robot) = (trio.cloud(), trio.robot(&["/a", "/b"], "desk"));
+    let _desk = trio.desk(&["/a", "/b"]);
+    let net = &trio.desk_net;
+    shows(net, &[("/sgc_desk", 0)]);
+    let talker = RosProcess::new(&trio.robot_net, "talker", &["/a", "/b", "/private"]);
+    let _hidden = RosProcess::new(&trio.robot_net, "hidden", &["/other"]);
+    shows(net, &[("/robot/talker", 2), ("/sgc_desk", 0)]);
+    let second = RosProcess::new(&trio.robot_net, "second", &["/b"]);
+    shows(net, &[("/robot/second", 1), ("/robot/talker", 2), ("/sgc_desk", 0)]);
+    // Another name is another node with the same writers.
+    second.is_called("renamed");
+    shows(net, &[("/robot/renamed", 1), ("/robot/talker", 2), ("/sgc_desk", 0)]);
+    assert_eq!((writers(net, "/a"), writers(net, "/b"), writers(net, "/other")), (1, 2, 0));
+    // The robot's own proxy stands for nobody, and has its readers.
+    shows(&trio.robot_net, &[("/sgc_robot", 0)]);
+    drop(talker);
+    shows(net, &[("/robot/renamed", 1), ("/sgc_desk", 0)]);
+    drop(second);
+    shows(net, &[("/sgc_desk", 0)]);
+    wait("no writers", || writers(net, "/a") + writers(net, "/b") == 0);
+}
+
+#[test]
+fn a_restarted_publisher_keeps_its_writer_and_is_heard_once() {
+    let trio = Trio::new();
+    let (_cloud, _robot, _desk) = (trio.cloud(), trio.robot(&["/a"], "desk"), trio.desk(&["/a"]));
+    let listener = Listener::new(&trio.desk_net, "/a", Qos::default());
+    let first = RosProcess::new(&trio.robot_net, "talker", &["/a"]);
+    let writer = &first.writers[0];
+    let say = |writer: &FakeWriter, text: String| {
+        writer.write(sgc_ros::SampleKind::Write, 1, text.into()).unwrap();
+    };
+    wait("the robot reads", || writer.matched_readers() == 1);
+    listener.hears_at_last(|n| say(writer, format!("warm {n}")));
+    say(writer, "end".into());
+    wait("the end", || listener.drain().last().is_some_and(|b| b == "end"));
+    drop(first);
+    // It comes back at once, and what it says first arrives: its writer at the desk has its readers already.
+    for round in 0..5 {
+        let again = RosProcess::new(&trio.robot_net, "talker", &["/a"]);
+        say(&again.writers[0], format!("round {round}"));
+        listener.hears(format!("round {round}"));
+        assert_eq!(writers(&trio.desk_net, "/a"), 1);
+    }
+    shows(&trio.desk_net, &[("/sgc_desk", 0)]);
+    listener.hears_nothing();
+}
+
+#[test]
+fn no_restart_leaves_a_ghost() {
+    let trio = Trio::new();
+    let (mut cloud, mut robot) = (trio.cloud(), trio.robot(&["/a"], "desk"));
+    let mut desk = trio.desk(&["/a"]);
+    let _talkers = ["one", "two"].map(|node| RosProcess::new(&trio.robot_net, node, &["/a"]));
+    let both = [("/robot/one", 1), ("/robot/two", 1), ("/sgc_desk", 0)];
+    shows(&trio.desk_net, &both);
+    cloud.kill();
+    cloud = trio.cloud();
+    shows(&trio.desk_net, &both);
+    desk.stop();
+    shows(&trio.desk_net, &[]);
+    desk = trio.desk(&["/a"]);
+    shows(&trio.desk_net, &both);
+    robot.kill();
+    robot = trio.robot(&["/a"], "desk");
+    // The sources are others than before.
+    shows(&trio.desk_net, &both);
+    wait("two writers", || writers(&trio.desk_net, "/a") == 2);
+    robot.stop();
+    shows(&trio.desk_net, &[("/sgc_desk", 0)]);
+    wait("no writer", || writers(&trio.desk_net, "/a") == 0);
+    drop((cloud, desk));
+}
+
+#[test]
+fn every_publisher_has_its_own_qos_and_others_may_publish_beside() {
+    let lab = Lab::new(&["robot", "desk", "watch"]);
+    let _cloud = lab.cloud();
+    let _robot = lab.start("robot", |config| {
+        let mut cmd = share("/cmd", &["watch"]);
+        cmd.publish = lab::nodes(&["desk"]);
+        cmd.type_name = Some("std_msgs/msg/String".into());
+        config.shares = vec![cmd, share("/a", &["watch"])];
+    });
+    let _watch = lab.start("watch", |config| config.uses = vec![uses("/cmd"), uses("/a")]);
+    let _desk = lab.start("desk", |config| {
+        config.uses = vec![uses("/cmd")];
+        config.uses[0].publish = true;
+    });
+    let (robot, desk, watch) = (lab.net("robot"), lab.net("desk"), lab.net("watch"));
+    let own = Talker::new(&robot, "/cmd", Qos::default());
+    let theirs = Talker::new(&desk, "/cmd", Qos::default());
+    let listener = Listener::new(&watch, "/cmd", Qos::default());
+    for talker in [&own, &theirs] {
+        wait("a reader", || talker.writer.matched_readers() > 0);
+        listener.hears_at_last(|n| talker.say(format!("warm {n}")));
+    }
+    wait("a writer for each", || writers(&watch, "/cmd") == 2);
+    // Who offers less than a subscriber asks for is not heard by it, and its neighbour is.
+    let strict = Qos { deadline_ns: Some(1_000_000_000), ..Qos::default() };
+    let (_strict, _lax) = (Talker::new(&robot, "/a", strict), Talker::new(&robot, "/a", Qos::default()));
+    wait("two writers", || writers(&watch, "/a") == 2);
+    let offered = watch.offers("rt/a");
+    assert!(offered.iter().any(|qos| qos.deadline_ns == Some(1_000_000_000)), "{offered:?}");
+    assert!(offered.iter().any(|qos| qos.deadline_ns.is_none()), "{offered:?}");
+    assert!(offered.iter().all(|qos| qos.reliability == Reliability::Reliable), "{offered:?}");
+    assert_eq!(watch.count("rt/a", EndpointKind::Reader), 0);
+}

@@ -1,0 +1,107 @@
+//! Topics with connections of their own.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
+#[path = "support/lab.rs"]
+mod lab;
+mod support;
+
+use lab::*;
+use sgc_node::config::ShareConfig;
+use support::{Listener, Node, wait};
+
+fn lanes(node: &Node) -> u64 {
+    let status = node.status();
+    status["links"].as_array().unwrap().iter().map(|link| link["lanes"].as_u64().unwrap()).sum()
+}
+
+fn dedicated(topic: &str) -> ShareConfig {
+    ShareConfig { dedicated: true, ..share(topic, &["desk"]) }
+}
+
+/// Once the way is there.
+fn begin_stream(lab: &Lab, topic: &str, listener: &Listener) -> Stream {
+    let talker = lab.talker("robot", topic);
+    warm_up(&talker, &[listener]);
+    Stream::start(talker)
+}
+
+#[test]
+fn a_dedicated_topic_is_carried_by_a_lane_and_the_others_are_not() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![dedicated("/video"), share("/state", &["desk"])]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/video"), uses("/state")]);
+    let (video, state) = (lab.listener("desk", "/video"), lab.listener("desk", "/state"));
+    let video_stream = begin_stream(&lab, "/video", &video);
+    let state_stream = begin_stream(&lab, "/state", &state);
+    wait("a lane is up at both ends", || lanes(&robot) == 1 && lanes(&cloud) == 1);
+    video_stream.more(200);
+    assert_eq!(lanes(&desk), 0, "it did not ask for one");
+    for (stream, listener) in [(video_stream, video), (state_stream, state)] {
+        hears_each(&listener, 1, stream.end().1);
+    }
+}
+
+#[test]
+fn a_subscriber_has_its_own_lane_and_both_ends_may_want_one() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![dedicated("/video")]);
+    let mut wish = uses("/video");
+    wish.dedicated = true;
+    let desk = lab.start("desk", |c| c.uses = vec![wish]);
+    let listener = lab.listener("desk", "/video");
+    let stream = begin_stream(&lab, "/video", &listener);
+    wait("lanes are up", || lanes(&robot) == 1 && lanes(&desk) == 1 && lanes(&cloud) == 2);
+    stream.more(200);
+    hears_each(&listener, 1, stream.end().1);
+}
+
+#[test]
+fn a_router_that_restarts_gets_its_lane_again_and_nothing_is_lost() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![dedicated("/video")]);
+    let _desk = lab.start("desk", |c| c.uses = vec![uses("/video")]);
+    let listener = lab.listener("desk", "/video");
+    let stream = begin_stream(&lab, "/video", &listener);
+    wait("a lane is up", || lanes(&robot) == 1);
+    stream.more(100);
+    cloud.stop();
+    wait("the lane is gone with its link", || lanes(&robot) == 0);
+    let cloud = lab.cloud();
+    wait("a lane is up again", || lanes(&robot) == 1 && lanes(&cloud) == 1);
+    stream.more(100);
+    hears_each(&listener, 1, stream.end().1);
+}
+
+#[test]
+fn a_topic_that_ends_takes_its_lane_along() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![dedicated("/video")]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/video")]);
+    let listener = lab.listener("desk", "/video");
+    let talker = lab.talker("robot", "/video");
+    wait("a lane is up", || lanes(&robot) == 1 && lanes(&cloud) == 1);
+    desk.stop();
+    drop(listener);
+    wait("nobody wants the topic", || lanes(&robot) == 0 && lanes(&cloud) == 0);
+    drop(talker);
+}
+
+#[test]
+fn no_more_lanes_than_there_may_be() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let topics: Vec<_> = (0..10).map(|n| format!("/camera{n}")).collect();
+    let robot = lab.start("robot", |c| c.shares = topics.iter().map(|topic| dedicated(topic)).collect());
+    let _desk = lab.start("desk", |c| c.uses = topics.iter().map(|topic| uses(topic)).collect());
+    let listeners: Vec<_> = topics.iter().map(|topic| lab.listener("desk", topic)).collect();
+    let talkers: Vec<_> = topics.iter().map(|topic| lab.talker("robot", topic)).collect();
+    wait("as many lanes as there may be", || lanes(&robot) == 8 && lanes(&cloud) == 8);
+    for (talker, listener) in talkers.iter().zip(&listeners) {
+        warm_up(talker, &[listener]);
+    }
+    assert_eq!((lanes(&robot), lanes(&cloud)), (8, 8));
+}

@@ -1,0 +1,226 @@
+//! What is wrong between the two sides: found from what is there, told when it begins, forgotten when it ends.
+//!
+//! Each problem has a cause, the endpoint or route that it is about. A cause is looked at again when it changes, and what
+//! is said of it then takes the place of what was said before.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use rand_core::RngCore;
+use sgc_wire::{Kind, Name, NodeId, Qos};
+
+use super::{Command, Problem, Routes};
+use crate::names::{ros_topic, ros_type};
+use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
+use crate::qos::mismatches;
+
+/// Problems that hold at once and are known; those beyond are not told.
+const PROBLEMS_MAX: usize = 4096;
+
+/// What a problem is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Cause {
+    /// The local network as a whole.
+    Network,
+    /// A local endpoint.
+    Endpoint(Guid),
+    /// A local publisher that a rule is for and that is not shared.
+    Unshared(Guid),
+    /// Shares that are there for what others publish.
+    Inbound,
+    /// A share route.
+    Share(Name),
+    /// What an owner lists.
+    Catalogue(NodeId),
+    /// What came for a token.
+    Token(Name),
+}
+
+/// The problems that hold.
+#[derive(Debug, Default)]
+pub(super) struct Problems {
+    by_cause: BTreeMap<Cause, BTreeSet<Problem>>,
+    /// Of how many causes each is.
+    holding: BTreeMap<Problem, usize>,
+    /// True if what local endpoints are compared with has changed.
+    is_stale: bool,
+}
+
+impl Problems {
+    /// Adds one; true if it did not hold before.
+    fn add(&mut self, cause: Cause, problem: Problem) -> bool {
+        if !self.holding.contains_key(&problem) && self.holding.len() >= PROBLEMS_MAX {
+            return false;
+        }
+        if !self.by_cause.entry(cause).or_default().insert(problem.clone()) {
+            return false;
+        }
+        let holders = self.holding.entry(problem).or_default();
+        *holders += 1;
+        *holders == 1
+    }
+
+    /// Replaces all of a cause; those that did not hold before.
+    fn settle(&mut self, cause: Cause, problems: BTreeSet<Problem>) -> Vec<Problem> {
+        let before = self.take(cause);
+        let begun =
+            problems.into_iter().filter(|p| self.add(cause, p.clone()) && !before.contains(p)).collect();
+        self.release(before);
+        begun
+    }
+
+    /// What held of a cause; it still does until [`Self::release`], so that what is added again meanwhile is no news.
+    pub(super) fn take(&mut self, cause: Cause) -> BTreeSet<Problem> {
+        self.by_cause.remove(&cause).unwrap_or_default()
+    }
+
+    /// What was taken holds no more, but for what was added since.
+    pub(super) fn release(&mut self, taken: BTreeSet<Problem>) {
+        for problem in taken {
+            if let Some(holders) = self.holding.get_mut(&problem) {
+                *holders -= 1;
+                if *holders == 0 {
+                    self.holding.remove(&problem);
+                }
+            }
+        }
+    }
+}
+
+impl<R: RngCore> Routes<R> {
+    /// What is wrong at present, each once, in a fixed order.
+    pub fn problems(&self) -> impl Iterator<Item = &Problem> {
+        self.problems.holding.keys()
+    }
+
+    /// Adds a problem to those of its cause, and tells it unless it holds already.
+    pub(super) fn report(&mut self, cause: Cause, problem: Problem) {
+        if self.problems.add(cause, problem.clone()) {
+            self.commands.push_back(Command::Report(problem));
+        }
+    }
+
+    /// Replaces the problems of a cause, and tells those that did not hold before.
+    pub(super) fn settle(&mut self, cause: Cause, problems: BTreeSet<Problem>) {
+        let begun = self.problems.settle(cause, problems);
+        self.commands.extend(begun.into_iter().map(Command::Report));
+    }
+
+    /// Looks at a local endpoint: it is new, or what it is to talk to has changed.
+    pub(super) fn check_local(&mut self, endpoint: &DiscoveredEndpoint) {
+        let problems = self.problems_of(endpoint);
+        self.settle(Cause::Endpoint(endpoint.guid), problems);
+    }
+
+    /// Looks at all local endpoints again before the next command is asked for in vain: routes have changed.
+    pub(super) fn check_later(&mut self) {
+        self.problems.is_stale = true;
+    }
+
+    pub(super) fn check_stale(&mut self) {
+        if std::mem::take(&mut self.problems.is_stale) {
+            for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
+                self.check_local(&endpoint);
+            }
+        }
+    }
+
+    fn problems_of(&self, endpoint: &DiscoveredEndpoint) -> BTreeSet<Problem> {
+        let mut problems = BTreeSet::new();
+        let Some(topic) = ros_topic(&endpoint.topic) else { return problems };
+        let is_reader = endpoint.kind == EndpointKind::Reader;
+        let local = ros_type(&endpoint.type_name);
+        let end = if is_reader { "subscriber" } else { "publisher" };
+        if !is_reader && let Some(rule) = self.share_rule(Kind::Topic, topic, None) {
+            let expected = &self.share_rules[rule].metadata.type_name;
+            if !expected.is_empty() && *expected != local {
+                let (topic, expected, found) = (topic.to_owned(), expected.clone(), local.clone());
+                problems.insert(Problem::ShareType { topic, expected, found });
+            }
+        }
+        for route in self.uses.values() {
+            let rule = &self.use_rules[route.rule];
+            let entry = &route.entry;
+            let publishes = self.publishes(route.rule);
+            // What this node publishes elsewhere concerns its publishers only.
+            if route.local_name != topic || rule.is_service() || (publishes && is_reader) {
+                continue;
+            }
+            let (topic, owner) = (topic.to_owned(), rule.owner_name.clone());
+            let remote = entry.metadata.type_name.clone();
+            if remote != local {
+                problems.insert(Problem::LocalType { topic, owner, remote, end, local: local.clone() });
+                continue;
+            }
+            if let (Some(remote), Some(local)) = (&entry.type_hash, &endpoint.type_hash)
+                && remote != local
+            {
+                problems.insert(Problem::LocalHash {
+                    topic: topic.clone(),
+                    owner: owner.clone(),
+                    type_name: entry.metadata.type_name.clone(),
+                    remote: remote.clone(),
+                    end,
+                    local: local.clone(),
+                });
+            }
+            if !is_reader {
+                continue;
+            }
+            // What writers there are, or will be.
+            let offers = entry.sources.iter().map(|source| &source.qos);
+            let offers = offers.chain(entry.sources.is_empty().then_some(&entry.qos));
+            for mismatch in offers.flat_map(|offer| mismatches(offer, &endpoint.qos)) {
+                let (topic, owner) = (topic.clone(), owner.clone());
+                problems.insert(Problem::LocalQos { topic, owner, mismatch });
+            }
+        }
+        problems
+            .extend(is_reader.then(|| self.problems_with_publishers(topic, endpoint)).into_iter().flatten());
+        problems
+    }
+
+    /// What others publish on a share of this node comes here too.
+    fn problems_with_publishers(&self, topic: &str, reader: &DiscoveredEndpoint) -> BTreeSet<Problem> {
+        let offers = |qos: &Qos| mismatches(qos, &reader.qos);
+        let shares = self.shares.values().filter(|s| s.fits(topic, &reader.type_name));
+        let found = shares.filter_map(|s| s.writer.as_ref()).flat_map(|spec| offers(&spec.qos));
+        let owner = "the node that publishes on it";
+        let problem =
+            |mismatch| Problem::LocalQos { topic: topic.to_owned(), owner: owner.to_owned(), mismatch };
+        found.map(problem).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn problem(n: usize) -> Problem {
+        Problem::TooManySources { topic: n.to_string() }
+    }
+
+    #[test]
+    fn one_of_several_causes_holds_until_the_last_ends_and_is_told_again() {
+        let mut problems = Problems::default();
+        let [a, b] = [1, 2].map(|n| Cause::Endpoint(Guid([n; 16])));
+        assert!(problems.add(a, problem(1)) && !problems.add(a, problem(1)));
+        assert_eq!(problems.settle(b, [problem(1), problem(2)].into()), [problem(2)]);
+        assert_eq!(problems.settle(a, BTreeSet::new()), []);
+        assert_eq!(problems.settle(b, [problem(1)].into()), []);
+        assert_eq!(problems.holding, [(problem(1), 1)].into());
+        assert_eq!(problems.settle(b, BTreeSet::new()), []);
+        assert_eq!((problems.holding.len(), problems.by_cause.len()), (0, 0));
+        assert_eq!(problems.settle(b, [problem(1)].into()), [problem(1)]);
+    }
+
+    #[test]
+    fn there_is_an_end_to_them() {
+        let mut problems = Problems::default();
+        for n in 0..2 * PROBLEMS_MAX {
+            problems.add(Cause::Network, problem(n));
+        }
+        assert_eq!(problems.holding.len(), PROBLEMS_MAX);
+        problems.settle(Cause::Network, BTreeSet::new());
+        assert!(problems.add(Cause::Network, problem(0)));
+    }
+}

@@ -1,0 +1,23 @@
+//! A network that is worse than this machine's, between real processes: rate, queue, delay, jitter, loss, reordering.
+//!
+//! [`Channel`] is the model of one direction, without clock or socket. [`TunLink`] joins two network namespaces through
+//! two channels, IP packet by IP packet, so that whatever runs there meets it; it needs root. [`UdpRelay`] and
+//! [`TcpRelay`] put the same channels between two addresses, without root. [`Namespace`] makes the namespaces that
+//! tests and benchmarks put their processes and threads in.
+//!
+//! Unlike the rest of this crate it lives in real time; the draws alone are seeded. The program `netsim` is all of it
+//! at the command line.
+
+mod channel;
+mod namespace;
+mod pump;
+mod relay;
+mod tun;
+mod units;
+
+pub use channel::{Channel, Counters, FLYING_BYTES_MAX, Loss, Profile, QueueLimit, Reorder};
+pub use namespace::{Namespace, NetsimError, ip, on_host};
+pub use pump::Direction;
+pub use relay::{TcpRelay, UdpRelay};
+pub use tun::{TunEnd, TunLink, TunOptions};
+pub use units::{UnitError, parse_bytes, parse_duration, parse_percent, parse_queue, parse_rate};

@@ -1,0 +1,200 @@
+//! Network namespaces, as `ip netns` makes them: for processes, for threads, and gone with the value.
+
+use std::ffi::OsStr;
+use std::fs::File;
+use std::io;
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
+
+/// Where `ip netns` keeps them.
+const NAMESPACES: &str = "/run/netns";
+
+/// Why a network could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum NetsimError {
+    /// A command of iproute2 or nftables failed.
+    #[error("{command}: {why}")]
+    Command {
+        /// What was run.
+        command: String,
+        /// What it complained of.
+        why: String,
+    },
+    /// There is no such namespace.
+    #[error("no network namespace {0:?}: make it with `ip netns add {0}`")]
+    NoNamespace(String),
+    /// The namespace is there, and this user may not enter it.
+    #[error("cannot enter the network namespace {0:?}: {1} (it takes root)")]
+    Enter(String, io::Error),
+    /// No TUN device could be made.
+    #[error("cannot make the TUN device {0:?}: {1} (it takes root, and /dev/net/tun)")]
+    Tun(String, io::Error),
+    /// No socket could be bound or reached.
+    #[error("{0}: {1}")]
+    Socket(String, io::Error),
+    /// No thread could be started.
+    #[error("no thread: {0}")]
+    Thread(io::Error),
+}
+
+/// A namespace, and everything in it, that goes when this is dropped.
+#[derive(Debug)]
+pub struct Namespace {
+    name: String,
+}
+
+impl Namespace {
+    /// Makes it, with its loopback interface up. There must be none of that name.
+    pub fn create(name: impl Into<String>) -> Result<Self, NetsimError> {
+        let namespace = Self { name: name.into() };
+        ip(&["netns", "add", &namespace.name])?;
+        namespace.ip(&["link", "set", "lo", "up"])?;
+        Ok(namespace)
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Runs `ip` in it.
+    pub fn ip(&self, args: &[&str]) -> Result<String, NetsimError> {
+        ip(&[&["-n", &self.name], args].concat())
+    }
+
+    /// Runs any program in it to its end; what it printed.
+    pub fn run(&self, program: &str, args: &[&str]) -> Result<String, NetsimError> {
+        finish(self.command(program).args(args))
+    }
+
+    /// A program in it. The process is the program's own: `ip` replaces itself by it.
+    pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
+        let mut command = Command::new("ip");
+        command.args(["netns", "exec", &self.name]).arg(program);
+        command
+    }
+
+    /// A pair of interfaces, up: one here with this name and these addresses, one there. Addresses are with their
+    /// prefix: `10.1.0.1/24`.
+    pub fn veth(
+        &self,
+        ours: (&str, &[&str]),
+        peer: &Self,
+        theirs: (&str, &[&str]),
+    ) -> Result<(), NetsimError> {
+        ip(&[
+            "link", "add", ours.0, "netns", &self.name, "type", "veth", "peer", "name", theirs.0, "netns",
+            &peer.name,
+        ])?;
+        for (namespace, (interface, addresses)) in [(self, ours), (peer, theirs)] {
+            namespace.bring_up(interface, addresses)?;
+        }
+        Ok(())
+    }
+
+    /// Gives an interface its addresses and brings it up.
+    pub fn bring_up(&self, interface: &str, addresses: &[&str]) -> Result<(), NetsimError> {
+        configure(Some(&self.name), interface, addresses, &[""; 0])
+    }
+
+    /// Moves the calling thread here for the rest of its life: sockets that it opens are of this namespace.
+    pub fn enter(&self) -> Result<(), NetsimError> {
+        enter(&self.name)
+    }
+
+    /// Runs a function in a thread in it.
+    pub fn within<T: Send>(&self, function: impl FnOnce() -> T + Send) -> Result<T, NetsimError> {
+        within(Some(&self.name), function)
+    }
+}
+
+impl Drop for Namespace {
+    fn drop(&mut self) {
+        let _ = ip(&["netns", "delete", &self.name]);
+    }
+}
+
+/// Runs `ip` of iproute2; what it printed.
+pub fn ip(args: &[&str]) -> Result<String, NetsimError> {
+    finish(Command::new("ip").args(args))
+}
+
+/// Whether namespaces and TUN devices can be made here; if not, why not.
+pub fn on_host() -> Result<(), NetsimError> {
+    let name = format!("netsim-{}-{:?}", std::process::id(), std::thread::current().id());
+    let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
+    let namespace = Namespace::create(name)?;
+    namespace.within(|| super::tun::open("netsim0").map(drop))?
+}
+
+fn finish(command: &mut Command) -> Result<String, NetsimError> {
+    let line = || {
+        let words = std::iter::once(command.get_program()).chain(command.get_args());
+        words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" ")
+    };
+    let text = line();
+    let output = command
+        .output()
+        .map_err(|error| NetsimError::Command { command: text.clone(), why: error.to_string() })?;
+    if output.status.success() {
+        return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
+    }
+    let why = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+    Err(NetsimError::Command { command: text, why })
+}
+
+/// Moves the calling thread into a namespace: a name, or a path such as `/proc/PID/ns/net`.
+fn enter(namespace: &str) -> Result<(), NetsimError> {
+    let path = if namespace.contains('/') {
+        PathBuf::from(namespace)
+    } else {
+        Path::new(NAMESPACES).join(namespace)
+    };
+    let file = File::open(&path).map_err(|error| match error.kind() {
+        io::ErrorKind::NotFound => NetsimError::NoNamespace(namespace.to_owned()),
+        _ => NetsimError::Enter(namespace.to_owned(), error),
+    })?;
+    move_into_link_name_space(file.as_fd(), Some(LinkNameSpaceType::Network))
+        .map_err(|error| NetsimError::Enter(namespace.to_owned(), error.into()))
+}
+
+/// Runs a function in a thread in a namespace, or in this one.
+pub(super) fn within<T: Send>(
+    namespace: Option<&str>,
+    function: impl FnOnce() -> T + Send,
+) -> Result<T, NetsimError> {
+    std::thread::scope(|scope| {
+        let thread = std::thread::Builder::new()
+            .spawn_scoped(scope, || {
+                namespace.map_or(Ok(()), enter)?;
+                Ok(function())
+            })
+            .map_err(NetsimError::Thread)?;
+        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    })
+}
+
+/// Gives an interface addresses and routes, and brings it up.
+pub(super) fn configure(
+    namespace: Option<&str>,
+    interface: &str,
+    addresses: &[impl AsRef<str> + Sync],
+    routes: &[impl AsRef<str> + Sync],
+) -> Result<(), NetsimError> {
+    within(namespace, || {
+        for address in addresses.iter().map(AsRef::as_ref) {
+            // An IPv6 address would otherwise be of no use for its first second.
+            let unchecked: &[&str] = if address.contains(':') { &["nodad"] } else { &[] };
+            ip(&[&["address", "add", address, "dev", interface], unchecked].concat())?;
+        }
+        ip(&["link", "set", interface, "up"])?;
+        for route in routes.iter().map(AsRef::as_ref) {
+            let family: &[&str] = if route.contains(':') { &["-6"] } else { &[] };
+            ip(&[family, &["route", "add", route, "dev", interface]].concat())?;
+        }
+        Ok(())
+    })?
+}

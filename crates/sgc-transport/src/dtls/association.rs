@@ -1,0 +1,519 @@
+//! One association: DTLS with one peer, the verdict on its certificate, and the few words that are exchanged before QUIC.
+//!
+//! Callers give it records and the time, and take what it put into the [`Sink`]. It knows no socket and no other
+//! association; which datagrams are its own is decided in [`super::mux`]. Nothing that a peer sends is handed on before
+//! its certificate was verified.
+
+use std::sync::{Arc, LazyLock};
+use std::time::{Duration, Instant};
+
+use dimpl::crypto::{CryptoProvider, aws_lc_rs};
+use dimpl::{
+    CertificateError, Config, Dtls, Error, Output, ProtocolVersion, SecurityError, UnexpectedMessageError,
+};
+use rustls::AlertDescription;
+use rustls_pki_types::{CertificateDer, UnixTime};
+use sgc_trust::{CertError, VerifiedPeer};
+
+use super::front::{self, Inside, Token};
+use super::keys::{Keys, Loan};
+use crate::credentials::CredentialStore;
+use crate::error::{LinkError, PeerRefusal, Refusal};
+use crate::options::LinkOptions;
+use crate::tls;
+
+/// Longest datagram of a handshake, bytes: it fits a path of 1280 with everything in front.
+const FLIGHT_BYTES_MAX: usize = 1150;
+/// First wait for an answer to a flight; it doubles.
+const FLIGHT_RTO: Duration = Duration::from_millis(400);
+const FLIGHT_RETRIES: usize = 8;
+/// dimpl's own limit, which ours comes before.
+const DIMPL_TIMEOUT: Duration = Duration::from_secs(120);
+/// How often a dialer asks for its id at first; it doubles.
+const ASK_INTERVAL: Duration = Duration::from_millis(200);
+/// How long a dialer that is refused may take to say that it refuses, too: whose word comes first is what is reported.
+const WORD_PATIENCE: Duration = Duration::from_secs(1);
+/// How often the clock of DTLS is set where no timer is due.
+const CLOCK_INTERVAL: Duration = Duration::from_millis(20);
+/// How often a refusal is said: it is not acknowledged.
+const REFUSAL_COPIES: usize = 2;
+/// The longest that dimpl may have to hand out, bytes: one record.
+const RECORD_BYTES_MAX: usize = 1 << 15;
+/// `protocol_version`: of what is spoken inside.
+const ALERT_VERSION: u8 = 70;
+
+static CONFIG: LazyLock<Arc<Config>> = LazyLock::new(|| {
+    let provider = CryptoProvider { key_provider: &Keys, ..aws_lc_rs::default_provider() };
+    let config = Config::builder()
+        .mtu(FLIGHT_BYTES_MAX)
+        .flight_start_rto(FLIGHT_RTO)
+        .flight_retries(FLIGHT_RETRIES)
+        .handshake_timeout(DIMPL_TIMEOUT)
+        .with_crypto_provider(provider)
+        .build()
+        .expect("dimpl accepts its own cipher suites and these numbers");
+    Arc::new(config)
+});
+
+/// What came out of associations: packets for the wire, and plaintext for QUIC, each in one piece of memory.
+#[derive(Debug, Default)]
+pub(super) struct Sink {
+    pub(super) packets: Vec<u8>,
+    pub(super) packet_lens: Vec<usize>,
+    pub(super) data: Vec<u8>,
+    pub(super) data_lens: Vec<usize>,
+}
+
+impl Sink {
+    fn packet(&mut self, prefix: &[u8], record: &[u8]) {
+        self.packets.extend_from_slice(prefix);
+        self.packets.extend_from_slice(record);
+        self.packet_lens.push(prefix.len() + record.len());
+    }
+
+    fn plaintext(&mut self, data: &[u8]) {
+        self.data.extend_from_slice(data);
+        self.data_lens.push(data.len());
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.packets.clear();
+        self.packet_lens.clear();
+        self.data.clear();
+        self.data_lens.clear();
+    }
+}
+
+/// What an association is told when it begins.
+pub(super) struct Setup<'a> {
+    pub(super) credentials: &'a CredentialStore,
+    pub(super) options: &'a LinkOptions,
+    pub(super) is_dialer: bool,
+    /// What the peer is to put in front of its records, and how the end of that would look.
+    pub(super) id: u64,
+    pub(super) reset: Token,
+}
+
+/// How an association ended.
+#[derive(Clone, Debug)]
+pub(super) enum End {
+    /// Its certificate is refused here.
+    Refused(CertError),
+    /// It refuses ours.
+    ByPeer(PeerRefusal),
+    /// It speaks DTLS and nothing that we know inside of it.
+    NotOurs,
+    TimedOut,
+    /// It has forgotten us.
+    Restarted,
+    /// It said so.
+    Goodbye,
+    /// It is no longer needed here.
+    Released,
+    /// DTLS failed.
+    Broken(String),
+}
+
+impl End {
+    /// For the one who dials.
+    pub(super) fn to_dialer(&self, after: Duration) -> LinkError {
+        match self {
+            Self::Refused(why) => LinkError::RefusedHere(why.clone()),
+            Self::ByPeer(why) => LinkError::RefusedByPeer(why.clone()),
+            Self::NotOurs => LinkError::RefusedByPeer(PeerRefusal::Version),
+            Self::TimedOut => LinkError::HandshakeTimedOut { after },
+            Self::Restarted => LinkError::PeerRestarted,
+            Self::Goodbye | Self::Released => LinkError::RefusedByPeer(PeerRefusal::GaveUp),
+            Self::Broken(text) => LinkError::Transport(format!("DTLS: {text}")),
+        }
+    }
+
+    /// For the one who listens.
+    pub(super) fn to_listener(&self, after: Duration) -> Refusal {
+        match self {
+            Self::Refused(why) => Refusal::Certificate(why.clone()),
+            Self::ByPeer(why) => Refusal::ByPeer(why.clone()),
+            Self::TimedOut | Self::NotOurs => Refusal::TimedOut { after },
+            Self::Goodbye | Self::Released | Self::Restarted => Refusal::ByPeer(PeerRefusal::GaveUp),
+            Self::Broken(text) => Refusal::Transport(format!("DTLS: {text}")),
+        }
+    }
+}
+
+/// Where an association stands, in order.
+#[derive(Clone, Debug)]
+pub(super) enum Stage {
+    Handshake,
+    /// The dialer's certificate is refused; what it says of ours is waited for.
+    Refusing {
+        why: CertError,
+        until: Instant,
+    },
+    /// The dialer asks for its id.
+    Asking {
+        peer: Box<VerifiedPeer>,
+        next: Instant,
+        interval: Duration,
+    },
+    /// The peer is who it says.
+    Up {
+        peer: Box<VerifiedPeer>,
+        since: Instant,
+    },
+    Ended(End),
+}
+
+/// DTLS with one peer.
+pub(super) struct Association {
+    dtls: Dtls,
+    _key: Loan,
+    credentials: CredentialStore,
+    is_dialer: bool,
+    handshake_timeout: Duration,
+    idle_timeout: Duration,
+    id: u64,
+    reset: Token,
+    /// Stands in front of every record that is sent.
+    prefix: Vec<u8>,
+    started: Instant,
+    clock: Instant,
+    due: Instant,
+    /// When something authentic came last.
+    heard: Instant,
+    has_data: bool,
+    /// A link uses it.
+    is_claimed: bool,
+    stage: Stage,
+    certificate: Option<CertificateDer<'static>>,
+    /// What a dialer said first, for the case that it has to be said with a ticket.
+    first_flight: Vec<Vec<u8>>,
+    scratch: Vec<u8>,
+}
+
+impl Association {
+    /// `None` if DTLS cannot use the key of the identity.
+    pub(super) fn new(setup: &Setup<'_>, now: Instant) -> Option<Self> {
+        let key = Loan::new(setup.credentials.identity().certified_key())?;
+        let mut dtls = Dtls::new_auto(Arc::clone(&CONFIG), key.certificate(), now);
+        if setup.is_dialer {
+            dtls.set_active(true);
+        }
+        Some(Self {
+            dtls,
+            _key: key,
+            credentials: setup.credentials.clone(),
+            is_dialer: setup.is_dialer,
+            handshake_timeout: setup.options.handshake_timeout,
+            idle_timeout: setup.options.idle_timeout,
+            id: setup.id,
+            reset: setup.reset,
+            prefix: Vec::new(),
+            started: now,
+            clock: now,
+            due: now,
+            heard: now,
+            has_data: false,
+            is_claimed: false,
+            stage: Stage::Handshake,
+            certificate: None,
+            first_flight: Vec::new(),
+            scratch: vec![0; 2048],
+        })
+    }
+
+    /// Says the first word.
+    pub(super) fn start(&mut self, now: Instant, sink: &mut Sink) {
+        let result = self.dtls.handle_timeout(now);
+        self.check(result);
+        let from = sink.packet_lens.len();
+        let mut at: usize = sink.packet_lens.iter().sum();
+        self.drain(now, sink);
+        for len in &sink.packet_lens[from..] {
+            self.first_flight.push(sink.packets[at..at + len].to_vec());
+            at += len;
+        }
+    }
+
+    /// Takes one datagram's records. True if something in it was authentic and new.
+    pub(super) fn receive(&mut self, records: &[u8], now: Instant, sink: &mut Sink) -> bool {
+        if self.is_ended() || (!self.takes_plaintext() && front::has_plaintext(records)) {
+            return false;
+        }
+        if matches!(self.stage, Stage::Handshake)
+            || now.saturating_duration_since(self.clock) >= CLOCK_INTERVAL
+        {
+            self.clock = now;
+            let result = self.dtls.handle_timeout(now);
+            self.check(result);
+        }
+        match self.dtls.handle_packet(records) {
+            // Anybody could have sent that.
+            Err(Error::UnexpectedMessage(UnexpectedMessageError::UnrecognizedAutoServerResponse)) => {}
+            result => self.check(result),
+        }
+        self.drain(now, sink)
+    }
+
+    /// Seals one packet of QUIC.
+    pub(super) fn seal(&mut self, packet: &[u8], now: Instant, sink: &mut Sink) {
+        if !matches!(self.stage, Stage::Up { .. }) {
+            return;
+        }
+        let result = self.dtls.send_application_data(packet).map(drop);
+        self.check(result);
+        self.drain(now, sink);
+    }
+
+    /// Does what is due.
+    pub(super) fn tick(&mut self, now: Instant, sink: &mut Sink) {
+        if self.is_ended() {
+            return;
+        }
+        if self.due <= now {
+            self.clock = now;
+            let result = self.dtls.handle_timeout(now);
+            self.check(result);
+            self.drain(now, sink);
+        }
+        let is_late = now >= self.started + self.handshake_timeout;
+        match &mut self.stage {
+            Stage::Handshake if is_late => self.end(End::TimedOut),
+            Stage::Asking { .. } if is_late => self.end(End::NotOurs),
+            Stage::Asking { next, interval, .. } if *next <= now => {
+                *interval *= 2;
+                *next = now + *interval;
+                self.say(Inside::Ask);
+                self.drain(now, sink);
+            }
+            Stage::Refusing { why, until } if *until <= now => {
+                let why = why.clone();
+                self.end(End::Refused(why));
+            }
+            Stage::Up { since, .. } if !self.is_dialer => {
+                // QUIC has its own time-out, which comes first if there is a handshake of its own.
+                let patience = self.handshake_timeout * if self.has_data { 2 } else { 1 };
+                if !self.is_claimed && now >= *since + patience {
+                    self.close(End::TimedOut, now, sink);
+                } else if now >= self.heard + self.idle_timeout * 2 {
+                    self.close(End::Released, now, sink);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// When [`Self::tick`] is to be called next.
+    pub(super) fn due(&self) -> Instant {
+        let own = match &self.stage {
+            Stage::Handshake => self.started + self.handshake_timeout,
+            Stage::Asking { next, .. } => *next,
+            Stage::Refusing { until, .. } => *until,
+            Stage::Up { .. } | Stage::Ended(_) => return self.due,
+        };
+        own.min(self.due)
+    }
+
+    /// A listener wants to see that datagrams arrive here: sends the first ones again, with its ticket in front of
+    /// everything until there is an id.
+    pub(super) fn answer_challenge(&mut self, token: &Token, sink: &mut Sink) {
+        if self.is_dialer && matches!(self.stage, Stage::Handshake) {
+            self.prefix = front::ticket_prefix(token);
+            for record in &self.first_flight {
+                sink.packet(&self.prefix, record);
+            }
+        }
+    }
+
+    /// The random of the first ClientHello.
+    pub(super) fn echo(&self) -> Option<front::Echo> {
+        self.first_flight.first().and_then(|hello| front::client_hello(hello))
+    }
+
+    /// The listener has forgotten the association, if this is what it said.
+    pub(super) fn is_reset_by(&self, token: &Token) -> bool {
+        use ::aws_lc_rs::constant_time::verify_slices_are_equal;
+        self.is_dialer
+            && matches!(self.stage, Stage::Up { .. })
+            && verify_slices_are_equal(&self.reset, token).is_ok()
+    }
+
+    /// A link is made on it; false if there is one already.
+    pub(super) fn claim(&mut self) -> bool {
+        !std::mem::replace(&mut self.is_claimed, true)
+    }
+
+    /// Says goodbye.
+    pub(super) fn close(&mut self, end: End, now: Instant, sink: &mut Sink) {
+        if !self.is_ended() {
+            let result = self.dtls.close();
+            self.check(result);
+            self.drain(now, sink);
+            self.end(end);
+        }
+    }
+
+    /// Ends it without a word.
+    pub(super) fn end(&mut self, end: End) {
+        if !self.is_ended() {
+            self.stage = Stage::Ended(end);
+        }
+    }
+
+    pub(super) fn stage(&self) -> &Stage {
+        &self.stage
+    }
+
+    /// Who the peer is, as soon as that is certain.
+    pub(super) fn peer(&self) -> Option<&VerifiedPeer> {
+        match &self.stage {
+            Stage::Up { peer, .. } => Some(peer),
+            _ => None,
+        }
+    }
+
+    /// True as long as nothing was made of it, and the peer has said nothing that QUIC could speak of.
+    pub(super) fn is_unused(&self) -> bool {
+        !self.is_claimed && !self.has_data
+    }
+
+    /// True once the peer showed a certificate, which takes a cookie of DTLS: it receives where it says.
+    pub(super) fn has_shown(&self) -> bool {
+        self.certificate.is_some()
+    }
+
+    fn is_ended(&self) -> bool {
+        matches!(self.stage, Stage::Ended(_))
+    }
+
+    /// Whether records that everybody can make may still be needed: during the handshake, and in DTLS 1.2 until the
+    /// dialer is known to have the last of our flights.
+    fn takes_plaintext(&self) -> bool {
+        match self.stage {
+            Stage::Handshake => true,
+            Stage::Refusing { .. } | Stage::Up { .. } if !self.is_dialer && !self.has_data => {
+                self.dtls.protocol_version() == Some(ProtocolVersion::DTLS1_2)
+            }
+            _ => false,
+        }
+    }
+
+    fn check(&mut self, result: Result<(), Error>) {
+        let Err(error) = result else { return };
+        self.end(match error {
+            Error::Timeout(_) => End::TimedOut,
+            Error::SecurityError(SecurityError::FatalAlert { description }) => {
+                End::ByPeer(PeerRefusal::from_alert(description))
+            }
+            Error::CertificateError(
+                CertificateError::NoClientCertificateReceived
+                | CertificateError::NoClientCertificateForVerification
+                | CertificateError::NoServerCertificateReceived
+                | CertificateError::NoServerCertificateForVerification,
+            ) => End::Refused(CertError::NoCertificate),
+            error => End::Broken(error.to_string()),
+        });
+    }
+
+    fn say(&mut self, inside: Inside) {
+        let result = self.dtls.send_application_data(&inside.to_bytes()).map(drop);
+        self.check(result);
+    }
+
+    /// Takes everything out of DTLS, also after an error: there may be an alert to send. True if there was something that
+    /// only the peer can have sent, and not before.
+    fn drain(&mut self, now: Instant, sink: &mut Sink) -> bool {
+        let mut has_heard = false;
+        let mut buffer = std::mem::take(&mut self.scratch);
+        loop {
+            match self.dtls.poll_output(&mut buffer) {
+                Output::Packet(record) => sink.packet(&self.prefix, record),
+                Output::BufferTooSmall { needed } if needed <= RECORD_BYTES_MAX => buffer.resize(needed, 0),
+                Output::BufferTooSmall { needed } => {
+                    self.end(End::Broken(format!("a record of {needed} bytes")));
+                    break;
+                }
+                Output::Timeout(due) => {
+                    self.due = due;
+                    break;
+                }
+                Output::Connected => self.connected(now),
+                Output::PeerCert(leaf) => self.certificate = Some(leaf.to_vec().into()),
+                Output::ApplicationData(data) => {
+                    self.heard = now;
+                    has_heard = true;
+                    if Inside::is_inside(data) {
+                        self.heed(Inside::parse(data), now);
+                    } else if matches!(self.stage, Stage::Up { .. }) {
+                        self.has_data = true;
+                        sink.plaintext(data);
+                    }
+                }
+                Output::CloseNotify => self.end(End::Goodbye),
+                _ => {}
+            }
+        }
+        self.scratch = buffer;
+        has_heard
+    }
+
+    /// The handshake is over; whose it was is judged here, before anything else of the peer counts.
+    fn connected(&mut self, now: Instant) {
+        if !matches!(self.stage, Stage::Handshake) {
+            return;
+        }
+        self.first_flight.clear();
+        let chain = self.certificate.as_slice();
+        let verdict = match chain {
+            [] => Err(CertError::NoCertificate),
+            chain => tls::judge(&self.credentials, chain, UnixTime::now(), !self.is_dialer),
+        };
+        match (verdict, self.is_dialer) {
+            (Ok(peer), true) => {
+                let next = now + ASK_INTERVAL;
+                self.stage = Stage::Asking { peer: Box::new(peer), next, interval: ASK_INTERVAL };
+                self.say(Inside::Ask);
+            }
+            (Ok(peer), false) => self.stage = Stage::Up { peer: Box::new(peer), since: now },
+            (Err(why), true) => self.refuse(why),
+            (Err(why), false) => self.stage = Stage::Refusing { why, until: now + WORD_PATIENCE },
+        }
+    }
+
+    /// Tells the peer why, and ends.
+    fn refuse(&mut self, why: CertError) {
+        let alert = u8::from(AlertDescription::from(tls::alert(&why)));
+        for _ in 0..REFUSAL_COPIES {
+            self.say(Inside::Refused { alert });
+        }
+        self.end(End::Refused(why));
+    }
+
+    /// What the peer says besides QUIC.
+    fn heed(&mut self, inside: Inside, now: Instant) {
+        match (inside, self.is_dialer) {
+            (Inside::Ask, false) => match &self.stage {
+                Stage::Up { .. } => self.say(Inside::Answer { id: self.id, reset: self.reset }),
+                Stage::Refusing { why, .. } => {
+                    let why = why.clone();
+                    self.refuse(why);
+                }
+                _ => {}
+            },
+            (Inside::Answer { id, reset }, true) => {
+                if let Stage::Asking { peer, .. } = &self.stage {
+                    self.stage = Stage::Up { peer: peer.clone(), since: now };
+                    self.prefix = front::id_prefix(id);
+                    self.reset = reset;
+                }
+            }
+            (Inside::Refused { alert }, _) => {
+                let is_early = matches!(self.stage, Stage::Asking { .. } | Stage::Refusing { .. });
+                if is_early || (!self.is_dialer && !self.is_claimed) {
+                    self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
+                }
+            }
+            (Inside::Unknown, false) => self.say(Inside::Refused { alert: ALERT_VERSION }),
+            (Inside::Ask, true) | (Inside::Answer { .. }, false) | (Inside::Unknown, true) => {}
+        }
+    }
+}

@@ -1,0 +1,273 @@
+//! What stands in front of DTLS records on the wire, and what is said inside of them besides QUIC; bytes alone.
+//!
+//! It sorts datagrams and makes them. Whether what they claim is true is for [`super::association`] and [`super::mux`].
+
+/// In front of a record: the association that it belongs to, wherever it comes from. All of these bytes lie outside of
+/// what DTLS begins its records with (RFC 7983, RFC 9443).
+const ID: u8 = 0xc1;
+/// Prove that you receive at your address.
+const CHALLENGE: u8 = 0xc2;
+/// In front of a record: the proof.
+const TICKET: u8 = 0xc3;
+/// The association is not known here.
+const RESET: u8 = 0xc4;
+/// Too many are connecting.
+const BUSY: u8 = 0xc5;
+
+/// First byte of what is said inside of records and is not QUIC: QUIC never begins a packet with it.
+const INSIDE: u8 = 0;
+const HELLO: u8 = 1;
+const REFUSED: u8 = 2;
+/// What is spoken inside.
+pub(super) const INSIDE_VERSION: u8 = 1;
+
+pub(super) const ID_BYTES: usize = 8;
+pub(super) const TOKEN_BYTES: usize = 16;
+/// How much of a ClientHello's random an answer repeats, so that only who saw it can answer.
+pub(super) const ECHO_BYTES: usize = 16;
+
+const RECORD_HEAD_BYTES: usize = 13;
+const HANDSHAKE_HEAD_BYTES: usize = 12;
+const CONTENT_HANDSHAKE: u8 = 22;
+const CLIENT_HELLO: u8 = 1;
+
+pub(super) type Token = [u8; TOKEN_BYTES];
+pub(super) type Echo = [u8; ECHO_BYTES];
+
+/// A datagram, by what stands in front.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Front<'a> {
+    /// Records as DTLS knows them.
+    Plain(&'a [u8]),
+    /// Records of an association.
+    Id(u64, &'a [u8]),
+    /// Records of somebody who received a challenge.
+    Ticket(Token, &'a [u8]),
+    Challenge(Token, Echo),
+    Reset(Token),
+    Busy(Echo),
+}
+
+/// Sorts a datagram; `None` if it is none of ours.
+pub(super) fn sort(datagram: &[u8]) -> Option<Front<'_>> {
+    let (first, rest) = datagram.split_first()?;
+    match *first {
+        20..=63 => Some(Front::Plain(datagram)),
+        ID => rest.split_first_chunk().map(|(id, record)| Front::Id(u64::from_be_bytes(*id), record)),
+        TICKET => rest.split_first_chunk().map(|(token, record)| Front::Ticket(*token, record)),
+        CHALLENGE => {
+            let (token, echo) = rest.split_first_chunk()?;
+            Some(Front::Challenge(*token, echo.try_into().ok()?))
+        }
+        RESET => rest.try_into().ok().map(Front::Reset),
+        BUSY => rest.try_into().ok().map(Front::Busy),
+        _ => None,
+    }
+}
+
+pub(super) fn id_prefix(id: u64) -> Vec<u8> {
+    [&[ID], &id.to_be_bytes()[..]].concat()
+}
+
+pub(super) fn ticket_prefix(token: &Token) -> Vec<u8> {
+    [&[TICKET], &token[..]].concat()
+}
+
+pub(super) fn challenge(token: &Token, echo: &Echo) -> Vec<u8> {
+    [&[CHALLENGE], &token[..], &echo[..]].concat()
+}
+
+pub(super) fn reset(token: &Token) -> Vec<u8> {
+    [&[RESET], &token[..]].concat()
+}
+
+pub(super) fn busy(echo: &Echo) -> Vec<u8> {
+    [&[BUSY], &echo[..]].concat()
+}
+
+/// The beginning of the random of the ClientHello that a datagram begins with; `None` if it begins with anything else.
+/// A hello that comes in pieces counts by the piece that holds the random.
+pub(super) fn client_hello(datagram: &[u8]) -> Option<Echo> {
+    let (head, rest) = datagram.split_at_checked(RECORD_HEAD_BYTES)?;
+    let length = usize::from(u16::from_be_bytes([head[11], head[12]]));
+    let (handshake, body) = rest.get(..length)?.split_at_checked(HANDSHAKE_HEAD_BYTES)?;
+    let is_hello = head[0] == CONTENT_HANDSHAKE && epoch(head) == 0 && handshake[0] == CLIENT_HELLO;
+    let is_first_piece = handshake[6..9] == [0, 0, 0];
+    // Two bytes of version, then the random.
+    let random = body.get(2..2 + ECHO_BYTES)?;
+    if is_hello && is_first_piece { random.try_into().ok() } else { None }
+}
+
+/// Whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS 1.3 has
+/// a header of its own, 001CSLEE (RFC 9147, 4).
+pub(super) fn has_plaintext(mut records: &[u8]) -> bool {
+    while let Some(first) = records.first() {
+        let next = match first {
+            0x20..=0x3f if first & 0x10 == 0 => {
+                let sequence_bytes = if first & 0x08 == 0 { 1 } else { 2 };
+                if first & 0x04 == 0 {
+                    // Without a length it is the last.
+                    return false;
+                }
+                let at = 1 + sequence_bytes;
+                records.get(at..at + 2).map(|n| at + 2 + usize::from(u16::from_be_bytes([n[0], n[1]])))
+            }
+            20..=25 => match records.get(..RECORD_HEAD_BYTES) {
+                Some(head) if epoch(head) > 0 => {
+                    Some(RECORD_HEAD_BYTES + usize::from(u16::from_be_bytes([head[11], head[12]])))
+                }
+                _ => return true,
+            },
+            _ => return true,
+        };
+        let Some(rest) = next.and_then(|next| records.get(next..)) else { return true };
+        records = rest;
+    }
+    false
+}
+
+fn epoch(head: &[u8]) -> u16 {
+    u16::from_be_bytes([head[3], head[4]])
+}
+
+/// What is said inside of records.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Inside {
+    /// The dialer asks.
+    Ask,
+    /// The listener answers: put this id in front from now on; that is how a reset of it would look.
+    Answer { id: u64, reset: Token },
+    /// The certificate is refused, with this alert (RFC 8446, 6.2).
+    Refused { alert: u8 },
+    /// Another version, or nothing known.
+    Unknown,
+}
+
+impl Inside {
+    pub(super) fn is_inside(plaintext: &[u8]) -> bool {
+        plaintext.first() == Some(&INSIDE)
+    }
+
+    pub(super) fn parse(plaintext: &[u8]) -> Self {
+        match plaintext {
+            [INSIDE, HELLO, INSIDE_VERSION] => Self::Ask,
+            [INSIDE, HELLO, INSIDE_VERSION, rest @ ..] => {
+                let answer = rest.split_first_chunk::<ID_BYTES>();
+                let answer = answer.and_then(|(id, reset)| Some((id, reset.try_into().ok()?)));
+                answer
+                    .map_or(Self::Unknown, |(id, reset)| Self::Answer { id: u64::from_be_bytes(*id), reset })
+            }
+            [INSIDE, REFUSED, alert] => Self::Refused { alert: *alert },
+            _ => Self::Unknown,
+        }
+    }
+
+    pub(super) fn to_bytes(self) -> Vec<u8> {
+        match self {
+            Self::Ask => vec![INSIDE, HELLO, INSIDE_VERSION],
+            Self::Answer { id, reset } => {
+                [&[INSIDE, HELLO, INSIDE_VERSION], &id.to_be_bytes()[..], &reset].concat()
+            }
+            Self::Refused { alert } => vec![INSIDE, REFUSED, alert],
+            Self::Unknown => vec![INSIDE],
+        }
+    }
+}
+
+/// What the fuzzer and the seeded test throw at this module: whatever is sorted is made of the same bytes again.
+#[doc(hidden)]
+pub fn exercise(datagram: &[u8]) {
+    let again = match sort(datagram) {
+        None => None,
+        Some(Front::Plain(record)) => {
+            let _ = has_plaintext(record);
+            // A hello is plaintext.
+            assert!(client_hello(record).is_none() || has_plaintext(record));
+            Some(record.to_vec())
+        }
+        Some(Front::Id(id, record)) => Some([&id_prefix(id), record].concat()),
+        Some(Front::Ticket(token, record)) => Some([&ticket_prefix(&token), record].concat()),
+        Some(Front::Challenge(token, echo)) => Some(challenge(&token, &echo)),
+        Some(Front::Reset(token)) => Some(reset(&token)),
+        Some(Front::Busy(echo)) => Some(busy(&echo)),
+    };
+    assert!(again.is_none_or(|again| again == datagram));
+    if Inside::is_inside(datagram) {
+        let inside = Inside::parse(datagram);
+        assert!(inside == Inside::Unknown || inside.to_bytes() == datagram);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_chacha::ChaCha20Rng;
+    use rand_core::{RngCore as _, SeedableRng as _};
+
+    use super::*;
+
+    fn record(epoch: u16, body: &[u8]) -> Vec<u8> {
+        let mut out = vec![CONTENT_HANDSHAKE, 0xfe, 0xfd];
+        out.extend_from_slice(&epoch.to_be_bytes());
+        out.extend_from_slice(&[0; 6]);
+        out.extend_from_slice(&(body.len() as u16).to_be_bytes());
+        out.extend_from_slice(body);
+        out
+    }
+
+    fn hello() -> Vec<u8> {
+        let mut body = vec![CLIENT_HELLO, 0, 0, 60, 0, 0, 0, 0, 0, 0, 0, 60, 0xfe, 0xfd];
+        body.extend(1..=58);
+        record(0, &body)
+    }
+
+    #[test]
+    fn a_hello_is_known_by_its_random() {
+        let hello = hello();
+        assert_eq!(client_hello(&hello).unwrap()[..3], [1, 2, 3]);
+        assert!(has_plaintext(&hello));
+        for (at, value) in [(0, 23), (4, 1), (13, 2), (19, 1), (12, 0xff)] {
+            let mut other = hello.clone();
+            other[at] = value;
+            assert_eq!(client_hello(&other), None, "byte {at}");
+        }
+    }
+
+    #[test]
+    fn plaintext_is_found_behind_ciphertext() {
+        let sealed12 = record(1, &[7; 40]);
+        let sealed13 = [&[0x2f, 0, 1, 0, 20], &[7; 20][..]].concat();
+        for sealed in [&sealed12, &sealed13] {
+            assert!(!has_plaintext(sealed));
+            assert!(has_plaintext(&[&sealed[..], &hello()].concat()));
+            assert!(has_plaintext(&sealed[..sealed.len() - 1]));
+        }
+        assert!(!has_plaintext(&[&sealed13[..], &sealed12].concat()));
+    }
+
+    #[test]
+    fn random_datagrams_are_sorted_without_harm() {
+        let mut rng = ChaCha20Rng::seed_from_u64(7);
+        let known =
+            [hello(), challenge(&[1; 16], &[2; 16]), Inside::Answer { id: 7, reset: [3; 16] }.to_bytes()];
+        for round in 0..20_000 {
+            let mut bytes = match known.get(round % 8) {
+                Some(known) => known.clone(),
+                None => vec![0; rng.next_u32() as usize % 80],
+            };
+            if round % 8 >= known.len() {
+                rng.fill_bytes(&mut bytes);
+            }
+            if let Some(first) = bytes.first_mut()
+                && round % 3 == 0
+            {
+                *first = [0, 22, 0x2c, ID, CHALLENGE, TICKET, RESET, BUSY][rng.next_u32() as usize % 8];
+            }
+            if !bytes.is_empty() {
+                let at = rng.next_u32() as usize % bytes.len();
+                bytes[at] ^= rng.next_u32() as u8;
+                bytes.truncate(1 + rng.next_u32() as usize % bytes.len());
+            }
+            exercise(&bytes);
+        }
+    }
+}

@@ -1,0 +1,292 @@
+//! Making links over TCP: listening and dialling.
+//!
+//! A link is handed out only after both certificates were verified and the greetings were exchanged, as over QUIC.
+
+use std::collections::VecDeque;
+use std::io::{self, Write as _};
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::Duration;
+
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::{AbortHandle, JoinSet};
+use tokio::time::{sleep, timeout};
+
+use super::driver::{DRAIN_TIMEOUT, run};
+use super::handshake::{self, Made};
+use super::{About, Shared, StreamLink};
+use crate::credentials::CredentialStore;
+use crate::error::{CloseReason, DialError, LinkError, Refusal};
+use crate::framing::Greeting;
+use crate::metrics::TransportMetrics;
+use crate::options::LinkOptions;
+use crate::overload::Overload;
+use crate::race;
+use crate::url::{LinkUrl, ListenAddr, Scheme};
+
+/// Connections that the kernel keeps until they are accepted.
+const BACKLOG: i32 = 1024;
+/// How long to wait where no connection can be accepted, for want of file descriptors for instance.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// A TLS alert, `internal_error`, before any keys: what a dialer is told that there is no time for.
+const ALERT_OVERLOADED: [u8; 7] = [21, 3, 3, 0, 2, 2, 80];
+const HTTP_OVERLOADED: &[u8] =
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
+
+/// Awaits links on one TCP socket.
+pub(crate) struct StreamListener {
+    tcp: TcpListener,
+    local: SocketAddr,
+    acceptor: Arc<Acceptor>,
+    handshakes: JoinSet<(SocketAddr, Result<StreamLink, Refusal>)>,
+    slots: VecDeque<Slot>,
+    overload: Overload,
+}
+
+/// What every incoming handshake needs.
+struct Acceptor {
+    scheme: Scheme,
+    path: String,
+    credentials: CredentialStore,
+    options: LinkOptions,
+    metrics: Arc<TransportMetrics>,
+    links: Links,
+}
+
+/// A handshake under way.
+struct Slot {
+    task: AbortHandle,
+    /// The peer has said something.
+    has_spoken: Arc<AtomicBool>,
+}
+
+impl StreamListener {
+    pub(crate) fn bind(
+        addr: &ListenAddr,
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> io::Result<Self> {
+        let tcp = listen(addr.addr)?;
+        let local = tcp.local_addr()?;
+        let (scheme, path) = (addr.scheme, addr.path().to_owned());
+        let acceptor =
+            Arc::new(Acceptor { scheme, path, credentials, options, metrics, links: Links::default() });
+        let (handshakes, overload) = (JoinSet::new(), Overload::default());
+        Ok(Self { tcp, local, acceptor, handshakes, slots: VecDeque::new(), overload })
+    }
+
+    pub(crate) fn local_addr(&self) -> SocketAddr {
+        self.local
+    }
+
+    pub(crate) async fn accept(&mut self) -> Result<StreamLink, (SocketAddr, Refusal)> {
+        loop {
+            tokio::select! {
+                Some(done) = self.handshakes.join_next() => match done {
+                    Ok((_, Ok(link))) => return Ok(link),
+                    Ok((remote, Err(refusal))) => return Err((remote, refusal)),
+                    Err(error) if error.is_cancelled() => {}
+                    Err(error) => tracing::error!(%error, "a handshake ended abnormally"),
+                },
+                incoming = self.tcp.accept() => match incoming {
+                    Ok((tcp, remote)) => {
+                        let remote = canonical(remote);
+                        if let Some(refusal) = self.admit(tcp, remote) {
+                            return Err((remote, refusal));
+                        }
+                    }
+                    Err(error) => {
+                        tracing::debug!(%error, "no connection can be accepted");
+                        sleep(ACCEPT_PAUSE).await;
+                    }
+                },
+            }
+        }
+    }
+
+    pub(crate) async fn close(&mut self, reason: &CloseReason) {
+        self.handshakes.abort_all();
+        self.acceptor.links.close(reason).await;
+    }
+
+    fn admit(&mut self, tcp: TcpStream, remote: SocketAddr) -> Option<Refusal> {
+        self.slots.retain(|slot| !slot.task.is_finished());
+        let pending = self.slots.len();
+        let mut refusal = None;
+        if pending >= self.acceptor.options.handshakes_max {
+            self.acceptor.metrics.count_refused(Refusal::TooMany { pending, unreported: 0 }.kind());
+            refusal = self.overload.note(pending);
+            // Whoever has said nothing yet gives way, the oldest first; else this one does. So connections that are opened
+            // and left alone keep nobody out.
+            let silent = self.slots.iter().position(|slot| !slot.has_spoken.load(Relaxed));
+            match silent.and_then(|at| self.slots.remove(at)) {
+                Some(slot) => slot.task.abort(),
+                None => {
+                    self.acceptor.turn_away(tcp);
+                    return refusal;
+                }
+            }
+        }
+        let acceptor = Arc::clone(&self.acceptor);
+        let has_spoken = Arc::<AtomicBool>::default();
+        let (pending, spoken) = (acceptor.metrics.pending(), Arc::clone(&has_spoken));
+        let task = self.handshakes.spawn(async move {
+            let _pending = pending;
+            (remote, acceptor.handshake(tcp, remote, &spoken).await)
+        });
+        self.slots.push_back(Slot { task, has_spoken });
+        refusal
+    }
+}
+
+impl Acceptor {
+    async fn handshake(
+        &self,
+        tcp: TcpStream,
+        remote: SocketAddr,
+        spoken: &AtomicBool,
+    ) -> Result<StreamLink, Refusal> {
+        let after = self.options.handshake_timeout;
+        let made = async {
+            // In every scheme the dialer speaks first.
+            if matches!(tcp.peek(&mut [0]).await, Ok(1..)) {
+                spoken.store(true, Relaxed);
+            }
+            handshake::accept(tcp, self.scheme, &self.path, &self.credentials, &self.options).await
+        };
+        match timeout(after, made).await.unwrap_or(Err(Refusal::TimedOut { after })) {
+            Ok(made) => {
+                self.metrics.count_accepted();
+                Ok(self.links.start(made, remote, false, &self.options))
+            }
+            Err(refusal) => {
+                self.metrics.count_refused(refusal.kind());
+                Err(refusal)
+            }
+        }
+    }
+
+    /// Tells a dialer that it cannot be heard now, if that costs nothing.
+    fn turn_away(&self, tcp: TcpStream) {
+        let text = if self.scheme == Scheme::Ws { HTTP_OVERLOADED } else { &ALERT_OVERLOADED };
+        if let Ok(mut tcp) = tcp.into_std() {
+            let _ = tcp.write(text);
+        }
+    }
+}
+
+/// Dials links over TCP.
+pub(crate) struct StreamDialer {
+    credentials: CredentialStore,
+    options: LinkOptions,
+    metrics: Arc<TransportMetrics>,
+    links: Links,
+}
+
+impl StreamDialer {
+    pub(crate) fn new(
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> Self {
+        Self { credentials, options, metrics, links: Links::default() }
+    }
+
+    /// Dials these addresses in this order, and says `url` of them.
+    pub(crate) async fn dial_at(
+        &self,
+        url: &LinkUrl,
+        addresses: Vec<SocketAddr>,
+        greeting: Greeting,
+    ) -> Result<StreamLink, DialError> {
+        let failed = |attempts| DialError::Failed { url: url.clone(), attempts };
+        let after = self.options.handshake_timeout;
+        let late = LinkError::HandshakeTimedOut { after };
+        let connect = |address| {
+            let (url, credentials, options) = (url.clone(), self.credentials.clone(), self.options.clone());
+            let late = late.clone();
+            async move {
+                let dialled = async {
+                    let tcp = TcpStream::connect(address).await.map_err(unconnected)?;
+                    handshake::dial(tcp, &url, &credentials, &options).await
+                };
+                timeout(after, dialled).await.unwrap_or(Err(late))
+            }
+        };
+        let (remote, secured) = race::first(addresses, connect).await.map_err(failed)?;
+        let made = timeout(after, secured.greet(greeting)).await.unwrap_or(Err(late));
+        let made = made.map_err(|e| failed(vec![(remote, e)]))?;
+        self.metrics.count_dialed();
+        Ok(self.links.start(made, canonical(remote), true, &self.options))
+    }
+
+    pub(crate) async fn close(&self, reason: &CloseReason) {
+        self.links.close(reason).await;
+    }
+}
+
+/// The links of one endpoint, to be closed with it.
+#[derive(Default)]
+struct Links {
+    all: Mutex<Vec<Weak<Shared>>>,
+}
+
+impl Links {
+    fn start(&self, made: Made, remote: SocketAddr, is_dialer: bool, options: &LinkOptions) -> StreamLink {
+        let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
+        let shared = Shared::new(options, counters);
+        shared.lock().mux.note_handshake(rtt);
+        tokio::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
+        let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
+        if all.len() == all.capacity() {
+            all.retain(|link| link.strong_count() > 0);
+        }
+        all.push(Arc::downgrade(&shared));
+        drop(all);
+        StreamLink::new(shared, peer, About { remote, is_dialer, lane, key_exchange, mtu_bytes })
+    }
+
+    /// Closes all, and gives their peers a while to hear of it.
+    async fn close(&self, reason: &CloseReason) {
+        let all = std::mem::take(&mut *self.all.lock().unwrap_or_else(PoisonError::into_inner));
+        let all: Vec<_> = all.iter().filter_map(Weak::upgrade).collect();
+        for link in &all {
+            link.close(reason, LinkError::Closed { by_peer: false, reason: reason.clone() });
+        }
+        let drained = async {
+            for link in &all {
+                link.drained().await;
+            }
+        };
+        let _ = timeout(DRAIN_TIMEOUT, drained).await;
+    }
+}
+
+/// A socket that takes both families where its address is that of every interface.
+fn listen(addr: SocketAddr) -> io::Result<TcpListener> {
+    use socket2::{Domain, Protocol, Socket, Type};
+    let socket = Socket::new(Domain::for_address(addr), Type::STREAM, Some(Protocol::TCP))?;
+    if addr.is_ipv6() {
+        socket.set_only_v6(false)?;
+    }
+    // Connections that have ended do not keep the next run from listening.
+    socket.set_reuse_address(true)?;
+    socket.set_nonblocking(true)?;
+    socket.bind(&addr.into())?;
+    socket.listen(BACKLOG)?;
+    TcpListener::from_std(socket.into())
+}
+
+fn unconnected(error: io::Error) -> LinkError {
+    match error.kind() {
+        io::ErrorKind::ConnectionRefused => LinkError::NobodyListens,
+        _ => error.into(),
+    }
+}
+
+/// IPv4 peers of a socket for both families appear as IPv6 addresses otherwise.
+fn canonical(address: SocketAddr) -> SocketAddr {
+    SocketAddr::new(address.ip().to_canonical(), address.port())
+}

@@ -1,0 +1,278 @@
+//! How many bytes may be under way: as many as keep the path busy and a short queue in it. Pure.
+//!
+//! TCP takes whatever it is given, and its congestion control fills the queue of the narrowest hop; what is urgent then
+//! waits behind what is not. So the link gives TCP only what the path delivers within its shortest round trip and
+//! [`QUEUE_TARGET`] more. It is measured from within: pings stand between the bytes, and the answer to one says that all
+//! before it has arrived. (The kernel knows more, but tells it by an ioctl only, for which this crate would need unsafe
+//! code, and knows nothing of a proxy's queues.)
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// How long bytes may queue on the path.
+const QUEUE_TARGET: Duration = Duration::from_millis(12);
+/// Least bytes that may be under way.
+const WINDOW_BYTES_MIN: u64 = 12 << 10;
+/// Bytes that may be under way before anything was measured.
+const WINDOW_BYTES_START: u64 = 32 << 10;
+/// By how much the window grows in a round trip, at most; and does until there is a queue for the first time.
+const GROWTH_MAX: f64 = 1.5;
+/// For how long answers have to be late for a queue to be seen in that, at least; a round trip if that is longer.
+const STANDING_MIN: Duration = Duration::from_millis(25);
+/// For how long the shortest round trip counts before it is looked for again, with a path that is almost empty.
+const RTT_MIN_AGE_MAX: Duration = Duration::from_secs(10);
+/// Most pings without answer: a peer that answers none costs no more.
+const PINGS_MAX: usize = 64;
+/// Bytes between two pings, at least and at most.
+const PING_BYTES: (u64, u64) = (4 << 10, 256 << 10);
+
+/// The window of one link, this way.
+#[derive(Debug)]
+pub(crate) struct Window {
+    bytes: u64,
+    bytes_max: u64,
+    written: u64,
+    delivered: u64,
+    next_ping: u64,
+    pings: VecDeque<Ping>,
+    /// The round trip of the handshake, until there is a better.
+    handshake: Duration,
+    rtt: Option<Duration>,
+    rtt_min: Option<(Duration, Instant)>,
+    /// Since when the shortest of late is looked for, that, and the one of the time before.
+    shortest: Option<(Instant, Duration, Duration)>,
+    /// The shortest round trip is being looked for.
+    is_probing: bool,
+    /// No queue was seen yet.
+    is_starting: bool,
+}
+
+#[derive(Debug)]
+struct Ping {
+    number: u64,
+    at: Instant,
+    /// Bytes written before it, in all.
+    written: u64,
+    /// Bytes under way when it was written.
+    in_flight: u64,
+}
+
+impl Window {
+    /// At most `bytes_max` under way.
+    pub(crate) fn new(bytes_max: u64) -> Self {
+        let bytes_max = bytes_max.max(WINDOW_BYTES_MIN);
+        Self {
+            bytes: WINDOW_BYTES_START.min(bytes_max),
+            bytes_max,
+            written: 0,
+            delivered: 0,
+            next_ping: 1,
+            pings: VecDeque::new(),
+            handshake: Duration::ZERO,
+            rtt: None,
+            rtt_min: None,
+            shortest: None,
+            is_probing: false,
+            is_starting: true,
+        }
+    }
+
+    /// So many bytes were written.
+    pub(crate) fn on_written(&mut self, bytes: u64) {
+        self.written += bytes;
+    }
+
+    /// The number of a ping to be written now; nothing if too many have no answer.
+    pub(crate) fn ping(&mut self, now: Instant) -> Option<u64> {
+        if self.pings.len() >= PINGS_MAX {
+            return None;
+        }
+        let number = self.next_ping;
+        self.next_ping += 1;
+        self.pings.push_back(Ping { number, at: now, written: self.written, in_flight: self.in_flight() });
+        Some(number)
+    }
+
+    /// True if enough was written since the last ping for another to tell something.
+    pub(crate) fn is_ping_due(&self) -> bool {
+        let (least, most) = PING_BYTES;
+        let last = self.pings.back().map_or(self.delivered, |ping| ping.written);
+        // A full window opens with an answer only, so one has to be under way.
+        let is_stuck = self.pings.is_empty() && !self.has_room(0);
+        is_stuck || self.written - last >= (self.limit() / 8).clamp(least, most)
+    }
+
+    /// All pings up to this one have arrived. False if there is none of that number.
+    pub(crate) fn on_pong(&mut self, number: u64, now: Instant) -> bool {
+        if number >= self.next_ping {
+            return false;
+        }
+        let mut latest = None;
+        while self.pings.front().is_some_and(|ping| ping.number <= number) {
+            latest = self.pings.pop_front();
+        }
+        if let Some(ping) = latest {
+            self.delivered = self.delivered.max(ping.written);
+            self.measure(&ping, now);
+        }
+        true
+    }
+
+    /// True if more may be written now: `more` bytes above the window are for what is urgent.
+    pub(crate) fn has_room(&self, more: u64) -> bool {
+        self.in_flight() < self.limit() + more
+    }
+
+    fn limit(&self) -> u64 {
+        if self.is_probing { WINDOW_BYTES_MIN } else { self.bytes }
+    }
+
+    /// Bytes written, in all.
+    pub(crate) fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// Bytes that may be under way.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Smoothed and shortest round trip.
+    pub(crate) fn rtt(&self) -> (Duration, Duration) {
+        (self.rtt.unwrap_or(self.handshake), self.rtt_min.map_or(self.handshake, |(rtt, _)| rtt))
+    }
+
+    /// How long the handshake took for a round trip.
+    pub(crate) fn note_handshake(&mut self, rtt: Duration) {
+        self.handshake = rtt;
+    }
+
+    /// The shortest round trip of late. What comes and goes is the radio or a busy processor; what stays is a queue.
+    fn standing(&mut self, rtt: Duration, now: Instant) -> Duration {
+        let half = self.rtt.map_or(STANDING_MIN, |rtt| rtt.max(STANDING_MIN));
+        let (began, latest, before) = self.shortest.unwrap_or((now, rtt, rtt));
+        let (began, latest, before) = if now.saturating_duration_since(began) > half {
+            (now, rtt, latest)
+        } else {
+            (began, latest.min(rtt), before)
+        };
+        self.shortest = Some((began, latest, before));
+        latest.min(before)
+    }
+
+    fn in_flight(&self) -> u64 {
+        self.written - self.delivered
+    }
+
+    fn measure(&mut self, ping: &Ping, now: Instant) {
+        let rtt = now.saturating_duration_since(ping.at).max(Duration::from_micros(1));
+        self.rtt = Some(self.rtt.map_or(rtt, |smooth| (smooth * 7 + rtt) / 8));
+        let is_unloaded = ping.in_flight <= WINDOW_BYTES_MIN;
+        match self.rtt_min {
+            Some((least, at)) if rtt > least => {
+                if now.saturating_duration_since(at) > RTT_MIN_AGE_MAX {
+                    self.is_probing = !is_unloaded;
+                    if is_unloaded {
+                        self.rtt_min = Some((rtt, now));
+                    }
+                }
+            }
+            _ => {
+                self.rtt_min = Some((rtt, now));
+                self.is_probing = false;
+            }
+        }
+        let least = self.rtt_min.map_or(rtt, |(least, _)| least);
+        // What was under way arrived within this round trip; so this much does in the time that it is to take.
+        let was_full = ping.in_flight >= self.bytes / 2;
+        let (aim, standing) = (least + QUEUE_TARGET, self.standing(rtt, now));
+        let portion = |rtt: Duration| aim.as_secs_f64() / rtt.as_secs_f64();
+        self.is_starting &= rtt < least + QUEUE_TARGET / 2;
+        let growth = if self.is_starting { GROWTH_MAX } else { portion(rtt).min(GROWTH_MAX) };
+        let wanted = (ping.in_flight as f64 * growth) as u64;
+        if wanted > self.bytes {
+            self.bytes = wanted;
+        } else if was_full && standing > aim && !self.is_probing {
+            let wanted = (ping.in_flight as f64 * portion(standing)) as u64;
+            self.bytes -= self.bytes.saturating_sub(wanted) / 4;
+        }
+        self.bytes = self.bytes.clamp(WINDOW_BYTES_MIN, self.bytes_max);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_chacha::ChaCha20Rng;
+    use rand_core::{RngCore as _, SeedableRng as _};
+
+    use super::*;
+
+    /// A path of this rate and delay, as full as the window lets it be: (bytes per second delivered, longest wait in its
+    /// queue) over the last of so many seconds. Answers are late by up to `jitter`, and stay in order.
+    fn run(rate: f64, rtt: Duration, jitter: Duration, seconds: u32) -> (f64, Duration) {
+        let mut rng = ChaCha20Rng::seed_from_u64(1);
+        let start = Instant::now();
+        let (mut window, mut now, mut free_at) = (Window::new(16 << 20), start, start);
+        let mut answers: VecDeque<(Instant, u64)> = VecDeque::new();
+        let end = start + Duration::from_secs(seconds.into());
+        let late = end - Duration::from_secs(1);
+        let (mut sent, mut worst) = (0u64, Duration::ZERO);
+        while now < end {
+            loop {
+                if window.is_ping_due()
+                    && let Some(number) = window.ping(now)
+                {
+                    let at = free_at.max(now) + rtt + jitter * (rng.next_u32() % 256) / 256;
+                    let at = answers.back().map_or(at, |(before, _)| at.max(*before));
+                    answers.push_back((at, number));
+                }
+                if !window.has_room(0) {
+                    break;
+                }
+                window.on_written(1400);
+                free_at = free_at.max(now) + Duration::from_secs_f64(1400.0 / rate);
+                if now >= late {
+                    sent += 1400;
+                    worst = worst.max(free_at - now);
+                }
+            }
+            let (at, number) = answers.pop_front().expect("an answer is always due");
+            now = at;
+            assert!(window.on_pong(number, now));
+        }
+        (sent as f64, worst)
+    }
+
+    #[test]
+    fn paths_are_filled_and_queues_stay_short() {
+        for (megabits, millis) in [(5.0, 1), (5.0, 76), (50.0, 20), (1000.0, 1), (1000.0, 20)] {
+            let rate = megabits * 125_000.0;
+            let (sent, worst) = run(rate, Duration::from_millis(millis), Duration::ZERO, 25);
+            let share = sent / rate;
+            assert!(share > 0.85, "{megabits} Mbit/s, {millis} ms: {share:.2} of the rate");
+            assert!(worst < Duration::from_millis(40), "{megabits} Mbit/s, {millis} ms: queue of {worst:?}");
+        }
+    }
+
+    #[test]
+    fn jitter_does_not_pass_for_a_queue() {
+        for (megabits, millis) in [(5.0, 5), (50.0, 5), (50.0, 40)] {
+            let rate = megabits * 125_000.0;
+            let (sent, worst) = run(rate, Duration::from_millis(millis), Duration::from_millis(30), 25);
+            let share = sent / rate;
+            assert!(share > 0.5, "{megabits} Mbit/s, {millis} ms: {share:.2} of the rate");
+            assert!(worst < Duration::from_millis(80), "{megabits} Mbit/s, {millis} ms: queue of {worst:?}");
+        }
+    }
+
+    #[test]
+    fn answers_to_nothing_are_refused_and_silence_is_bounded() {
+        let now = Instant::now();
+        let mut window = Window::new(1 << 20);
+        assert!(!window.on_pong(1, now));
+        assert_eq!((0..1000).filter_map(|_| window.ping(now)).count(), PINGS_MAX);
+        assert!(window.on_pong(PINGS_MAX as u64, now));
+        assert!(window.on_pong(3, now), "an old answer says nothing");
+        assert!(window.ping(now).is_some());
+    }
+}

@@ -1,0 +1,115 @@
+//! TLS 1.3 as every transport uses it: both ends show certificates, nothing is resumed, nothing is sent early.
+
+mod verifier;
+
+use std::sync::{Arc, LazyLock};
+
+use rustls::crypto::aws_lc_rs::kx_group;
+use rustls::crypto::{CryptoProvider, SupportedKxGroup};
+use rustls::server::NoServerSessionStorage;
+use rustls::sign::SingleCertAndKey;
+
+use crate::credentials::CredentialStore;
+use crate::options::LinkOptions;
+use verifier::{Anyone, PeerVerifier, Presenter};
+pub(crate) use verifier::{Findings, alert, judge};
+
+/// What web proxies expect to find in TLS.
+const HTTP_ALPN: &[u8] = b"http/1.1";
+
+static CLASSICAL: LazyLock<Arc<CryptoProvider>> =
+    LazyLock::new(|| provider_with(vec![kx_group::X25519, kx_group::X25519MLKEM768]));
+static POST_QUANTUM: LazyLock<Arc<CryptoProvider>> =
+    LazyLock::new(|| provider_with(vec![kx_group::X25519MLKEM768]));
+
+fn provider_with(kx_groups: Vec<&'static dyn SupportedKxGroup>) -> Arc<CryptoProvider> {
+    Arc::new(CryptoProvider { kx_groups, ..rustls::crypto::aws_lc_rs::default_provider() })
+}
+
+/// A node that does not require post-quantum key exchange still has it, second: so a fleet can be switched node by node,
+/// and one that has not been reached yet is not locked out by those that have.
+fn provider(post_quantum: bool) -> &'static Arc<CryptoProvider> {
+    if post_quantum { &POST_QUANTUM } else { &CLASSICAL }
+}
+
+/// For one incoming connection that speaks this application protocol (RFC 7301), with a verdict of its own.
+pub(crate) fn server(
+    credentials: &CredentialStore,
+    options: &LinkOptions,
+    alpn: &[u8],
+) -> (rustls::ServerConfig, Arc<Findings>) {
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
+    let presenter = Presenter {
+        key: identity.certified_key(),
+        accepted: provider.kx_groups.iter().map(|g| g.name()).collect(),
+        findings: Arc::clone(&findings),
+    };
+    let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(provider))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .expect("the provider has cipher suites of TLS 1.3")
+        .with_client_cert_verifier(verifier)
+        .with_cert_resolver(Arc::new(presenter));
+    tls.alpn_protocols = vec![alpn.to_vec()];
+    // A resumed session would skip the certificate, and with it expiry and revocation.
+    tls.session_storage = Arc::new(NoServerSessionStorage {});
+    tls.send_tls13_tickets = 0;
+    tls.max_early_data_size = 0;
+    (tls, findings)
+}
+
+/// For one outgoing connection that speaks this application protocol, with a verdict of its own.
+pub(crate) fn client(
+    credentials: &CredentialStore,
+    options: &LinkOptions,
+    alpn: &[u8],
+) -> (rustls::ClientConfig, Arc<Findings>) {
+    let identity = credentials.identity();
+    let post_quantum = options.post_quantum || identity.post_quantum();
+    let provider = provider(post_quantum);
+    let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
+    let key = identity.certified_key();
+    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(provider))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .expect("the provider has cipher suites of TLS 1.3")
+        .dangerous()
+        .with_custom_certificate_verifier(verifier)
+        .with_client_cert_resolver(Arc::new(SingleCertAndKey::from(key)));
+    tls.alpn_protocols = vec![alpn.to_vec()];
+    tls.resumption = rustls::client::Resumption::disabled();
+    tls.enable_early_data = false;
+    // No one routes by it, and it would tell the network where a node thinks it is going.
+    tls.enable_sni = false;
+    (tls, findings)
+}
+
+/// For the TLS around WebSocket, which a web proxy may end in this node's place: it hides what passes from who looks on,
+/// and proves nothing to either end.
+pub(crate) fn outer_server(credentials: &CredentialStore) -> rustls::ServerConfig {
+    let key = SingleCertAndKey::from(credentials.identity().certified_key());
+    let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(&CLASSICAL))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .expect("the provider has cipher suites of TLS 1.3")
+        .with_no_client_auth()
+        .with_cert_resolver(Arc::new(key));
+    tls.alpn_protocols = vec![HTTP_ALPN.to_vec()];
+    tls.session_storage = Arc::new(NoServerSessionStorage {});
+    tls.send_tls13_tickets = 0;
+    tls
+}
+
+/// The other end of [`outer_server`], or of a web proxy's. Whoever it is, the nodes' own TLS is within. It names the host,
+/// since web proxies choose by that.
+pub(crate) fn outer_client() -> rustls::ClientConfig {
+    let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(&CLASSICAL))
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .expect("the provider has cipher suites of TLS 1.3")
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(Anyone::new(&CLASSICAL)))
+        .with_no_client_auth();
+    tls.alpn_protocols = vec![HTTP_ALPN.to_vec()];
+    tls.resumption = rustls::client::Resumption::disabled();
+    tls
+}

@@ -1,0 +1,396 @@
+//! DTLS beside ours: `openssl`, floods of hellos, keys that DTLS cannot use.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
+#[path = "support/relay.rs"]
+mod relay;
+mod support;
+
+use std::net::UdpSocket;
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
+
+use relay::Relay;
+use sgc_transport::*;
+use sgc_trust::{CertError, Identity};
+use support::*;
+use tokio::io::{AsyncBufReadExt as _, AsyncRead, AsyncWriteExt as _, BufReader};
+use tokio::process::{Child, Command};
+
+/// The identity's parts in the form that `openssl` reads, in a directory that goes with it.
+struct Files {
+    dir: PathBuf,
+}
+
+impl Files {
+    fn of(identity: &Identity, name: &str) -> Self {
+        let dir = std::env::temp_dir().join(format!("sgc-dtls-{}-{name}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        let text = identity.to_text();
+        let block = |from: &str, to: &str| {
+            let (begin, end) = (format!("-----BEGIN {from}-----"), format!("-----END {from}-----\n"));
+            let start = text.find(&begin).unwrap();
+            let stop = text[start..].find(&end).unwrap() + start + end.len();
+            text[start..stop].replace(from, to)
+        };
+        std::fs::write(dir.join("ca.pem"), block("SGC CA CERTIFICATE", "CERTIFICATE")).unwrap();
+        std::fs::write(dir.join("leaf.der"), &identity.chain()[0]).unwrap();
+        std::fs::write(dir.join("key.pem"), block("PRIVATE KEY", "PRIVATE KEY")).unwrap();
+        Self { dir }
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.dir.join(name).to_str().unwrap().to_owned()
+    }
+}
+
+impl Drop for Files {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.dir);
+    }
+}
+
+fn openssl(what: &str, args: &[&str]) -> Child {
+    Command::new("openssl")
+        .arg(what)
+        .args(args)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .kill_on_drop(true)
+        .spawn()
+        .expect("these tests need the program `openssl`")
+}
+
+/// Reads lines until one has this in it, and returns what came.
+async fn until(lines: &mut tokio::io::Lines<BufReader<impl AsyncRead + Unpin>>, wanted: &str) -> String {
+    let mut seen = String::new();
+    let patience = Duration::from_secs(10);
+    while let Ok(Ok(Some(line))) = tokio::time::timeout(patience, lines.next_line()).await {
+        seen += &line;
+        seen.push('\n');
+        if line.contains(wanted) {
+            return seen;
+        }
+    }
+    panic!("{wanted:?} never came in\n{seen}")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn openssl_connects_with_certificates_of_both_sides() {
+    let fleet = fleet(1);
+    let options = LinkOptions { handshake_timeout: Duration::from_millis(1500), ..LinkOptions::default() };
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
+    let files = Files::of(&enroll(&fleet, "arm-1"), "client");
+    let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
+    let to = server.addr.to_string();
+    let mut child = openssl(
+        "s_client",
+        &[
+            "-dtls1_2",
+            "-connect",
+            &to,
+            "-CAfile",
+            &ca,
+            "-cert",
+            &leaf,
+            "-certform",
+            "DER",
+            "-key",
+            &key,
+            "-verify_return_error",
+            "-brief",
+        ],
+    );
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let seen = until(&mut lines, "Verification").await;
+    assert!(seen.contains("Verification: OK"), "{seen}");
+    assert!(seen.contains("DTLSv1.2"), "{seen}");
+    assert!(seen.contains("ECDHE-ECDSA-AES"), "{seen}");
+    // It says nothing that we know, and gets no link.
+    let mut stdin = child.stdin.take().unwrap();
+    stdin.write_all(b"hello\n").await.unwrap();
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::TimedOut { .. }), "{refused}");
+    assert_eq!(server.metrics.accepted(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    let mut server = Server::start_on("dtls", enroll(&ours, "router"), LinkOptions::default());
+    let to = server.addr.to_string();
+    let _nobody = openssl("s_client", &["-dtls1_2", "-connect", &to]);
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::NoCertificate)), "{refused}");
+    let files = Files::of(&enroll(&theirs, "arm-1"), "foreign");
+    let (leaf, key) = (files.path("leaf.der"), files.path("key.pem"));
+    let args = ["-dtls1_2", "-connect", &to, "-cert", &leaf, "-certform", "DER", "-key", &key];
+    let _foreign = openssl("s_client", &args);
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Certificate(CertError::UnknownIssuer)), "{refused}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
+    let fleet = fleet(1);
+    let files = Files::of(&enroll(&fleet, "router"), "server");
+    let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
+    let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let accept = format!("127.0.0.1:{port}");
+    let mut child = openssl(
+        "s_server",
+        &[
+            "-dtls1_2",
+            "-accept",
+            &accept,
+            "-CAfile",
+            &ca,
+            "-cert",
+            &leaf,
+            "-certform",
+            "DER",
+            "-key",
+            &key,
+            "-Verify",
+            "1",
+            "-verify_return_error",
+            "-listen",
+        ],
+    );
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    until(&mut lines, "ACCEPT").await;
+    let options = LinkOptions { handshake_timeout: Duration::from_millis(1500), ..LinkOptions::default() };
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
+    let url = format!("dtls://{accept}").parse().unwrap();
+    let error = dial_with(&dialer, &url).await.unwrap_err();
+    // It is of the fleet and is no node: nothing that it says inside is known.
+    assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Version)), "{error}");
+    let seen = until(&mut lines, "CIPHER is").await;
+    assert!(seen.contains("Client certificate") || seen.contains("BEGIN CERTIFICATE"), "{seen}");
+}
+
+/// A hello as a bare DTLS client sends it, each another.
+fn hello(number: u32) -> Vec<u8> {
+    let extensions: &[u8] = &[
+        0, 10, 0, 4, 0, 2, 0, 23, // groups: P-256
+        0, 11, 0, 2, 1, 0, // points: uncompressed
+        0, 13, 0, 4, 0, 2, 4, 3, // signatures: ECDSA P-256
+        0, 23, 0, 0, // extended master secret
+    ];
+    let mut body = vec![0xfe, 0xfd];
+    body.extend((0..8).flat_map(|i| (number.wrapping_mul(2_654_435_761) ^ i).to_be_bytes()));
+    body.extend([0, 0, 0, 2, 0xc0, 0x2b, 1, 0]);
+    body.extend((extensions.len() as u16).to_be_bytes());
+    body.extend(extensions);
+    let len = body.len() as u8;
+    let mut handshake = vec![1, 0, 0, len, 0, 0, 0, 0, 0, 0, 0, len];
+    handshake.extend(body);
+    let mut record = vec![22, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 0];
+    record.extend((handshake.len() as u16).to_be_bytes());
+    record.extend(handshake);
+    record
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_flood_of_hellos_keeps_no_one_out_and_takes_no_room() {
+    let fleet = fleet(1);
+    let options = LinkOptions::default();
+    let unproven_max = options.handshakes_unvalidated_max as u64;
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
+    let before = resident_kib();
+    let addr = server.addr;
+    let (sent, mut waves) = tokio::sync::mpsc::channel(1);
+    let flood = tokio::task::spawn_blocking(move || {
+        let (mut answered, mut challenged, mut answer) = (0_usize, 0, [0; 2048]);
+        for number in 0..20_000_u32 {
+            let [a, b, c, d] = number.to_be_bytes();
+            let source = UdpSocket::bind((std::net::Ipv4Addr::new(127, 1 + b + a, c, d), 0)).unwrap();
+            let hello = hello(number);
+            source.send_to(&hello, addr).unwrap();
+            source.set_nonblocking(true).unwrap();
+            if number % 64 == 0 {
+                source.set_nonblocking(false).unwrap();
+                source.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
+                if let Ok(len) = source.recv(&mut answer) {
+                    assert!(len <= hello.len() * 3, "{len} bytes for {}", hello.len());
+                    answered += 1;
+                    challenged += usize::from(answer[0] == 0xc2);
+                }
+            }
+            if number % 2000 == 1999 {
+                let _ = sent.blocking_send(());
+            }
+        }
+        (answered, challenged)
+    });
+    let dialer = dialer(enroll(&fleet, "arm-1"));
+    let mut links = Vec::new();
+    while soon(waves.recv()).await.is_some() {
+        assert!(server.metrics.handshakes_pending() <= unproven_max + 1);
+        links.push(soon(dialer.dial(&server.url)).await.unwrap());
+        server.link().await;
+    }
+    let (answered, challenged) = soon(flood).await.unwrap();
+    assert!(answered > 0 && challenged * 2 > answered, "{challenged} of {answered} answers are challenges");
+    assert_eq!(links.len(), 10);
+    // 20 000 associations would take more than 100 MiB; ten links and the buffers of their sockets take far less.
+    let grown = resident_kib().saturating_sub(before);
+    assert!(grown < 80 << 10, "{grown} KiB more");
+}
+
+fn resident_kib() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_hello_in_the_name_of_a_peer_does_not_disturb_its_link() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let listener = server.addr;
+    // In between, so that its address can be used by somebody else as well.
+    let middle = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
+    let front = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
+    let url = format!("dtls://{}", front.local_addr().unwrap()).parse().unwrap();
+    let forward = {
+        let middle = Arc::clone(&middle);
+        tokio::spawn(async move {
+            let (mut up, mut down, mut dialer) = (vec![0; 65_536], vec![0; 65_536], listener);
+            loop {
+                tokio::select! {
+                    Ok((len, from)) = front.recv_from(&mut up) => {
+                        dialer = from;
+                        let _ = middle.send_to(&up[..len], listener).await;
+                    }
+                    Ok(len) = middle.recv(&mut down) => {
+                        let _ = front.send_to(&down[..len], dialer).await;
+                    }
+                }
+            }
+        })
+    };
+    let near = dial(enroll(&fleet, "arm-1"), &url).await.unwrap();
+    let far = server.link().await;
+    for number in 0..50 {
+        let forged = match number % 5 {
+            0 => hello(number),
+            // A fatal alert, a change of cipher, a finished and garbage, all in the clear.
+            1 => vec![21, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 9, 0, 2, 2, 40],
+            2 => vec![20, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 9, 0, 1, 1],
+            3 => vec![22, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 9, 0, 12, 20, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0],
+            _ => vec![0x2f, 1, 2, 0, 40, 7, 7, 7],
+        };
+        middle.send_to(&forged, listener).await.unwrap();
+        near.send_control(bytes::Bytes::from_static(b"still")).await.unwrap();
+        assert_eq!(soon(far.recv_control()).await.unwrap(), "still");
+        far.send_control(bytes::Bytes::from_static(b"here")).await.unwrap();
+        assert_eq!(soon(near.recv_control()).await.unwrap(), "here");
+    }
+    forward.abort();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_listener_with_too_much_to_do_says_so() {
+    let fleet = fleet(1);
+    let options = LinkOptions { handshakes_max: 1, ..LinkOptions::default() };
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
+    let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
+    silent.send_to(&hello(1), server.addr).unwrap();
+    soon(async {
+        while server.metrics.handshakes_pending() == 0 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
+    let error = dial(enroll(&fleet, "arm-1"), &server.url).await.unwrap_err();
+    assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Overloaded)), "{error}");
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::TooMany { pending: 1, .. }), "{refused}");
+    // Who says no more makes room.
+    soon(async {
+        while server.metrics.handshakes_pending() > 0 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    })
+    .await;
+    dial(enroll(&fleet, "arm-1"), &server.url).await.unwrap();
+    server.link().await;
+}
+
+/// Waits until something has happened.
+async fn until_true(mut is_so: impl FnMut() -> bool) {
+    soon(async {
+        while !is_so() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn datagrams_that_were_overheard_move_no_link() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let relay = Relay::start(server.addr, 3).await;
+    let url = format!("dtls://{}", relay.addr).parse().unwrap();
+    let near = dial(enroll(&fleet, "arm-1"), &url).await.unwrap();
+    let far = server.link().await;
+    relay.weather.tap.store(true, Relaxed);
+    near.send_control(bytes::Bytes::from(vec![5; 3000])).await.unwrap();
+    soon(far.recv_control()).await.unwrap();
+    let overheard = |relay: &Relay| -> Vec<Vec<u8>> {
+        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1 && d.len() > 60).cloned().collect()
+    };
+    until_true(|| overheard(&relay).len() >= 2).await;
+    let here = far.remote();
+    let thief = tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    for datagram in overheard(&relay) {
+        // As it was, and altered where the number of the record, its length and its content are.
+        thief.send_to(&datagram, server.addr).await.unwrap();
+        for at in [9, 10, 11, 12, 13, 30] {
+            let mut altered = datagram.clone();
+            altered[at] ^= 0x15;
+            thief.send_to(&altered, server.addr).await.unwrap();
+        }
+    }
+    // An id that is not known is answered, which also says that all before it was looked at.
+    let mut unknown = overheard(&relay)[0].clone();
+    unknown[1..9].fill(0xee);
+    thief.send_to(&unknown, server.addr).await.unwrap();
+    let mut answer = [0; 2048];
+    let (len, _) = soon(thief.recv_from(&mut answer)).await.unwrap();
+    assert_eq!((answer[0], len), (0xc4, 17), "the thief was told something else");
+    assert_eq!(far.remote(), here);
+    near.send_control(bytes::Bytes::from_static(b"alive")).await.unwrap();
+    assert_eq!(soon(far.recv_control()).await.unwrap(), "alive");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_node_that_is_another_inside_gets_no_link() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let relay = Relay::start(server.addr, 3).await;
+    relay.weather.tap.store(true, Relaxed);
+    relay.weather.loss.store(1000, Relaxed);
+    let store = CredentialStore::new(enroll(&fleet, "arm-1"));
+    let dialing = {
+        let (dialer, url) = (dialer(store.clone()), format!("dtls://{}", relay.addr).parse().unwrap());
+        tokio::spawn(async move { dial_with(&dialer, &url).await })
+    };
+    // DTLS has begun as one node; QUIC is going to be another.
+    until_true(|| !relay.weather.seen.lock().unwrap().is_empty()).await;
+    store.set_identity(enroll(&fleet, "arm-12"));
+    relay.weather.loss.store(0, Relaxed);
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::Greeting(ProtocolError::OtherNode)), "{refused}");
+    let error = soon(dialing).await.unwrap().unwrap_err();
+    assert!(
+        matches!(&error, LinkError::Closed { by_peer: true, reason: CloseReason::Protocol(_) }),
+        "{error}"
+    );
+    assert_eq!(server.metrics.accepted(), 0);
+}

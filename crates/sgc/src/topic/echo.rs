@@ -1,0 +1,142 @@
+//! `sgc topic echo`: shows messages as `ros2 topic echo` does.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use sgc_cdr::{Layout, TypeName, YamlStyle};
+
+use super::{Tap, TapArgs};
+use crate::definitions::Definitions;
+use crate::error::{CliError, EXIT_FAILURE};
+use crate::output;
+
+/// Bytes in a line of `--raw`.
+const RAW_LINE_BYTES: usize = 32;
+
+/// Show messages of a topic, decoded
+///
+/// Definitions are looked for in `--msg-dir`, then in AMENT_PREFIX_PATH; the common interfaces of ROS 2 ship inside. Looking
+/// slows nothing down: what is not shown in time is left out, and counted.
+#[derive(Debug, Args)]
+pub(crate) struct EchoArgs {
+    #[command(flatten)]
+    tap: TapArgs,
+    /// Print JSON, a line for each message
+    #[arg(long, conflicts_with = "raw")]
+    json: bool,
+    /// End after the first message
+    #[arg(long, conflicts_with = "count")]
+    once: bool,
+    /// End after so many messages
+    #[arg(short = 'n', long, value_name = "N")]
+    count: Option<u64>,
+    /// Show this member alone: `pose.position.x`, `transforms[0].header`
+    #[arg(long, value_name = "PATH", conflicts_with = "raw")]
+    field: Option<String>,
+    /// Show the serialised bytes
+    #[arg(long)]
+    raw: bool,
+    /// Show all elements of long sequences and texts, not the first 128
+    #[arg(long)]
+    full_length: bool,
+    /// Directory with packages that define messages: DIR/PACKAGE/msg/NAME.msg
+    #[arg(long, value_name = "DIR")]
+    msg_dir: Vec<PathBuf>,
+    /// End, as a failure, when nothing came for so long
+    #[arg(long, value_name = "SECONDS")]
+    timeout: Option<u64>,
+}
+
+pub(super) fn echo(args: &EchoArgs) -> Result<ExitCode, CliError> {
+    let mut tap = args.tap.begin(u32::MAX)?;
+    let layout = if args.raw { None } else { Some(layout(&tap, &args.msg_dir)?) };
+    let most = if args.once { Some(1) } else { args.count };
+    let patience = args.timeout.map(Duration::from_secs);
+    let (mut shown, mut dropped) = (0, 0);
+    while most.is_none_or(|most| shown < most) {
+        let begun = Instant::now();
+        let Some((head, payload)) = tap.next(patience)? else {
+            let nothing = match patience {
+                Some(patience) if begun.elapsed() >= patience => {
+                    format!("nothing came for {} s", patience.as_secs())
+                }
+                _ => "the node stopped, or has the topic no more".to_owned(),
+            };
+            output::diagnostic(&format!("sgc: {}: {nothing}", args.tap.topic));
+            return Ok(ExitCode::from(EXIT_FAILURE));
+        };
+        if head.dropped > dropped {
+            output::diagnostic(&format!(
+                "sgc: {} messages left out: they came too fast",
+                head.dropped - dropped
+            ));
+            dropped = head.dropped;
+        }
+        shown += 1;
+        if head.kind != 0 {
+            let end = if head.kind == 1 { "disposed of" } else { "unregistered" };
+            output::diagnostic(&format!("sgc: an instance was {end}"));
+            continue;
+        }
+        match &layout {
+            None => output::raw(&hex(&payload))?,
+            Some(layout) => show(args, layout, payload)?,
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn show(args: &EchoArgs, layout: &Layout, payload: Vec<u8>) -> Result<(), CliError> {
+    let value = match layout.decode(&payload.into()) {
+        Ok(value) => value,
+        Err(why) => {
+            output::diagnostic(&format!("sgc: a message is not what its type says: {why}"));
+            return Ok(());
+        }
+    };
+    let value = match &args.field {
+        None => value,
+        Some(path) => match value.at(path) {
+            Some(value) => value,
+            None => return Err(CliError::NoSuchField { path: path.clone() }),
+        },
+    };
+    if args.json {
+        return output::line(value.to_json());
+    }
+    let style = if args.full_length { YamlStyle { elements: None } } else { YamlStyle::default() };
+    output::raw(&value.to_yaml(style))?;
+    output::line("---")
+}
+
+/// What the messages that a tap shows look like.
+pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
+    let type_name = &tap.shown.type_name;
+    let unknown = |why: String| CliError::NoDefinition { type_name: type_name.clone(), why };
+    let name: TypeName = type_name.parse().map_err(|why| unknown(format!("{why}")))?;
+    let layout = Definitions::new(dirs).layout(&name).map_err(|why| unknown(why.to_string()))?;
+    let differs = tap.shown.type_hash.as_ref().filter(|announced| **announced != layout.type_hash());
+    if let Some(announced) = differs {
+        output::diagnostic(&format!(
+            "sgc: the publisher has another definition of {type_name} ({announced}) than was found here ({}); \
+             name a directory with its definition with --msg-dir",
+            layout.type_hash()
+        ));
+    }
+    Ok(layout)
+}
+
+fn hex(payload: &[u8]) -> String {
+    let mut out = String::new();
+    for line in payload.chunks(RAW_LINE_BYTES) {
+        for byte in line {
+            let _ = write!(out, "{byte:02x}");
+        }
+        out.push('\n');
+    }
+    out.push_str("---\n");
+    out
+}

@@ -1,0 +1,182 @@
+//! `sgc topic hz`, `bw` and `delay`: how often messages come, how large they are, and how old.
+
+use std::collections::VecDeque;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use sgc_cdr::HEADER_STAMP_BYTES;
+use sgc_node::admin::TapHead;
+
+use super::{TapArgs, echo};
+use crate::error::CliError;
+use crate::output;
+
+/// How often figures are shown.
+const REPORT_EVERY: Duration = Duration::from_secs(1);
+
+/// Show how often messages of a topic come
+#[derive(Debug, Args)]
+pub(crate) struct HzArgs {
+    #[command(flatten)]
+    rates: RateArgs,
+}
+
+/// Show how many bytes a second a topic has
+#[derive(Debug, Args)]
+pub(crate) struct BwArgs {
+    #[command(flatten)]
+    rates: RateArgs,
+}
+
+/// Show how old the messages of a topic are by the stamp of their header, which is the clock of their publisher's host
+#[derive(Debug, Args)]
+pub(crate) struct DelayArgs {
+    #[command(flatten)]
+    rates: RateArgs,
+    /// Directory with packages that define messages: DIR/PACKAGE/msg/NAME.msg
+    #[arg(long, value_name = "DIR")]
+    msg_dir: Vec<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct RateArgs {
+    #[command(flatten)]
+    tap: TapArgs,
+    /// Messages that figures are made of
+    #[arg(short, long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
+    window: u32,
+    /// End after so many reports
+    #[arg(short = 'n', long, value_name = "N")]
+    count: Option<u64>,
+}
+
+pub(super) fn hz(args: &HzArgs) -> Result<ExitCode, CliError> {
+    report(&args.rates, 0, |head, _| Some(head.seen_ns as f64 / 1e9), rate)
+}
+
+pub(super) fn bw(args: &BwArgs) -> Result<ExitCode, CliError> {
+    report(&args.rates, 0, |head, _| Some(f64::from(head.bytes)), bandwidth)
+}
+
+pub(super) fn delay(args: &DelayArgs) -> Result<ExitCode, CliError> {
+    let layout = echo::layout(&args.rates.tap.begin(0)?, &args.msg_dir)?;
+    if !layout.begins_with_header() {
+        return Err(CliError::NoHeader { topic: args.rates.tap.topic.clone() });
+    }
+    let old = move |head: &TapHead, payload: &[u8]| {
+        let stamp = layout.header_stamp_ns(payload)?;
+        Some(head.seen_unix_ns.saturating_sub(stamp) as f64 / 1e9)
+    };
+    report(&args.rates, HEADER_STAMP_BYTES as u32, old, ages)
+}
+
+/// What was measured of the last messages: when each was seen, seconds, and the figure.
+type Window = VecDeque<(f64, f64)>;
+
+fn report(
+    args: &RateArgs,
+    bytes: u32,
+    figure: impl Fn(&TapHead, &[u8]) -> Option<f64>,
+    show: impl Fn(&Window) -> Option<String>,
+) -> Result<ExitCode, CliError> {
+    let mut tap = args.tap.begin(bytes)?;
+    let mut window = Window::new();
+    let (mut reports, mut is_news) = (0, false);
+    let mut due = Instant::now() + REPORT_EVERY;
+    while args.count.is_none_or(|count| reports < count) {
+        let left = due.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            due += REPORT_EVERY;
+            reports += 1;
+            match show(&window).filter(|_| is_news) {
+                Some(text) => output::line(text)?,
+                None => output::line("no new messages")?,
+            }
+            is_news = false;
+            continue;
+        }
+        match tap.next(Some(left))? {
+            Some((head, payload)) => {
+                if let Some(figure) = figure(&head, &payload) {
+                    is_news = true;
+                    window.push_back((head.seen_ns as f64 / 1e9, figure));
+                    if window.len() > args.window as usize {
+                        window.pop_front();
+                    }
+                }
+            }
+            // Too early for its patience: there is no more.
+            None if Instant::now() < due => break,
+            None => {}
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Least, most, mean and standard deviation.
+struct Spread {
+    least: f64,
+    most: f64,
+    mean: f64,
+    deviation: f64,
+}
+
+fn spread(all: impl Iterator<Item = f64> + Clone) -> Option<Spread> {
+    let count = all.clone().count();
+    if count == 0 {
+        return None;
+    }
+    let mean = all.clone().sum::<f64>() / count as f64;
+    let deviation = (all.clone().map(|x| (x - mean).powi(2)).sum::<f64>() / count as f64).sqrt();
+    let (least, most) = all.fold((f64::MAX, f64::MIN), |(least, most), x| (least.min(x), most.max(x)));
+    Some(Spread { least, most, mean, deviation })
+}
+
+fn rate(window: &Window) -> Option<String> {
+    let gaps = window.iter().zip(window.iter().skip(1)).map(|((a, _), (b, _))| b - a);
+    let Spread { least, most, mean, deviation } = spread(gaps)?;
+    let rate = if mean > 0.0 { 1.0 / mean } else { f64::INFINITY };
+    Some(format!(
+        "average rate: {rate:.3}\n\tmin: {least:.3}s max: {most:.3}s std dev: {deviation:.5}s window: {}",
+        window.len()
+    ))
+}
+
+fn bandwidth(window: &Window) -> Option<String> {
+    let Spread { least, most, mean, .. } = spread(window.iter().map(|(_, bytes)| *bytes))?;
+    let span = window.back()?.0 - window.front()?.0;
+    // The first message begins the time in which the others came.
+    let all: f64 = window.iter().skip(1).map(|(_, bytes)| bytes).sum();
+    let second = if span > 0.0 { all / span } else { 0.0 };
+    let [second, mean, least, most] = [second, mean, least, most].map(|bytes| output::bytes(bytes as u64));
+    Some(format!(
+        "{second}/s from {} messages\n\tMessage size mean: {mean} min: {least} max: {most}",
+        window.len()
+    ))
+}
+
+fn ages(window: &Window) -> Option<String> {
+    let Spread { least, most, mean, deviation } = spread(window.iter().map(|(_, age)| *age))?;
+    Some(format!(
+        "average delay: {mean:.3}\n\tmin: {least:.3}s max: {most:.3}s std dev: {deviation:.5}s window: {}",
+        window.len()
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_are_those_of_the_window() {
+        let window: Window = [(0.0, 100.0), (0.1, 200.0), (0.2, 300.0)].into();
+        let rate = rate(&window).unwrap();
+        assert_eq!(rate, "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 3");
+        let bandwidth = bandwidth(&window).unwrap();
+        let expected = "2.5 kB/s from 3 messages\n\tMessage size mean: 200 B min: 100 B max: 300 B";
+        assert_eq!(bandwidth, expected);
+        assert!(super::rate(&[(0.0, 1.0)].into()).is_none());
+    }
+}

@@ -1,0 +1,815 @@
+//! The walk: from the local end to the link, or from the link to the local end, up to the first thing that is wrong.
+//!
+//! Pure: a document in, steps out.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Share, ShareRoute, Use, UseRoute};
+use sgc_ros::{is_pattern, matches};
+
+use super::near::{hint, near};
+use super::{Step, Verdict};
+
+/// Steps, of which one that is wrong is the last.
+type Walk = Vec<Step>;
+
+/// Why an interface of the local network does not flow.
+pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
+    let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
+    if !topic.starts_with('/') {
+        let fix = format!("ask for /{topic}");
+        steps.push(Step::wrong(format!("{topic} is not a full ROS 2 name: it begins with no /"), fix));
+        return steps;
+    }
+    if !graph.has_ros {
+        steps.push(Step::wrong(
+            "this node is a router alone: it touches no ROS 2 network and knows topics by their 256-bit names only",
+            "ask the nodes at both ends, or here `sgc why --name HEX`, with the name that `sgc status` shows there",
+        ));
+        return steps;
+    }
+    let shares: Vec<_> =
+        graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, topic)).collect();
+    let uses: Vec<_> = graph.uses.iter().filter(|used| concerns(used, topic)).collect();
+    if shares.is_empty() && uses.is_empty() {
+        if !walk_parts(graph, topic, &mut steps) {
+            steps.push(uncovered(graph, topic));
+        }
+        return steps;
+    }
+    for (_, share) in &shares {
+        walk_share(graph, share, topic, &mut steps);
+    }
+    for used in &uses {
+        walk_use(graph, used, topic, &mut steps);
+    }
+    steps
+}
+
+/// Walks what an action, or the parameters of a node, are made of, up to the part that is wrong; false if no rule is for any
+/// of it.
+fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
+    let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
+    let mut is_any = false;
+    for part in kinds.into_iter().flat_map(|kind| kind.parts()) {
+        let name = part.name(topic);
+        let shares = graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, &name));
+        let mut of_part = Walk::new();
+        shares.for_each(|(_, share)| walk_share(graph, share, &name, &mut of_part));
+        let uses = graph.uses.iter().filter(|used| concerns(used, &name));
+        uses.for_each(|used| walk_use(graph, used, &name, &mut of_part));
+        is_any |= !of_part.is_empty();
+        // The parts have most of the way in common.
+        let known: BTreeSet<String> = steps.iter().map(|step| step.found.clone()).collect();
+        steps.extend(of_part.into_iter().filter(|step| !known.contains(&step.found)));
+        if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
+            break;
+        }
+    }
+    is_any
+}
+
+/// Why a name does not flow, at a router.
+pub(super) fn name(graph: &Graph, name: &str) -> Walk {
+    let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
+    let line = graph.names.get(name).cloned().unwrap_or_default();
+    match line.way {
+        Some((0, _)) => steps.push(Step::fine("its owner is this node")),
+        Some((link, cost)) => {
+            let way =
+                format!("the way to its owner is {}, {} round trip", link_of(graph, link), millis(cost));
+            match graph.links.iter().find(|l| l.id == link) {
+                Some(l) if l.silent => {
+                    steps.push(silent(graph, link));
+                    return steps;
+                }
+                _ => steps.push(Step::fine(way)),
+            }
+        }
+        None => {
+            steps.push(Step::wrong(
+                "nobody in reach advertises it: its owner is not linked to these routers, shares it no more, or nobody \
+                 publishes it there; with `mapping = \"query\"` it is known only while it is asked for",
+                "see `sgc why /topic` at its owner; compare the name with `sgc name`",
+            ));
+            return steps;
+        }
+    }
+    if !line.has_branch {
+        steps.push(Step::wrong(
+            "nobody asked for it over this router: no branch leads through it",
+            "see `sgc why /topic` at the node that uses it: it may go over another router, or be refused",
+        ));
+        return steps;
+    }
+    let out: Vec<_> = line.out.iter().map(|link| link_of(graph, *link)).collect();
+    steps.push(Step::fine(format!("a branch leads through this node, to {}", out.join(", "))));
+    for link in &line.out {
+        if graph.links.iter().any(|l| l.id == *link && l.silent) {
+            steps.push(silent(graph, *link));
+            return steps;
+        }
+    }
+    traffic(&line, "passed through this node", &mut steps);
+    steps
+}
+
+/// Whether a rule shares this, or what runs of it is called so here.
+fn covers(graph: &Graph, at: usize, share: &Share, topic: &str) -> bool {
+    let is_named = share.topic == topic || share.routes.iter().any(|route| route.topic == topic);
+    is_named || graph.endpoints.iter().any(|e| e.topic == topic && e.shared_by == Some(at))
+}
+
+fn concerns(used: &Use, topic: &str) -> bool {
+    let runs = used.routes.iter().any(|route| route.topic == topic);
+    let is_covered = is_pattern(&used.local_topic) && matches(&used.local_topic, topic);
+    runs || is_covered || used.routes.is_empty() && used.local_topic == topic
+}
+
+/// The local ends of an interface: who provides it, and who wants it.
+fn ends<'a>(graph: &'a Graph, kind: Interface, topic: &str) -> (Vec<&'a Endpoint>, Vec<&'a Endpoint>) {
+    let dds = match kind {
+        Interface::Topic => topic.to_owned(),
+        Interface::Service => format!("rq{topic}Request"),
+        Interface::Action => format!("rq{topic}/_action/send_goalRequest"),
+    };
+    let is_topic = kind == Interface::Topic;
+    let all = graph.endpoints.iter().filter(|e| e.topic == dds && e.is_ros_topic == is_topic);
+    // Who answers a service reads its requests.
+    all.partition(|e| e.writes == is_topic)
+}
+
+/// Type of an interface, of the type of its end.
+fn type_of(kind: Interface, end: &Endpoint) -> &str {
+    let suffix = match kind {
+        Interface::Topic => "",
+        Interface::Service => "_Request",
+        Interface::Action => "_SendGoal_Request",
+    };
+    end.type_name.strip_suffix(suffix).unwrap_or(&end.type_name)
+}
+
+fn provider(kind: Interface) -> &'static str {
+    if kind == Interface::Topic { "publisher" } else { "server" }
+}
+
+fn consumer(kind: Interface) -> &'static str {
+    if kind == Interface::Topic { "subscriber" } else { "client" }
+}
+
+/// What to say of an interface that no rule names.
+fn uncovered(graph: &Graph, topic: &str) -> Step {
+    let node = &graph.node;
+    if let Some(offer) = graph.offers.iter().find(|offer| offer.topic == topic && !offer.is_used) {
+        let owner = offer.owner.as_deref().unwrap_or("another node");
+        let line = if offer.subscribe { "" } else { ", publish = true" };
+        return Step::wrong(
+            format!("{owner} shares {topic} with this node, but no [[use]] asks for it"),
+            format!(
+                "add [[use]] from = \"{owner}\", topic = \"{topic}\"{line} to the file of {node}, then `sgc reload`"
+            ),
+        );
+    }
+    let kinds = [Interface::Topic, Interface::Service, Interface::Action];
+    for kind in kinds {
+        let (providers, consumers) = ends(graph, kind, topic);
+        let rules: Vec<_> = graph.shares.iter().map(|share| share.topic.as_str()).collect();
+        let used: Vec<_> = graph.uses.iter().map(|used| used.topic.as_str()).collect();
+        if !providers.is_empty() {
+            let meant = hint(&near(topic, rules.iter().copied()));
+            return Step::wrong(
+                format!("{} local {}s have it, but no rule names it{meant}", providers.len(), provider(kind)),
+                format!(
+                    "to share it, add [[share]] {kind} = \"{topic}\", to = [\"NODE\"] to the file of {node}, then `sgc reload`"
+                ),
+            );
+        }
+        if !consumers.is_empty() {
+            let offers = graph.offers.iter().map(|offer| offer.topic.as_str());
+            let meant = hint(&near(topic, offers.chain(used.iter().copied())));
+            return Step::wrong(
+                format!(
+                    "{} local {}s want it, but no rule brings it here{meant}",
+                    consumers.len(),
+                    consumer(kind)
+                ),
+                format!(
+                    "add [[use]] from = \"OWNER\", {kind} = \"{topic}\" to the file of {node}; the owner has to share it with \
+                     {node}"
+                ),
+            );
+        }
+    }
+    let here = graph.endpoints.iter().filter(|e| e.is_ros_topic).map(|e| e.topic.as_str());
+    let offered = graph.offers.iter().map(|offer| offer.topic.as_str());
+    let ruled =
+        graph.shares.iter().map(|s| s.topic.as_str()).chain(graph.uses.iter().map(|u| u.topic.as_str()));
+    let meant = hint(&near(topic, here.chain(offered).chain(ruled)));
+    Step::wrong(
+        format!(
+            "nobody on the local network has {topic}, no rule names it, and no followed node lists it{meant}"
+        ),
+        "start what publishes it; if it runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
+         ROS_AUTOMATIC_DISCOVERY_RANGE; `sgc topic list` shows what there is",
+    )
+}
+
+/// From the local publishers to the far side, on what this node shares.
+fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
+    let kind = share.kind;
+    let (providers, _) = ends(graph, kind, topic);
+    let routes: Vec<_> = share.routes.iter().filter(|route| route.topic == topic).collect();
+    let takes_in = share.publish.iter().any(|n| *n > 0);
+    if providers.is_empty() && !takes_in {
+        steps.push(no_provider(graph, kind, topic));
+        return;
+    }
+    if !providers.is_empty() {
+        let types: BTreeSet<_> = providers.iter().map(|end| type_of(kind, end)).collect();
+        let types: Vec<_> = types.into_iter().collect();
+        let found =
+            format!("{} local {}s of {topic} [{}]", providers.len(), provider(kind), types.join(", "));
+        steps.push(Step::fine(found));
+        if let Some(wanted) = share.wanted_type.as_deref().filter(|wanted| !types.contains(wanted)) {
+            steps.push(Step::wrong(
+                format!(
+                    "the [[share]] of {topic} says type {wanted}, and the {}s have {}",
+                    provider(kind),
+                    types.join(", ")
+                ),
+                "change `type` in the [[share]], or leave it out",
+            ));
+            return;
+        }
+        let hashes: BTreeSet<_> = providers.iter().filter_map(|end| end.type_hash.as_deref()).collect();
+        if types.len() == 1 && hashes.len() > 1 {
+            let hashes: Vec<_> = hashes.into_iter().map(short_hash).collect();
+            steps.push(Step::wrong(
+                format!(
+                    "local {}s have different definitions of {}: {}",
+                    provider(kind),
+                    types[0],
+                    hashes.join(" and ")
+                ),
+                "build them from one version of the interface package",
+            ));
+            return;
+        }
+    }
+    steps.push(Step::fine(format!("a [[share]] covers it, for {}", whom(share.to))));
+    if routes.is_empty() {
+        steps.push(Step::wrong(
+            format!(
+                "{topic} is covered by a rule, but not shared: {}",
+                told(graph, topic, "nothing of it runs")
+            ),
+            "look into the node's log, and at `sgc status`",
+        ));
+        return;
+    }
+    if !linked(graph, steps) {
+        return;
+    }
+    for route in &routes {
+        walk_share_route(graph, share, route, !providers.is_empty(), steps);
+    }
+}
+
+fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, steps: &mut Walk) {
+    let (node, topic, kind) = (&graph.node, &route.topic, share.kind);
+    if route.granted.is_empty() {
+        if let Some((who, why)) = route.refused.iter().next() {
+            steps.push(Step::wrong(
+                format!("{who} asked for it and was refused: {why}"),
+                format!(
+                    "if {who} may have it, add it to `to` of this [[share]] (`publish`, if it is to publish), then `sgc \
+                     reload`; `sgc policy test` says who may"
+                ),
+            ));
+        } else {
+            steps.push(Step::wrong(
+                "nobody asked for it",
+                format!(
+                    "on the other node: [[use]] from = \"{node}\", {kind} = \"{topic}\"; if it is there, run `sgc why {topic}` \
+                     there"
+                ),
+            ));
+        }
+        return;
+    }
+    let refused = match route.refused.iter().next() {
+        Some((who, why)) => format!("; {who} was refused: {why}"),
+        None => String::new(),
+    };
+    steps.push(Step::fine(format!("granted to {}{refused}", route.granted.join(", "))));
+    let line = graph.names.get(&route.name).cloned().unwrap_or_default();
+    if !line.has_branch {
+        steps.push(Step::wrong(
+            "granted, but no branch leads away from this node: the way broke and is being looked for",
+            "wait a few seconds and ask again; if it stays, see `sgc status` for links that are silent",
+        ));
+        return;
+    }
+    let out: Vec<_> = line.out.iter().filter(|link| **link != 0).collect();
+    for link in &out {
+        if graph.links.iter().any(|l| l.id == **link && l.silent) {
+            steps.push(silent(graph, **link));
+            return;
+        }
+    }
+    let ways: Vec<_> = out.iter().map(|link| link_of(graph, **link)).collect();
+    if !ways.is_empty() {
+        steps.push(Step::fine(format!("it leaves over {}", ways.join(", "))));
+    }
+    if kind != Interface::Topic {
+        if !route.is_written {
+            steps.push(Step::wrong(
+                "granted, but nothing on the local network calls the server for others: DDS refused it, or it is being made",
+                "wait a few seconds and ask again; then look into the node's log for what DDS said",
+            ));
+            return;
+        }
+        steps.push(Step::fine("calls of others are put to the local server"));
+        far_half(&route.granted.join(", "), topic, steps);
+        return;
+    }
+    if provides && !route.is_read {
+        steps.push(Step::wrong(
+            "the local publishers are not read, though somebody has it: the local network refused a reader",
+            "look into the node's log for what DDS said",
+        ));
+        return;
+    }
+    if provides && route.messages == 0 {
+        steps.push(
+            Step::unknown("no message has come from the local publishers since somebody asked for it")
+                .with_fix(format!("`sgc topic hz {topic}` shows whether they publish")),
+        );
+    } else if provides {
+        steps.push(Step::fine(format!("{} messages were published to the far side", route.messages)));
+    }
+    traffic(&line, "went through here", steps);
+    if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
+        return;
+    }
+    if route.is_written {
+        readers(graph, kind, topic, &route.type_name, None, route.matched, steps);
+        steps.push(Step::fine(format!(
+            "{} messages of others were given to the local network",
+            route.written
+        )));
+    }
+    far_half(&route.granted.join(", "), topic, steps);
+}
+
+/// From the owner to the local subscribers, or from the local publishers to the owner.
+fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
+    let (node, owner, kind) = (&graph.node, &used.owner, used.kind);
+    let wish = if used.publishes { "publishes on" } else { "brings" };
+    steps.push(Step::fine(format!("a [[use]] {wish} {} of {owner}", used.topic)));
+    if used.publishes {
+        let (providers, _) = ends(graph, kind, topic);
+        if providers.is_empty() {
+            steps.push(no_provider(graph, kind, topic));
+            return;
+        }
+        steps.push(Step::fine(format!("{} local {}s of {topic}", providers.len(), provider(kind))));
+    }
+    if !linked(graph, steps) {
+        return;
+    }
+    if !used.is_token && !used.has_catalogue {
+        let state = used.owner_state.as_deref().unwrap_or("has not said yet what it shares");
+        let why = match used.follow.as_deref() {
+            Some("refused") => {
+                "it is in reach and refuses this node: are both of one fleet, and is neither revoked?"
+            }
+            Some("asked") => "it is in reach and was asked; it has not answered",
+            _ => {
+                "nobody in reach knows it: is its node running, and linked to the same routers? Is its name spelt right?"
+            }
+        };
+        steps.push(Step::wrong(
+            format!("{owner} {state}: {why}"),
+            format!("run `sgc status` on {owner}; its name in `from` has to be that of its identity"),
+        ));
+        return;
+    }
+    let routes: Vec<_> = used.routes.iter().filter(|route| route.topic == topic).collect();
+    if routes.is_empty() {
+        // Under a wildcard it is the one that was asked for.
+        let theirs = if is_pattern(&used.topic) { topic } else { &used.topic };
+        steps.push(unlisted(graph, used, theirs));
+        return;
+    }
+    if !used.is_token {
+        steps.push(Step::fine(format!("{owner} lists it for {node}")));
+    }
+    for route in routes {
+        walk_use_route(graph, used, route, steps);
+    }
+}
+
+/// Why nothing of a rule runs, though its owner is known.
+fn unlisted(graph: &Graph, used: &Use, topic: &str) -> Step {
+    let (node, owner) = (&graph.node, &used.owner);
+    if used.is_token {
+        return match &used.refused {
+            Some(why) => Step::wrong(
+                format!("{owner} refuses the token: {why}"),
+                format!("ask {owner} for a new token (`sgc share-token`)"),
+            ),
+            None => Step::wrong(
+                format!(
+                    "{owner} has not granted what the token is for: nobody in reach knows the name, or it was not answered"
+                ),
+                format!("is {owner} running, and linked to a router that this node is linked to?"),
+            ),
+        };
+    }
+    let of_owner: Vec<_> = graph.offers.iter().filter(|offer| offer.owner_id == used.owner_id).collect();
+    let same: Vec<_> =
+        of_owner.iter().filter(|offer| offer.topic == topic && offer.kind == used.kind).collect();
+    if let (Some(wanted), Some(offer)) =
+        (&used.wanted_type, same.iter().find(|o| Some(&o.type_name) != used.wanted_type.as_ref()))
+    {
+        return Step::wrong(
+            format!("{owner} shares {topic} as {}, and the [[use]] asks for {wanted}", offer.type_name),
+            "change `type` in the [[use]], or leave it out",
+        );
+    }
+    if let Some(offer) = same.first() {
+        return if used.publishes && !offer.publish {
+            Step::wrong(
+                format!("{owner} shares {topic} with {node}, but does not let it publish"),
+                format!("on {owner}: add \"{node}\" to `publish` of its [[share]], then `sgc reload`"),
+            )
+        } else if !used.publishes && !offer.subscribe {
+            Step::wrong(
+                format!("{owner} lets {node} publish on {topic}, but not subscribe"),
+                format!(
+                    "on {owner}: add \"{node}\" to `to` of its [[share]]; or set publish = true in the [[use]]"
+                ),
+            )
+        } else {
+            Step::wrong(
+                format!(
+                    "{owner} lists {topic}, but nothing of it runs here: {}",
+                    told(graph, topic, "see the log")
+                ),
+                "look into the node's log, and at `sgc status`",
+            )
+        };
+    }
+    let other = of_owner.iter().find(|offer| offer.topic == topic);
+    if let Some(offer) = other {
+        return Step::wrong(
+            format!("{owner} shares {topic} as a {}, and the [[use]] asks for a {}", offer.kind, used.kind),
+            format!("write {} = \"{topic}\" in the [[use]]", offer.kind),
+        );
+    }
+    let meant = hint(&near(topic, of_owner.iter().map(|offer| offer.topic.as_str())));
+    Step::wrong(
+        format!("{owner} is in reach and does not share {topic} with {node}{meant}"),
+        format!(
+            "on {owner}: is it in a [[share]] whose `to` has \"{node}\" or a group of it, and is it published there? `sgc why \
+             {topic}` there says more"
+        ),
+    )
+}
+
+fn walk_use_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
+    let (owner, topic, kind) = (&used.owner, &route.topic, used.kind);
+    if !route.is_granted {
+        steps.push(match (&route.refused, route.join.as_deref()) {
+            (Some(why), _) => Step::wrong(
+                format!("{owner} refuses it: {why}"),
+                format!(
+                    "on {owner}: `sgc why {}` names the entry that is missing; it is asked again by itself",
+                    used.topic
+                ),
+            ),
+            (None, Some("waiting")) => Step::wrong(
+                format!("{owner} listed it, but no way leads to it now"),
+                format!("is {owner} running and linked? `sgc status` there"),
+            ),
+            (None, _) => Step::wrong(
+                format!("asked {owner} for it; the answer is not here yet"),
+                "wait a few seconds and ask again",
+            ),
+        });
+        return;
+    }
+    steps.push(Step::fine(format!("{owner} granted it [{}]", route.type_name)));
+    let line = graph.names.get(&route.name).cloned().unwrap_or_default();
+    if let Some((link, cost)) = line.way {
+        if graph.links.iter().any(|l| l.id == link && l.silent) {
+            steps.push(silent(graph, link));
+            return;
+        }
+        steps.push(Step::fine(format!(
+            "the way to {owner}: {}, {} round trip",
+            link_of(graph, link),
+            millis(cost)
+        )));
+    }
+    if !line.has_branch {
+        steps.push(Step::wrong(
+            "granted, but no branch leads here: the way broke and is being looked for",
+            "wait a few seconds and ask again; if it stays, see `sgc status` for links that are silent",
+        ));
+        return;
+    }
+    if used.publishes {
+        return walk_publishing(graph, used, route, &line, steps);
+    }
+    if kind != Interface::Topic {
+        if route.writers == 0 {
+            steps.push(Step::wrong(
+                "granted, but nothing on the local network answers for it: DDS refused a server, or it is being made",
+                "wait a few seconds and ask again; then look into the node's log for what DDS said",
+            ));
+            return;
+        }
+        steps.push(Step::fine(format!("local clients are answered for {owner}")));
+        far_half(owner, &used.topic, steps);
+        return;
+    }
+    if !readers(graph, kind, topic, &route.type_name, Some(route), route.matched, steps) {
+        return;
+    }
+    if route.messages == 0 {
+        steps.push(
+            Step::unknown(format!("nothing has come from {owner} yet"))
+                .with_fix(format!("run `sgc why {}` on {owner}: its publishers may be silent", used.topic)),
+        );
+    } else {
+        steps.push(Step::fine(format!("{} messages were given to the local network", route.messages)));
+    }
+    traffic(&line, "came here", steps);
+}
+
+fn walk_publishing(graph: &Graph, used: &Use, route: &UseRoute, line: &NameLine, steps: &mut Walk) {
+    let (owner, topic) = (&used.owner, &route.topic);
+    let (providers, _) = ends(graph, used.kind, topic);
+    if route.publishers == 0 {
+        let types: BTreeSet<_> = providers.iter().map(|end| type_of(used.kind, end)).collect();
+        let types: Vec<_> = types.into_iter().collect();
+        steps.push(Step::wrong(
+            format!(
+                "{owner} takes it as {}, and the local publishers have {}",
+                route.type_name,
+                types.join(", ")
+            ),
+            "publish the type that the owner shares, or have the owner change its `type`",
+        ));
+        return;
+    }
+    if !route.is_read {
+        steps.push(Step::wrong(
+            "the local publishers are not read: the local network refused a reader",
+            "look into the node's log for what DDS said",
+        ));
+        return;
+    }
+    if route.messages == 0 {
+        steps.push(
+            Step::unknown("no message has come from the local publishers yet")
+                .with_fix(format!("`sgc topic hz --side local {topic}` shows whether they publish")),
+        );
+    } else {
+        steps.push(Step::fine(format!("{} messages were published to {owner}", route.messages)));
+    }
+    traffic(line, "left here", steps);
+    far_half(owner, &used.topic, steps);
+}
+
+/// Whether local readers get what is written for them; false if something is wrong.
+fn readers(
+    graph: &Graph,
+    kind: Interface,
+    topic: &str,
+    type_name: &str,
+    route: Option<&UseRoute>,
+    matched: u32,
+    steps: &mut Walk,
+) -> bool {
+    let (_, all) = ends(graph, kind, topic);
+    if all.is_empty() {
+        let others = graph.endpoints.iter().filter(|e| e.is_ros_topic && !e.writes).map(|e| e.topic.as_str());
+        let meant = hint(&near(topic, others));
+        steps.push(Step::wrong(
+            format!("nobody on this local network subscribes to {topic}{meant}"),
+            "start a subscriber; if one runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
+             ROS_AUTOMATIC_DISCOVERY_RANGE",
+        ));
+        return false;
+    }
+    let same: Vec<_> = all.iter().filter(|end| end.type_name == type_name).collect();
+    if same.is_empty() {
+        steps.push(Step::wrong(
+            format!("the far side has {type_name}, and the local subscribers have {}", all[0].type_name),
+            "the two never talk: use one type on both sides",
+        ));
+        return false;
+    }
+    if let Some(ours) = route.and_then(|route| route.type_hash.as_deref())
+        && let Some(other) = same.iter().filter_map(|end| end.type_hash.as_deref()).find(|hash| *hash != ours)
+    {
+        steps.push(Step::wrong(
+            format!(
+                "the definitions of {type_name} differ: {} on the far side, {} here",
+                short_hash(ours),
+                short_hash(other)
+            ),
+            "build both sides from one version of the interface package",
+        ));
+        return false;
+    }
+    if let Some(route) = route {
+        let mismatches: Vec<_> = same.iter().filter_map(|end| end.qos.mismatch(&route.qos)).collect();
+        let say = |(policy, offered, asked): &(&str, String, String)| {
+            format!("{policy}: {offered} is offered by the far side, {asked} is asked for")
+        };
+        match mismatches.first() {
+            Some(first) if mismatches.len() == same.len() => {
+                steps.push(Step::wrong(
+                    format!("QoS does not match, by {}", say(first)),
+                    format!("ask for no more in the subscriber, or offer more in the publisher: {}", first.0),
+                ));
+                return false;
+            }
+            Some(first) => steps.push(Step::unknown(format!(
+                "{} of {} local subscribers get nothing: QoS does not match, by {}",
+                mismatches.len(),
+                same.len(),
+                say(first)
+            ))),
+            None => {}
+        }
+        if route.writers == 0 {
+            steps.push(Step::wrong(
+                "no writer for it is on the local network: DDS refused one, or it is being made",
+                "look into the node's log for what DDS said",
+            ));
+            return false;
+        }
+    }
+    if matched == 0 {
+        steps.push(Step::wrong(
+            format!("{} local subscribers are there, and DDS matches none of them with this node", same.len()),
+            "do they run in another security enclave (SROS2), with another partition, or behind a firewall for UDP?",
+        ));
+        return false;
+    }
+    steps.push(Step::fine(format!("{matched} local subscribers are matched")));
+    true
+}
+
+/// Whether this node has a link that works; says so.
+fn linked(graph: &Graph, steps: &mut Walk) -> bool {
+    if let Some(link) = graph.links.iter().find(|link| !link.silent) {
+        steps.push(Step::fine(format!("linked: {}", link_of(graph, link.id))));
+        return true;
+    }
+    if let Some(link) = graph.links.first() {
+        steps.push(silent(graph, link.id));
+        return false;
+    }
+    let step = match graph.routers.first() {
+        None => Step::wrong(
+            "no link is up, and no router is configured",
+            "name one: `routers` in [node], or `sgc run --router URL`",
+        ),
+        Some(search) => {
+            let why = search.last_failure.as_deref().map(|why| format!(": {why}")).unwrap_or_default();
+            Step::wrong(
+                format!("no link is up; {} is {}{why}", search.router, search.state),
+                "is the router running and in reach? Where UDP is blocked, a URL with tls:// or wss:// passes \
+                 (docs/transports.md)",
+            )
+        }
+    };
+    steps.push(step);
+    false
+}
+
+fn no_provider(graph: &Graph, kind: Interface, topic: &str) -> Step {
+    let (_, consumers) = ends(graph, kind, topic);
+    let others = graph.endpoints.iter().filter(|e| e.is_ros_topic && e.writes).map(|e| e.topic.as_str());
+    let meant = hint(&near(topic, others));
+    let besides = match consumers.len() {
+        0 => String::new(),
+        n => format!(" ({n} {}s are there)", consumer(kind)),
+    };
+    Step::wrong(
+        format!("no {} of {topic} is on the local network{besides}{meant}", provider(kind)),
+        "start it; if it runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
+         ROS_AUTOMATIC_DISCOVERY_RANGE; `sgc topic list` shows what was discovered",
+    )
+}
+
+fn silent(graph: &Graph, link: u32) -> Step {
+    Step::wrong(
+        format!("{} is silent: something should come over it and does not", link_of(graph, link)),
+        "is the peer still there, and does the network between carry UDP? Another way is taken as soon as there is one",
+    )
+}
+
+/// What went by, and what was dropped of it and why.
+fn traffic(line: &NameLine, what: &str, steps: &mut Walk) {
+    if line.packets > 0 {
+        let bytes = crate::output::bytes(line.bytes);
+        steps.push(Step::fine(format!("{} packets ({bytes}) {what}", line.packets)));
+    }
+    // Packets that came before anybody asked, or after, are nobody's loss.
+    let lost: BTreeMap<_, _> = line.dropped.iter().filter(|(reason, _)| *reason != "no_subscriber").collect();
+    let Some((worst, _)) = lost.iter().max_by_key(|(_, count)| **count) else { return };
+    let all: Vec<_> = lost.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
+    let (means, fix) = drop_reason(worst);
+    let found = format!("dropped here: {} ({means})", all.join(", "));
+    let total: u64 = lost.values().copied().sum();
+    steps.push(if total > line.packets {
+        Step::wrong(found, fix)
+    } else {
+        Step::unknown(found).with_fix(fix)
+    });
+}
+
+fn drop_reason(reason: &str) -> (&'static str, &'static str) {
+    match reason {
+        "wrong_way" => {
+            ("it came over a link that the tree does not use", "a few when a way changes are no fault")
+        }
+        "hop_limit" => {
+            ("it went in a circle, or over too many routers", "look at the links between the routers")
+        }
+        "stalled" => (
+            "a reliable consumer took nothing for seconds",
+            "is a subscriber stopped? A best-effort one would hold nothing up",
+        ),
+        "stale" => (
+            "newer messages took the place of what could not be sent in time",
+            "the link is thinner than the topic: set max_rate, max_bandwidth or a `priority` in the [[share]]",
+        ),
+        "link_closed" => {
+            ("a link ended with something under way", "reliable topics ask for it again by themselves")
+        }
+        "malformed" | "unknown_label" => ("it could not be read", "do both nodes have one version of sgc?"),
+        "not_granted" => ("there was no key for it yet", "a few when a topic begins are no fault"),
+        "sink" => (
+            "it was refused when it was opened: a replay, a broken seal or signature, or lost for good",
+            "`sgc status` counts the kinds under Drops",
+        ),
+        "no_writer" => ("no local writer was there for it", "look into the node's log for what DDS said"),
+        "too_large" => ("larger than 64 MiB", "publish smaller messages"),
+        "thinned" => {
+            ("more came than max_rate or max_bandwidth let on", "raise the limit if that is not meant")
+        }
+        "too_old" => ("older than max_age", "raise max_age, or compare the clocks of the hosts"),
+        _ => ("for another reason", "`sgc status` shows all drops"),
+    }
+}
+
+fn far_half(who: &str, topic: &str, steps: &mut Walk) {
+    steps.push(
+        Step::unknown(format!("all is well up to here; the other half of the way is known to {who}"))
+            .with_fix(format!("run `sgc why {topic}` there")),
+    );
+}
+
+/// What the user was told of a topic, or something else.
+fn told(graph: &Graph, topic: &str, otherwise: &str) -> String {
+    let begin = format!("{topic}: ");
+    graph.problems.iter().find_map(|p| p.strip_prefix(&begin)).unwrap_or(otherwise).to_owned()
+}
+
+fn whom([nodes, groups, fleets]: [usize; 3]) -> String {
+    let count =
+        |n: usize, what: &str| (n > 0).then(|| format!("{n} {what}{}", if n == 1 { "" } else { "s" }));
+    let all: Vec<_> = [count(nodes, "node"), count(groups, "group"), count(fleets, "whole fleet")]
+        .into_iter()
+        .flatten()
+        .collect();
+    if all.is_empty() { "nobody".to_owned() } else { all.join(", ") }
+}
+
+fn link_of(graph: &Graph, link: u32) -> String {
+    match graph.links.iter().find(|l| l.id == link) {
+        _ if link == 0 => "this node".to_owned(),
+        Some(l) => {
+            let peer = l.name.clone().unwrap_or_else(|| l.peer.chars().take(8).collect());
+            format!("link {link} to {peer} at {} ({})", l.remote, crate::output::millis(l.rtt_us))
+        }
+        None => format!("link {link}"),
+    }
+}
+
+fn millis(us: u32) -> String {
+    crate::output::millis(us.into())
+}
+
+/// Enough of a hash to tell it from another.
+fn short_hash(hash: &str) -> String {
+    hash.chars().take("RIHS01_".len() + 12).collect()
+}

@@ -1,0 +1,56 @@
+//! What is not shared does not cross, in either direction, discovery included, whatever the other side asks for.
+
+use crate::lab::{Lab, Site};
+use crate::support::{Peer, eventually};
+
+fn talker(lab: &Lab, site: Site, topic: &str) -> Peer {
+    let args = ["--type", "string", "--topic", topic, "--rate", "20", "--wait-matched", "0"];
+    lab.peer(site, "cyclone", "pub", &args)
+}
+
+#[test]
+fn a_network_shows_what_is_used_and_nothing_else() {
+    // To this desk, to somebody else, and to nobody; one of which the desk has no use for.
+    let share = |topic: &str, to: &str| format!("[[share]]\ntopic = \"{topic}\"\nto = [\"{to}\"]\n");
+    let robot = share("/used", "desk") + &share("/unused", "desk") + &share("/others", "somebody");
+    // The desk asks for all of them, and wants to publish on what it may only hear.
+    let uses = |topic: &str| format!("[[use]]\nfrom = \"robot\"\ntopic = \"{topic}\"\n");
+    let publish = |topic: &str| uses(topic) + "publish = true\n";
+    let desk =
+        uses("/used") + &uses("/others") + &uses("/secret") + &publish("/unused") + &publish("/command");
+    let lab = Lab::new(&robot, &desk);
+    let mut observers = [Site::Robot, Site::Desk].map(|site| lab.observer(site));
+    let _robots = ["/used", "/unused", "/others", "/secret"].map(|topic| talker(&lab, Site::Robot, topic));
+    let _desks = ["/unused", "/command", "/private"].map(|topic| talker(&lab, Site::Desk, topic));
+    let heard = ["--type", "string", "--topic", "/used", "--verbose"];
+    let mut listener = lab.peer(Site::Desk, "fastdds", "sub", &heard);
+    for _ in 0..20 {
+        listener.wait("what is shared and used", |e| e["event"] == "received");
+    }
+    let refused = "does not";
+    eventually("the desk is told of the rest", || {
+        let routes = lab.status(Site::Desk)["routes"].as_array().cloned().unwrap_or_default();
+        let told = |topic: &str| {
+            let of_topic = |r: &&serde_json::Value| r["topic"] == topic;
+            routes.iter().find(of_topic).is_some_and(|r| r["state"].as_str().unwrap().contains(refused))
+        };
+        ["/others", "/secret", "/unused", "/command"].into_iter().all(told)
+    });
+    // The robot's network: its own publishers, and one reader of ours for what somebody hears.
+    let expected =
+        ["reader rt/used", "writer rt/others", "writer rt/secret", "writer rt/unused", "writer rt/used"];
+    assert_eq!(observers[0].endpoints(), expected);
+    // The desk's: its own programs, and one writer of ours.
+    let expected =
+        ["reader rt/used", "writer rt/command", "writer rt/private", "writer rt/unused", "writer rt/used"];
+    assert_eq!(observers[1].endpoints(), expected);
+    // Nothing of what was not to be heard went past the robot's node either.
+    let names = lab.status(Site::Cloud)["names"].as_array().unwrap().len();
+    let robot = lab.status(Site::Robot);
+    let messages = |topic: &str| {
+        let routes = robot["routes"].as_array().unwrap();
+        routes.iter().find(|r| r["topic"] == topic).unwrap()["messages"].as_u64().unwrap()
+    };
+    assert!(messages("/used") > 0 && names <= 2, "{names} names: the topic's, and the robot's catalogue");
+    assert_eq!([messages("/unused"), messages("/others")], [0, 0], "not even read");
+}

@@ -1,0 +1,132 @@
+//! Images to a subscriber that stands still, and to a node that does: memory has a bound everywhere, other topics do not
+//! notice, and who goes on gets what is new.
+//!
+//! `SGC_STALL_SECONDS` is how long the subscriber stands still (`make stall`: ten minutes). A node stands still for less than
+//! the leases of DDS: after ten minutes all was with its writers at once, but the Fast DDS program beside it had not found
+//! them again a minute later.
+
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+
+use crate::lab::{Lab, SITES, Site, environment, held};
+use crate::support::{PATIENCE, Peer, say};
+
+const SECONDS: u64 = 6;
+const NODE_SECONDS_MAX: u64 = 8;
+/// More than any node may come to hold: its queues and histories have bounds of 64 MiB and less, and there are three of
+/// them on a topic's way through a node.
+const RESIDENT_MORE_KB_MAX: u64 = 200_000;
+const IMAGE_BYTES: &str = "1000000";
+const IMAGES_PER_S: &str = "30";
+
+/// The last number that a program reported.
+fn last(peer: &Peer, before: u64) -> u64 {
+    peer.events.try_iter().filter_map(|(_, e)| e["seq"].as_u64()).max().unwrap_or(0).max(before)
+}
+
+struct Stall {
+    lab: Lab,
+    camera: Peer,
+    state: Peer,
+    images: Peer,
+    states: Peer,
+    before: [u64; 3],
+}
+
+impl Stall {
+    fn new() -> Self {
+        let (robot, desk) = Lab::topics(&["/image", "/string"]);
+        let lab = Lab::new(&robot, &desk);
+        let of = |kind: &'static str, topic: &'static str| {
+            ["--type", kind, "--topic", topic, "--verbose", "--large"]
+        };
+        let rate = |rate: &'static str| ["--wait-matched", "0", "--rate", rate];
+        let image = [&of("image", "/image")[..], &rate(IMAGES_PER_S), &["--size", IMAGE_BYTES]].concat();
+        let mut images = lab.peer(Site::Desk, "cyclone", "sub", &of("image", "/image"));
+        // Deeper than what is said while a node stands still: else a reader that is slow to acknowledge, on a busy machine,
+        // may see some of it overwritten, as it may without us.
+        let deep = ["--depth", "400"];
+        let states = [&of("string", "/string")[..], &deep].concat();
+        let mut states = lab.peer(Site::Desk, "fastdds", "sub", &states);
+        let camera = lab.peer(Site::Robot, "cyclone", "pub", &image);
+        let text = [&of("string", "/string")[..], &rate("20"), &deep].concat();
+        let state = lab.peer(Site::Robot, "cyclone", "pub", &text);
+        for peer in [&mut images, &mut states] {
+            for _ in 0..30 {
+                peer.wait("what flows", |e| e["event"] == "received");
+            }
+        }
+        let before = SITES.map(|site| held(lab.pid(site)).resident_kb);
+        Self { lab, camera, state, images, states, before }
+    }
+
+    /// Looks at the memory of all nodes for the time that something stands still; how much more than before each held at
+    /// most.
+    fn endures(&self, seconds: u64) -> [u64; 3] {
+        let end = Instant::now() + Duration::from_secs(seconds);
+        let mut most = [0; 3];
+        while Instant::now() < end {
+            for (n, site) in SITES.into_iter().enumerate() {
+                let more = held(self.lab.pid(site)).resident_kb.saturating_sub(self.before[n]);
+                assert!(more < RESIDENT_MORE_KB_MAX, "{} holds {more} kB more than before", site.name());
+                most[n] = most[n].max(more);
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        most
+    }
+
+    /// What is said from now on is heard.
+    fn is_fresh(&mut self) {
+        for (talker, listener) in [(&self.camera, &mut self.images), (&self.state, &mut self.states)] {
+            let said = last(talker, 0);
+            let deadline = Instant::now() + PATIENCE;
+            let mut heard = 0;
+            while heard <= said {
+                assert!(Instant::now() < deadline, "{said} was said, {heard} is the last that was heard");
+                heard = last(listener, heard);
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        }
+    }
+
+    /// Of the small topic nothing may be missing, of neither anything twice or altered.
+    fn ends(mut self) {
+        for (listener, loses) in [(&mut self.images, true), (&mut self.states, false)] {
+            listener.end();
+            let summary = listener.summary();
+            let count = |key: &str| summary[key].as_u64().unwrap();
+            assert_eq!((count("duplicated"), count("altered")), (0, 0), "{summary}");
+            assert!(loses || count("lost") == 0, "{summary}");
+        }
+    }
+}
+
+#[test]
+fn a_subscriber_of_images_that_stands_still_harms_nobody_and_goes_on_with_what_is_new() {
+    let mut stall = Stall::new();
+    stall.images.signal(Signal::STOP);
+    let begun = last(&stall.states, 0);
+    let most = stall.endures(environment("SGC_STALL_SECONDS", SECONDS));
+    // Meanwhile the other topic flowed: what is there was heard before the subscriber goes on.
+    assert!(last(&stall.states, 0) > begun, "the other topic stood still, too");
+    stall.images.signal(Signal::CONT);
+    stall.is_fresh();
+    say(&format!("stall of a subscriber: robot, cloud and desk held {most:?} kB more at most"));
+    stall.ends();
+}
+
+#[test]
+fn a_node_that_stands_still_harms_nobody_and_goes_on_with_what_is_new() {
+    let mut stall = Stall::new();
+    stall.lab.signal(Site::Desk, Signal::STOP);
+    let most = stall.endures(environment("SGC_STALL_SECONDS", SECONDS).min(NODE_SECONDS_MAX));
+    stall.lab.signal(Site::Desk, Signal::CONT);
+    stall.is_fresh();
+    let after = SITES.map(|site| held(stall.lab.pid(site)).resident_kb);
+    say(&format!(
+        "stall of a node: robot, cloud and desk held {most:?} kB more at most, {after:?} kB at the end"
+    ));
+    stall.ends();
+}

@@ -1,0 +1,156 @@
+//! A stream of numbered messages from an application at the robot to one at the desk, and what became of them.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
+use sgc_testkit::{FakeDomain, FakeReader, FakeRos};
+use sgc_wire::{History, Qos, Reliability};
+
+/// What flows.
+#[derive(Clone, Copy)]
+pub(crate) struct Topic {
+    pub(crate) name: &'static str,
+    pub(crate) reliable: bool,
+    period: Duration,
+    bytes: usize,
+}
+
+pub(crate) const TOPICS: [Topic; 2] = [
+    Topic { name: "/state", reliable: true, period: Duration::from_millis(20), bytes: 64 },
+    Topic { name: "/video", reliable: false, period: Duration::from_millis(50), bytes: 500 },
+];
+
+impl Topic {
+    fn spec(&self) -> EndpointSpec {
+        let (reliability, history) = if self.reliable {
+            (Reliability::Reliable, History::KeepAll)
+        } else {
+            (Reliability::BestEffort, History::KeepLast(5))
+        };
+        EndpointSpec {
+            topic: dds_topic(self.name),
+            type_name: dds_type("std_msgs/msg/ByteMultiArray"),
+            keyless: true,
+            type_hash: None,
+            qos: Qos { reliability, history, ..Qos::default() },
+        }
+    }
+}
+
+#[derive(Default)]
+struct Shared {
+    said: AtomicU64,
+    heard: Mutex<Vec<(Instant, u64)>>,
+    /// Nothing more is to be said.
+    ends: AtomicBool,
+    /// Nor will be asked for what was.
+    is_over: AtomicBool,
+}
+
+pub(crate) struct Flow {
+    pub(crate) topic: Topic,
+    shared: Arc<Shared>,
+    talker: Option<JoinHandle<()>>,
+    _reader: FakeReader,
+    _net: FakeRos,
+}
+
+/// What became of a flow around something that happened.
+pub(crate) struct Verdict {
+    /// The longest that nothing came, beyond what is usual.
+    pub(crate) outage: Duration,
+    pub(crate) lost: u64,
+    pub(crate) doubled: u64,
+    /// Messages that came behind a later one.
+    pub(crate) late: u64,
+    pub(crate) heard: u64,
+}
+
+impl Flow {
+    pub(crate) fn start(topic: Topic, robot: &FakeDomain, desk: &FakeDomain) -> Self {
+        let shared = Arc::<Shared>::default();
+        let net = desk.join(false);
+        let hears = Arc::clone(&shared);
+        let handler = Box::new(move |sample: Sample| {
+            let number = u64::from_le_bytes(sample.payload[4..12].try_into().unwrap());
+            hears.heard.lock().unwrap().push((Instant::now(), number));
+        });
+        let reader = net.create_reader(&topic.spec(), handler).unwrap();
+        let near = robot.join(false);
+        let writer = near.create_writer(&topic.spec()).unwrap();
+        let its = Arc::clone(&shared);
+        let talker = std::thread::spawn(move || {
+            let _near = near;
+            for number in 1.. {
+                if its.ends.load(SeqCst) {
+                    break;
+                }
+                let mut payload = vec![0; topic.bytes];
+                payload[1] = 1;
+                payload[4..12].copy_from_slice(&u64::to_le_bytes(number));
+                its.said.store(number, SeqCst);
+                writer.write(SampleKind::Write, 1, Bytes::from(payload)).unwrap();
+                std::thread::sleep(topic.period);
+            }
+            while !its.is_over.load(SeqCst) {
+                std::thread::sleep(topic.period);
+            }
+        });
+        Self { topic, shared, talker: Some(talker), _reader: reader, _net: net }
+    }
+
+    /// The number of what was said last.
+    pub(crate) fn said(&self) -> u64 {
+        self.shared.said.load(SeqCst)
+    }
+
+    /// Whether this, or something after it, was heard.
+    pub(crate) fn has_heard(&self, number: u64) -> bool {
+        self.shared.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
+    }
+
+    /// Says no more.
+    pub(crate) fn end(&self) {
+        self.shared.ends.store(true, SeqCst);
+    }
+
+    /// What became of it all; the outage is the longest one since then.
+    pub(crate) fn judge(&self, since: Instant) -> Verdict {
+        let heard = self.shared.heard.lock().unwrap();
+        let mut gap = Duration::ZERO;
+        for pair in heard.windows(2).filter(|pair| pair[1].0 >= since) {
+            gap = gap.max(pair[1].0 - pair[0].0);
+        }
+        let (mut newest, mut late) = (0, 0);
+        let mut numbers: Vec<_> = heard.iter().map(|(_, number)| *number).collect();
+        for number in &numbers {
+            late += u64::from(*number < newest);
+            newest = newest.max(*number);
+        }
+        numbers.sort_unstable();
+        let all = numbers.len() as u64;
+        numbers.dedup();
+        let different = numbers.len() as u64;
+        // What was said before the first that was heard was said to nobody.
+        let span = numbers.last().map_or(0, |last| last - numbers[0] + 1);
+        Verdict {
+            outage: gap.saturating_sub(self.topic.period),
+            lost: span - different,
+            doubled: all - different,
+            late,
+            heard: different,
+        }
+    }
+}
+
+impl Drop for Flow {
+    fn drop(&mut self) {
+        self.end();
+        self.shared.is_over.store(true, SeqCst);
+        let _ = self.talker.take().map(JoinHandle::join);
+    }
+}

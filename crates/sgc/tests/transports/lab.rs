@@ -1,0 +1,232 @@
+//! A robot and a desk behind a NAT each, and a router with a public address between them; every one a network namespace.
+//! All of it goes with the lab.
+//!
+//! ```text
+//! robot ─ eth0 ──── lan ─ near ─ wan ──── cloud ──── wan ─ far ─ lan ──── eth0 ─ desk
+//!       ─ lte ───── lte ─┘                10.10.0.1
+//! ```
+
+use std::fs;
+use std::io::Write as _;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Once};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use rand_core::{OsRng, TryRngCore as _};
+use sgc_testkit::netsim::{Namespace, TunEnd, TunLink, TunOptions};
+use sgc_transport::LinkUrl;
+use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_wire::UnixMillis;
+use tempfile::TempDir;
+
+use crate::support::say;
+
+/// Every transport that there is to be. Those that this build does not know are named and left out.
+const SCHEMES: [&str; 7] = ["quic", "dtls", "udp", "tls", "tcp", "ws", "wss"];
+const PORT: u16 = 7447;
+const ROUTER: &str = "10.10.0.1";
+
+static LABS: AtomicU32 = AtomicU32::new(0);
+
+/// Transports of this build.
+pub(crate) fn schemes() -> Vec<&'static str> {
+    let is_known = |scheme: &str| format!("{scheme}://router").parse::<LinkUrl>().is_ok();
+    let (known, unknown): (Vec<_>, Vec<_>) = SCHEMES.into_iter().partition(|scheme| is_known(scheme));
+    if !unknown.is_empty() {
+        static SAID: Once = Once::new();
+        SAID.call_once(|| say(&format!("NOT IN THIS BUILD, so not tested: {}", unknown.join(", "))));
+    }
+    known
+}
+
+/// What a NAT does with ports.
+#[derive(Clone, Copy)]
+pub(crate) enum Nat {
+    /// Keeps them, and lets everyone in by them.
+    FullCone,
+    /// Draws each anew from this range, and lets in who was written to.
+    RandomPort(&'static str),
+}
+
+/// Ranges for a NAT that forgets.
+pub(crate) const RANGES: [&str; 2] = ["20000-29999", "30000-39999"];
+
+/// What joins the robot to its NAT.
+pub(crate) enum Lan {
+    Cable,
+    Path(TunOptions),
+}
+
+pub(crate) struct Lab {
+    dir: TempDir,
+    fleet: Fleet,
+    path: Option<TunLink>,
+    pub(crate) robot: Arc<Namespace>,
+    pub(crate) near: Arc<Namespace>,
+    pub(crate) cloud: Arc<Namespace>,
+    pub(crate) far: Arc<Namespace>,
+    pub(crate) desk: Arc<Namespace>,
+}
+
+impl Lab {
+    pub(crate) fn new(lan: Lan, nat: Nat) -> Self {
+        let number = LABS.fetch_add(1, Ordering::SeqCst);
+        let make = |place: &str| {
+            let name = format!("sgctr-{}-{number}-{place}", std::process::id());
+            Arc::new(Namespace::create(name).unwrap())
+        };
+        let mut lab = Self {
+            dir: tempfile::tempdir().unwrap(),
+            fleet: Fleet::create("lab".parse().unwrap(), unix_now(), &mut OsRng.unwrap_err()).unwrap(),
+            path: None,
+            robot: make("robot"),
+            near: make("near"),
+            cloud: make("cloud"),
+            far: make("far"),
+            desk: make("desk"),
+        };
+        lab.path = lab.join_robot(lan);
+        lab.desk.veth(("eth0", &["10.2.0.2/24"]), &lab.far, ("lan", &["10.2.0.1/24"])).unwrap();
+        lab.near.veth(("wan", &["10.10.1.2/24"]), &lab.cloud, ("near", &["10.10.1.1/24"])).unwrap();
+        lab.far.veth(("wan", &["10.10.2.2/24"]), &lab.cloud, ("far", &["10.10.2.1/24"])).unwrap();
+        lab.cloud.ip(&["address", "add", &format!("{ROUTER}/32"), "dev", "lo"]).unwrap();
+        lab.robot.ip(&["route", "add", "default", "via", "10.1.0.1"]).unwrap();
+        lab.desk.ip(&["route", "add", "default", "via", "10.2.0.1"]).unwrap();
+        lab.near.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
+        lab.far.ip(&["route", "add", "default", "via", "10.10.2.1"]).unwrap();
+        for site in [&lab.near, &lab.far] {
+            site.within(|| {
+                fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
+                // Who sends with an address that is not of its network is not let out, as providers have it.
+                fs::write("/proc/sys/net/ipv4/conf/all/rp_filter", "1").unwrap();
+            })
+            .unwrap();
+        }
+        lab.robot
+            .within(|| {
+                // Who asks for a gateway says who it is there. Otherwise a packet with the old address asks in its name, is
+                // not answered, and all wait a second.
+                fs::write("/proc/sys/net/ipv4/conf/all/arp_announce", "2").unwrap();
+            })
+            .unwrap();
+        lab.set_nat(&lab.near, nat, "10.1.0.2");
+        lab.set_nat(&lab.far, nat, "10.2.0.2");
+        lab
+    }
+
+    fn join_robot(&self, lan: Lan) -> Option<TunLink> {
+        let Lan::Path(options) = lan else {
+            self.robot.veth(("eth0", &["10.1.0.2/24"]), &self.near, ("lan", &["10.1.0.1/24"])).unwrap();
+            return None;
+        };
+        let end = |namespace: &Namespace, interface: &str, address: &str| TunEnd {
+            namespace: Some(namespace.name().to_owned()),
+            interface: interface.into(),
+            addresses: vec![address.into()],
+            routes: Vec::new(),
+        };
+        let ends = [end(&self.robot, "eth0", "10.1.0.2/24"), end(&self.near, "lan", "10.1.0.1/24")];
+        Some(TunLink::start(ends, &options).unwrap())
+    }
+
+    /// A second way out of the robot, over mobile radio, so to say; up, and not the default.
+    pub(crate) fn add_lte(&self) {
+        self.robot.veth(("lte", &["10.3.0.2/24"]), &self.near, ("lte", &["10.3.0.1/24"])).unwrap();
+    }
+
+    /// The robot's default route moves.
+    pub(crate) fn route_by(&self, gateway: &str) {
+        self.robot.ip(&["route", "replace", "default", "via", gateway]).unwrap();
+    }
+
+    fn set_nat(&self, site: &Namespace, nat: Nat, inside: &str) {
+        let rules = match nat {
+            Nat::FullCone => format!(
+                "chain out {{ type nat hook postrouting priority 100; oifname \"wan\" masquerade; }}\n\
+                 chain in {{ type nat hook prerouting priority -100; iifname \"wan\" ip protocol {{ tcp, udp }} dnat to {inside}; }}"
+            ),
+            Nat::RandomPort(range) => format!(
+                "chain out {{ type nat hook postrouting priority 100; \
+                 oifname \"wan\" ip protocol {{ tcp, udp }} masquerade to :{range} random; }}"
+            ),
+        };
+        self.load_rules(site, "nat", &format!("flush ruleset\ntable ip nat {{\n{rules}\n}}\n"));
+    }
+
+    /// The robot's NAT forgets what it knew, and draws ports from another range from now on.
+    pub(crate) fn rebind(&self, range: &'static str) {
+        self.set_nat(&self.near, Nat::RandomPort(range), "");
+        // What was masqueraded behind an address is forgotten when that goes.
+        let near = &self.near;
+        near.ip(&["address", "del", "10.10.1.2/24", "dev", "wan"]).unwrap();
+        near.ip(&["address", "add", "10.10.1.2/24", "dev", "wan"]).unwrap();
+        near.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
+    }
+
+    /// Nothing but TCP leaves the robot's network.
+    pub(crate) fn block_udp(&self) {
+        let rule = "chain through { type filter hook forward priority 0; ip protocol udp drop; }";
+        self.load_rules(&self.near, "block", &format!("table ip block {{\n{rule}\n}}\n"));
+    }
+
+    fn load_rules(&self, site: &Namespace, name: &str, rules: &str) {
+        let file = self.path(&format!("{}-{name}.nft", site.name()));
+        fs::write(&file, rules).unwrap();
+        site.run("nft", &["-f", file.to_str().unwrap()]).unwrap();
+    }
+
+    pub(crate) fn path(&self, file: &str) -> PathBuf {
+        self.dir.path().join(file)
+    }
+
+    pub(crate) fn dir(&self) -> &std::path::Path {
+        self.dir.path()
+    }
+
+    /// Where the router is, for a transport.
+    pub(crate) fn url(&self, scheme: &str) -> String {
+        format!("{scheme}://{ROUTER}:{}", port(scheme))
+    }
+
+    /// The router's configuration: it listens for every transport of this build.
+    pub(crate) fn router_config(&self) -> PathBuf {
+        let listen: Vec<_> =
+            schemes().iter().map(|scheme| format!("\"{scheme}://0.0.0.0:{}\"", port(scheme))).collect();
+        self.write_config("cloud", &[], &format!("[router]\nlisten = [{}]\n", listen.join(", ")))
+    }
+
+    /// A configuration on disk, beside the identity that [`Lab::enroll`] writes.
+    pub(crate) fn write_config(&self, node: &str, routers: &[&str], rest: &str) -> PathBuf {
+        let routers: Vec<_> = routers.iter().map(|url| format!("\"{url}\"")).collect();
+        let text = format!(
+            "identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\n\
+             [node]\nstate = \"{node}.state\"\nrouters = [{}]\n{rest}",
+            routers.join(", ")
+        );
+        let path = self.path(&format!("{node}.toml"));
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    /// An identity of the fleet, also as a file.
+    pub(crate) fn enroll(&self, node: &str, router: bool) -> Arc<Identity> {
+        let mut request = EnrollRequest::new(node.parse().unwrap(), unix_now());
+        request.router = router;
+        let identity = self.fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap();
+        let mut options = fs::OpenOptions::new();
+        let file = options.write(true).create(true).truncate(true).mode(0o600);
+        let mut file = file.open(self.path(&format!("{node}.identity"))).unwrap();
+        file.write_all(identity.to_text().as_bytes()).unwrap();
+        Arc::new(identity)
+    }
+}
+
+fn port(scheme: &str) -> u16 {
+    PORT + SCHEMES.iter().position(|known| *known == scheme).unwrap() as u16
+}
+
+fn unix_now() -> UnixMillis {
+    UnixMillis(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64)
+}
