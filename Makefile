@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring model-check bench-routing scale clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench-routing bench-teleop bench-transports scale clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -12,8 +12,13 @@ help:
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
+	@echo '                 churn (200 restarts at random; SGC_CHURN_SEED, SGC_CHURN_STEPS), stall (ten minutes of images to who stands still)'
+	@echo '                 bench-graph (200 nodes, 2000 endpoints; SGC_GRAPH_NODES, SGC_GRAPH_SHARED, SGC_GRAPH_SECONDS)'
+	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
+	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
 	@echo '                 model-check (larger bounds)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
+	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
 demo: build
@@ -42,10 +47,11 @@ deps-test:
 peers:
 	@scripts/build-peers.sh
 
-# The golden vectors of names, identities, tokens, sealing and grants, against an implementation that is not ours.
+# The golden vectors of names, identities, tokens, sealing and grants, and CDR, against implementations that are not ours.
 vectors: peers
 	.venv/bin/python -B scripts/check-vectors.py
 	.venv/bin/python -B scripts/trust-vectors.py
+	.venv/bin/python -B scripts/cdr-vectors.py
 
 lint: fmt clippy
 
@@ -80,6 +86,29 @@ ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
 		$(CARGO) test -p sgc --locked --test ring $(ARGS) -- --nocapture
 
+# Two hundred restarts of programs and nodes at random; a new seed each time, which it prints. The suite runs a short one.
+churn: peers
+	SGC_CHURN_SEED=$${SGC_CHURN_SEED:-$$(date +%s)} SGC_CHURN_STEPS=$${SGC_CHURN_STEPS:-200} \
+		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) nothing_is_left -- --nocapture
+
+# Ten minutes of images to a subscriber that stands still. The suite runs a short one.
+stall: peers
+	SGC_STALL_SECONDS=$${SGC_STALL_SECONDS:-600} \
+		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) stands_still -- --nocapture
+
+# What a network of 200 nodes and 2000 endpoints costs a node, 50 of them shared.
+bench-graph: peers
+	SGC_GRAPH_NODES=$${SGC_GRAPH_NODES:-200} SGC_GRAPH_SHARED=$${SGC_GRAPH_SHARED:-50} SGC_GRAPH_SECONDS=$${SGC_GRAPH_SECONDS:-60} \
+		$(CARGO) test --release -p sgc --locked --test fidelity $(ARGS) a_busy_network -- --nocapture
+
+# Every transport through NATs, roaming and bad paths, one at a time and five times over; prints what each cost.
+transports: peers
+	SGC_TRANSPORTS_LONG=1 $(CARGO) test -p sgc --locked --test transports $(ARGS) -- --nocapture
+
+# The whole matrix of DDS vendors, of which the suite runs a part. SGC_VENDORS=direct: with no sgc in between.
+vendors: peers
+	SGC_VENDORS=$${SGC_VENDORS:-full} $(CARGO) test -p sgc --locked --test vendors $(ARGS) -- --nocapture
+
 # The tree protocol within larger bounds than in `unit`: minutes, and some GB.
 model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
@@ -88,6 +117,13 @@ model-check:
 bench-routing: build
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml -- all \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
+
+# Need root, and neither zenoh nor the program. ARGS="--quick", ARGS="--schemes quic,dtls".
+bench-teleop: deps-build
+	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- teleop $(ARGS)
+
+bench-transports: deps-build
+	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- transports $(ARGS)
 
 # How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
 scale:

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the test peers that are not ours to test against: .peers/cyclone (Python) and .peers/fastdds (C++).
+# Builds the test peers that are not ours to test against: .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
 # Does nothing for what is there and newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -28,8 +28,16 @@ SCRIPT
 chmod +x .peers/cyclone
 
 source=tests/peers/fastdds/peer.cpp
-if [ ! -x .peers/fastdds ] || [ "$source" -nt .peers/fastdds ] || [ tests/peers/fastdds/messages.hpp -nt .peers/fastdds ]; then
+if [ ! -x .peers/fastdds ] || [ -n "$(find tests/peers/fastdds -newer .peers/fastdds -type f)" ]; then
     say "Fast DDS peer"
     "${CXX:-g++}" -std=c++17 -O2 -Wall -Wextra -Werror -o .peers/fastdds.new "$source" -lfastrtps -lfastcdr -lpthread
     mv .peers/fastdds.new .peers/fastdds
+fi
+
+# A workspace of its own, built where its dependencies are kept apart from ours. Cargo knows what is there and newer.
+say "RustDDS peer"
+CARGO_TARGET_DIR=.peers/rustdds-target "${CARGO:-cargo}" build --quiet --release --locked --manifest-path tests/peers/rustdds/Cargo.toml
+if ! cmp -s .peers/rustdds-target/release/rustdds-peer .peers/rustdds; then
+    cp .peers/rustdds-target/release/rustdds-peer .peers/rustdds.new
+    mv .peers/rustdds.new .peers/rustdds
 fi

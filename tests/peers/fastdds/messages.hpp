@@ -1,4 +1,4 @@
-// The three message types of the peers and what each message must hold; the C++ twin of ../py/messages.py.
+// The message types of the peers and what each message must hold; the C++ twin of ../py/messages.py.
 // ../README.md is what the two agree on. CDR is written and read by libfastcdr, as a ROS 2 type support does.
 #pragma once
 
@@ -95,7 +95,13 @@ struct Reading {
     bool intact;
 };
 
-struct String {
+// A type without a key.
+struct Keyless {
+    static constexpr bool KEYED = false;
+    uint32_t key() const { return 0; }
+};
+
+struct String : Keyless {
     static constexpr const char* TYPE = "std_msgs::msg::dds_::String_";
     std::string data;
 
@@ -133,9 +139,85 @@ struct String {
     void read_from(Cdr& cdr) { cdr >> data; }
 };
 
-struct Image {
-    static constexpr const char* TYPE = "sensor_msgs::msg::dds_::Image_";
+// A `wstring` as `ros2-client` writes it: the count of UTF-16 code units, and the units.
+struct WString : Keyless {
+    static constexpr const char* TYPE = "std_msgs::msg::dds_::WString_";
+    std::u16string data;
+
+    static WString make(uint64_t seq, uint64_t stamp_ns, size_t size) {
+        // One, two and three bytes of UTF-8 a character, and one that takes two units of UTF-16.
+        static const std::u16string wide[] = {u"a", u"\u00e9", u"\u0416", u"\u6f22", u"\u3042", u"\U0001f916", u"\u20ac", u"z"};
+        WString made;
+        made.data = widen("seq=" + std::to_string(seq) + " t=" + std::to_string(stamp_ns) + " fill=");
+        for (uint8_t byte : Noise(seq).take(size ? size : seq % 23)) made.data += wide[byte & 7];
+        char crc[16];
+        std::snprintf(crc, sizeof crc, " crc=%08x", Crc32().add(made.data.data(), made.data.size() * 2).value());
+        made.data += widen(crc);
+        return made;
+    }
+
+    Reading read() const {
+        std::string narrow;
+        size_t spaces = 0, filler_length = 0;
+        for (char16_t unit : data) {
+            narrow += unit < 0x80 ? static_cast<char>(unit) : '?';
+            if (unit == u' ') ++spaces;
+        }
+        unsigned long long seq = 0, stamp_ns = 0;
+        int fill_at = -1;
+        if (std::sscanf(narrow.c_str(), "seq=%llu t=%llu fill=%n", &seq, &stamp_ns, &fill_at) < 2 || fill_at < 0 || spaces != 3)
+            throw std::runtime_error("no sequence number in the text");
+        for (size_t at = static_cast<size_t>(fill_at); data[at] != u' '; ++at)
+            if ((data[at] & 0xfc00) != 0xdc00) ++filler_length;  // a pair is one character
+        size_t size = filler_length == seq % 23 ? 0 : filler_length;
+        return {seq, stamp_ns, data == make(seq, stamp_ns, size).data};
+    }
+
+    size_t cdr_size_max() const { return 16 + data.size() * 2; }
+    void write(Cdr& cdr) const {
+        cdr << static_cast<uint32_t>(data.size());
+        for (char16_t unit : data) cdr << static_cast<uint16_t>(unit);
+    }
+    void read_from(Cdr& cdr) {
+        uint32_t count = 0;
+        cdr >> count;
+        if (count > 1 << 20) throw std::runtime_error("a text of more than a million units");
+        data.resize(count);
+        for (char16_t& unit : data) {
+            uint16_t value = 0;
+            cdr >> value;
+            unit = value;
+        }
+    }
+
+private:
+    static std::u16string widen(const std::string& text) { return std::u16string(text.begin(), text.end()); }
+};
+
+// Sequence number, time, checksum, and a cut of the repeated noise block.
+struct Bulk {
     static constexpr size_t HEAD_BYTES = 20;
+
+    static std::vector<uint8_t> make(uint64_t seq, uint64_t stamp_ns, size_t size) {
+        constexpr size_t block_bytes = 1 << 16;
+        static const std::vector<uint8_t> block = Noise(0x5347435F50454552ull).take(block_bytes);
+        std::vector<uint8_t> data(size);
+        std::memcpy(data.data(), &seq, 8);
+        std::memcpy(data.data() + 8, &stamp_ns, 8);
+        for (size_t at = HEAD_BYTES, from = (seq * 7919) % block_bytes; at < size; from = 0) {
+            size_t run = std::min(block_bytes - from, size - at);
+            std::memcpy(data.data() + at, block.data() + from, run);
+            at += run;
+        }
+        uint32_t crc = Crc32().add(data.data(), 16).add(data.data() + HEAD_BYTES, size - HEAD_BYTES).value();
+        std::memcpy(data.data() + 16, &crc, 4);
+        return data;
+    }
+};
+
+struct Image : Keyless {
+    static constexpr const char* TYPE = "sensor_msgs::msg::dds_::Image_";
+    static constexpr size_t HEAD_BYTES = Bulk::HEAD_BYTES;
     int32_t sec = 0;
     uint32_t nanosec = 0;
     std::string frame_id;
@@ -146,8 +228,6 @@ struct Image {
     std::vector<uint8_t> data;
 
     static Image make(uint64_t seq, uint64_t stamp_ns, size_t size) {
-        constexpr size_t block_bytes = 1 << 16;
-        static const std::vector<uint8_t> block = Noise(0x5347435F50454552ull).take(block_bytes);
         size = std::max(size, HEAD_BYTES);
         Image made;
         made.sec = static_cast<int32_t>(stamp_ns / 1000000000ull);
@@ -156,16 +236,7 @@ struct Image {
         made.height = 1;
         made.width = made.step = static_cast<uint32_t>(size);
         made.encoding = "mono8";
-        made.data.resize(size);
-        std::memcpy(made.data.data(), &seq, 8);
-        std::memcpy(made.data.data() + 8, &stamp_ns, 8);
-        for (size_t at = HEAD_BYTES, from = (seq * 7919) % block_bytes; at < size; from = 0) {
-            size_t run = std::min(block_bytes - from, size - at);
-            std::memcpy(made.data.data() + at, block.data() + from, run);
-            at += run;
-        }
-        uint32_t crc = Crc32().add(made.data.data(), 16).add(made.data.data() + HEAD_BYTES, size - HEAD_BYTES).value();
-        std::memcpy(made.data.data() + 16, &crc, 4);
+        made.data = Bulk::make(seq, stamp_ns, size);
         return made;
     }
 
@@ -190,6 +261,115 @@ struct Image {
     }
 };
 
+struct PointField {
+    std::string name;
+    uint32_t offset = 0;
+    uint8_t datatype = 0;
+    uint32_t count = 0;
+
+    bool operator==(const PointField& other) const {
+        return name == other.name && offset == other.offset && datatype == other.datatype && count == other.count;
+    }
+};
+
+struct PointCloud2 : Keyless {
+    static constexpr const char* TYPE = "sensor_msgs::msg::dds_::PointCloud2_";
+    static constexpr size_t POINT_BYTES = 16, DEFAULT_BYTES = 6000000, FIELDS_MAX = 16;
+    static constexpr uint8_t FLOAT32 = 7;
+    int32_t sec = 0;
+    uint32_t nanosec = 0;
+    std::string frame_id;
+    uint32_t height = 0, width = 0;
+    std::vector<PointField> fields;
+    bool is_bigendian = false;
+    uint32_t point_step = 0, row_step = 0;
+    std::vector<uint8_t> data;
+    bool is_dense = false;
+
+    static PointCloud2 make(uint64_t seq, uint64_t stamp_ns, size_t size) {
+        size_t points = std::max(((size ? size : DEFAULT_BYTES) + POINT_BYTES - 1) / POINT_BYTES, size_t{2});
+        PointCloud2 made;
+        made.sec = static_cast<int32_t>(stamp_ns / 1000000000ull);
+        made.nanosec = static_cast<uint32_t>(stamp_ns % 1000000000ull);
+        made.frame_id = "sgc/" + std::to_string(seq);
+        made.height = 1;
+        made.width = static_cast<uint32_t>(points);
+        uint32_t offset = 0;
+        for (const char* name : {"x", "y", "z", "intensity"}) {
+            made.fields.push_back({name, offset, FLOAT32, 1});
+            offset += 4;
+        }
+        made.point_step = POINT_BYTES;
+        made.row_step = static_cast<uint32_t>(points * POINT_BYTES);
+        made.data = Bulk::make(seq, stamp_ns, points * POINT_BYTES);
+        made.is_dense = true;
+        return made;
+    }
+
+    Reading read() const {
+        if (data.size() < Bulk::HEAD_BYTES) throw std::runtime_error("cloud shorter than its head");
+        uint64_t seq, stamp_ns;
+        std::memcpy(&seq, data.data(), 8);
+        std::memcpy(&stamp_ns, data.data() + 8, 8);
+        PointCloud2 good = make(seq, stamp_ns, data.size());
+        bool intact = good.data == data && good.sec == sec && good.nanosec == nanosec && good.frame_id == frame_id &&
+                      good.height == height && good.width == width && good.fields == fields &&
+                      good.is_bigendian == is_bigendian && good.point_step == point_step && good.row_step == row_step &&
+                      good.is_dense == is_dense;
+        return {seq, stamp_ns, intact};
+    }
+
+    size_t cdr_size_max() const { return 256 + frame_id.size() + fields.size() * 64 + data.size(); }
+    void write(Cdr& cdr) const {
+        cdr << sec << nanosec << frame_id << height << width << static_cast<uint32_t>(fields.size());
+        for (const PointField& field : fields) cdr << field.name << field.offset << field.datatype << field.count;
+        cdr << is_bigendian << point_step << row_step << data << is_dense;
+    }
+    void read_from(Cdr& cdr) {
+        uint32_t count = 0;
+        cdr >> sec >> nanosec >> frame_id >> height >> width >> count;
+        if (count > FIELDS_MAX) throw std::runtime_error("more fields than a cloud has");
+        fields.resize(count);
+        for (PointField& field : fields) cdr >> field.name >> field.offset >> field.datatype >> field.count;
+        cdr >> is_bigendian >> point_step >> row_step >> data >> is_dense;
+    }
+};
+
+// Five instances, each with a history of its own.
+struct Keyed {
+    static constexpr const char* TYPE = "sgc_test_msgs::msg::dds_::Keyed_";
+    static constexpr bool KEYED = true;
+    static constexpr size_t DATA_MAX = 64;
+    uint32_t sensor = 0;
+    uint64_t seq = 0, stamp_ns = 0;
+    uint32_t crc = 0;
+    std::vector<uint8_t> data;
+
+    uint32_t key() const { return sensor; }
+
+    static Keyed make(uint64_t seq, uint64_t stamp_ns, size_t) {
+        Keyed made;
+        made.sensor = static_cast<uint32_t>(seq % 5);
+        made.seq = seq;
+        made.stamp_ns = stamp_ns;
+        made.data = Noise(seq).take(1 + seq % 31);
+        made.crc = Crc32().add(&made.seq, 8).add(&made.stamp_ns, 8).add(made.data.data(), made.data.size()).value();
+        return made;
+    }
+
+    Reading read() const {
+        Keyed good = make(seq, stamp_ns, 0);
+        return {seq, stamp_ns, good.sensor == sensor && good.crc == crc && good.data == data};
+    }
+
+    size_t cdr_size_max() const { return 64 + data.size(); }
+    void write(Cdr& cdr) const { cdr << sensor << seq << stamp_ns << crc << data; }
+    void read_from(Cdr& cdr) {
+        cdr >> sensor >> seq >> stamp_ns >> crc >> data;
+        if (data.size() > DATA_MAX) throw std::runtime_error("a sequence beyond its bound");
+    }
+};
+
 struct Inner {
     int16_t offset = 0;
     double weight = 0;
@@ -203,7 +383,7 @@ struct Inner {
 };
 
 // A type that no ROS distribution has: nested, bounded, mixed alignment, and a tail of odd length.
-struct Odd {
+struct Odd : Keyless {
     static constexpr const char* TYPE = "sgc_test_msgs::msg::dds_::Odd_";
     static constexpr size_t PARTS_MAX = 4, CODES_MAX = 32, TAIL_MAX = 64;
     bool flag = false;

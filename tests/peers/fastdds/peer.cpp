@@ -24,6 +24,7 @@
 #include <signal.h>
 #include <time.h>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -164,7 +165,7 @@ public:
     RosType() {
         setName(M::TYPE);
         m_typeSize = 1024;  // a first guess: the memory policy grows it
-        m_isGetKeyDefined = false;
+        m_isGetKeyDefined = M::KEYED;
         auto_fill_type_object(false);
         auto_fill_type_information(false);
     }
@@ -202,7 +203,13 @@ public:
 
     void* createData() override { return new M(); }
     void deleteData(void* data) override { delete static_cast<M*>(data); }
-    bool getKey(void*, eprosima::fastrtps::rtps::InstanceHandle_t*, bool) override { return false; }
+    // The key in CDR of big-endian byte order, which fits into the hash (RTPS 2.5, 9.6.4.8).
+    bool getKey(void* data, eprosima::fastrtps::rtps::InstanceHandle_t* handle, bool) override {
+        if (!M::KEYED) return false;
+        uint32_t key = static_cast<const M*>(data)->key();
+        for (int i = 0; i < 16; ++i) handle->value[i] = i < 4 ? static_cast<uint8_t>(key >> (24 - 8 * i)) : 0;
+        return true;
+    }
 };
 
 template <typename Qos>
@@ -403,8 +410,14 @@ int run(const Options& options, Stop& stop) {
     return code;
 }
 
+}  // namespace
+
+#include "service.hpp"
+
+namespace {
+
 [[noreturn]] void usage(const std::string& problem) {
-    std::cerr << "peer: " << problem << "; usage: peer pub|sub [options], see tests/peers/README.md\n";
+    std::cerr << "peer: " << problem << "; usage: peer pub|sub|client|server [options], see tests/peers/README.md\n";
     std::exit(EXIT_USAGE);
 }
 
@@ -412,7 +425,9 @@ Options parse(int argc, char** argv) {
     Options options;
     if (argc < 2) usage("no role");
     options.role = argv[1];
-    if (options.role != "pub" && options.role != "sub") usage("no such role: " + options.role);
+    const bool is_service = options.role == "client" || options.role == "server";
+    if (is_service) options.type = "add";
+    if (options.role != "pub" && options.role != "sub" && !is_service) usage("no such role: " + options.role);
     static const option known[] = {{"domain", 1, nullptr, 'd'},       {"topic", 1, nullptr, 't'},
                                    {"type", 1, nullptr, 'y'},         {"count", 1, nullptr, 'c'},
                                    {"timeout", 1, nullptr, 'o'},      {"rate", 1, nullptr, 'r'},
@@ -465,9 +480,17 @@ int main(int argc, char** argv) {
     const Options options = parse(argc, argv);
     static Stop stop;
     try {
+        if (options.role == "client" || options.role == "server") {
+            if (options.type == "add") return run_service<Add>(options, stop);
+            if (options.type == "blob") return run_service<Blob>(options, stop);
+            usage("no such type of service: " + options.type);
+        }
         if (options.type == "string") return run<peer::String>(options, stop);
         if (options.type == "image") return run<peer::Image>(options, stop);
         if (options.type == "custom") return run<peer::Odd>(options, stop);
+        if (options.type == "wstring") return run<peer::WString>(options, stop);
+        if (options.type == "pointcloud") return run<peer::PointCloud2>(options, stop);
+        if (options.type == "keyed") return run<peer::Keyed>(options, stop);
         usage("no such type: " + options.type);
     } catch (const std::exception& error) {
         std::cerr << "peer: " << error.what() << "\n";

@@ -1,4 +1,4 @@
-"""The three message types of the peers and what each message must hold.
+"""The message types of the peers and what each message must hold.
 
 Types carry the names that ROS 2 gives them on the wire. The content of a message follows from its sequence number, the
 time it was sent and a size alone, so a receiver rebuilds what it should have got and compares all of it. The C++ peer
@@ -6,28 +6,37 @@ does the same (`../fastdds/messages.hpp`); `../README.md` is what the two agree 
 """
 
 import struct
+import sys
 import zlib
 from dataclasses import dataclass
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.annotations import cdrv0, final
+from cyclonedds.idl.annotations import cdrv0, final, key, xcdrv2
 from cyclonedds.idl.types import array, float32, float64, int16, int32, sequence, uint8, uint16, uint32, uint64
 
 MASK64 = (1 << 64) - 1
 BLOCK_BYTES = 1 << 16
 IMAGE_BYTES_MIN = 20
+POINT_BYTES = 16
+POINTCLOUD_BYTES = 6_000_000
+FLOAT32 = 7
+# One, two and three bytes of UTF-8 a character, and one that takes two units of UTF-16.
+WIDE = "a\u00e9\u0416\u6f22\u3042\U0001f916\u20acz"
+
+# The binding wants to know it when a type is made, so before there is a command line to parse.
+represented = xcdrv2 if "--xcdr2" in sys.argv else cdrv0
 
 
 @dataclass
 @final
-@cdrv0
+@represented
 class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
     data: str
 
 
 @dataclass
 @final
-@cdrv0
+@represented
 class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
     sec: int32
     nanosec: uint32
@@ -35,7 +44,7 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
 @dataclass
 @final
-@cdrv0
+@represented
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
     stamp: Time
     frame_id: str
@@ -43,7 +52,7 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 
 @dataclass
 @final
-@cdrv0
+@represented
 class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
     header: Header
     height: uint32
@@ -56,7 +65,7 @@ class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
 
 @dataclass
 @final
-@cdrv0
+@represented
 class Inner(IdlStruct, typename="sgc_test_msgs::msg::dds_::Inner_"):
     offset: int16
     weight: float64
@@ -65,7 +74,7 @@ class Inner(IdlStruct, typename="sgc_test_msgs::msg::dds_::Inner_"):
 
 @dataclass
 @final
-@cdrv0
+@represented
 class Odd(IdlStruct, typename="sgc_test_msgs::msg::dds_::Odd_"):
     """A type that no ROS distribution has: nested, bounded, mixed alignment, and a tail of odd length."""
 
@@ -78,6 +87,54 @@ class Odd(IdlStruct, typename="sgc_test_msgs::msg::dds_::Odd_"):
     codes: sequence[uint16, 32]
     fixed: array[float32, 3]
     tail: sequence[uint8, 64]
+
+
+@dataclass
+@final
+@represented
+class WString(IdlStruct, typename="std_msgs::msg::dds_::WString_"):
+    """A `wstring` as it is on the wire: the count of UTF-16 code units, and the units. The binding has no `wstring`."""
+
+    data: sequence[uint16]
+
+
+@dataclass
+@final
+@represented
+class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
+    name: str
+    offset: uint32
+    datatype: uint8
+    count: uint32
+
+
+@dataclass
+@final
+@represented
+class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
+    header: Header
+    height: uint32
+    width: uint32
+    fields: sequence[PointField]
+    is_bigendian: bool
+    point_step: uint32
+    row_step: uint32
+    data: sequence[uint8]
+    is_dense: bool
+
+
+@dataclass
+@final
+@represented
+class Keyed(IdlStruct, typename="sgc_test_msgs::msg::dds_::Keyed_"):
+    """Five instances, each with a history of its own."""
+
+    sensor: uint32
+    key("sensor")
+    seq: uint64
+    stamp_ns: uint64
+    crc: uint32
+    data: sequence[uint8, 64]
 
 
 class Noise:
@@ -124,11 +181,18 @@ def read_string(message: String) -> tuple[int, int, bool]:
 
 def make_image(seq: int, stamp_ns: int, size: int) -> Image:
     size = max(size, IMAGE_BYTES_MIN)
+    return Image(_header(seq, stamp_ns), 1, size, "mono8", 0, size, _bulk(seq, stamp_ns, size))
+
+
+def _header(seq: int, stamp_ns: int) -> Header:
+    return Header(Time(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000), f"sgc/{seq}")
+
+
+def _bulk(seq: int, stamp_ns: int, size: int) -> bytes:
+    """Sequence number, time, checksum, and a cut of the repeated noise block."""
     fill = _cut_of_block(seq, size - IMAGE_BYTES_MIN)
     head = struct.pack("<QQ", seq, stamp_ns)
-    data = b"".join((head, struct.pack("<I", zlib.crc32(fill, zlib.crc32(head))), fill))
-    stamp = Time(stamp_ns // 1_000_000_000, stamp_ns % 1_000_000_000)
-    return Image(Header(stamp, f"sgc/{seq}"), 1, size, "mono8", 0, size, data)
+    return b"".join((head, struct.pack("<I", zlib.crc32(fill, zlib.crc32(head))), fill))
 
 
 def read_image(message: Image) -> tuple[int, int, bool]:
@@ -171,8 +235,58 @@ def _flat(odd: Odd) -> tuple:
     )  # fmt: skip
 
 
+def make_wstring(seq: int, stamp_ns: int, size: int) -> WString:
+    filler = "".join(WIDE[byte & 7] for byte in Noise(seq).take(size or seq % 23))
+    body = f"seq={seq} t={stamp_ns} fill={filler}"
+    units = f"{body} crc={zlib.crc32(body.encode('utf-16-le')):08x}".encode("utf-16-le")
+    return WString(list(struct.unpack(f"<{len(units) // 2}H", units)))
+
+
+def read_wstring(message: WString) -> tuple[int, int, bool]:
+    units = list(message.data)
+    text = struct.pack(f"<{len(units)}H", *units).decode("utf-16-le")
+    fields = dict(part.split("=", 1) for part in text.split(" "))
+    seq, stamp_ns = int(fields["seq"]), int(fields["t"])
+    size = 0 if len(fields["fill"]) == seq % 23 else len(fields["fill"])
+    return seq, stamp_ns, units == make_wstring(seq, stamp_ns, size).data
+
+
+def make_pointcloud(seq: int, stamp_ns: int, size: int) -> PointCloud2:
+    points = max(-(-(size or POINTCLOUD_BYTES) // POINT_BYTES), 2)
+    fields = [PointField(name, 4 * i, FLOAT32, 1) for i, name in enumerate(("x", "y", "z", "intensity"))]
+    size = points * POINT_BYTES
+    data = _bulk(seq, stamp_ns, size)
+    return PointCloud2(_header(seq, stamp_ns), 1, points, fields, False, POINT_BYTES, size, data, True)
+
+
+def read_pointcloud(message: PointCloud2) -> tuple[int, int, bool]:
+    data = bytes(message.data)
+    seq, stamp_ns = struct.unpack_from("<QQ", data)
+    good = make_pointcloud(seq, stamp_ns, len(data))
+    same = [
+        (c.header, c.height, c.width, list(c.fields), bool(c.is_bigendian), c.point_step, c.row_step, bool(c.is_dense))
+        for c in (good, message)
+    ]
+    return seq, stamp_ns, good.data == data and same[0] == same[1]
+
+
+def make_keyed(seq: int, stamp_ns: int, size: int) -> Keyed:
+    del size
+    data = Noise(seq).take(1 + seq % 31)
+    return Keyed(seq % 5, seq, stamp_ns, zlib.crc32(struct.pack("<QQ", seq, stamp_ns) + data), data)
+
+
+def read_keyed(message: Keyed) -> tuple[int, int, bool]:
+    good = make_keyed(message.seq, message.stamp_ns, 0)
+    same = [(k.sensor, k.seq, k.stamp_ns, k.crc, bytes(k.data)) for k in (good, message)]
+    return message.seq, message.stamp_ns, same[0] == same[1]
+
+
 KINDS = {
     "string": (String, make_string, read_string),
     "image": (Image, make_image, read_image),
     "custom": (Odd, make_custom, read_custom),
+    "wstring": (WString, make_wstring, read_wstring),
+    "pointcloud": (PointCloud2, make_pointcloud, read_pointcloud),
+    "keyed": (Keyed, make_keyed, read_keyed),
 }

@@ -61,7 +61,11 @@ def arguments() -> argparse.Namespace:
     common.add_argument("--localhost", action="store_true", help="use the loopback interface only")
     common.add_argument("--udp-only", action="store_true", help="no shared memory (Cyclone has none here)")
     common.add_argument("--large", action="store_true", help="settings that large messages need (Cyclone only)")
+    common.add_argument("--xcdr2", action="store_true", help="XCDR2 in the place of plain CDR (Cyclone only)")
     common.add_argument("--verbose", action="store_true", help="one line for each message")
+    common.add_argument("--node", help="full name of the ROS node that its endpoint belongs to")
+    common.add_argument("--gid-bytes", type=int, choices=(16, 24), default=16, help="length of ids in the ROS graph")
+    common.add_argument("--deadline", type=float, help="deadline in seconds")
     pub = roles.add_parser("pub", parents=[common])
     pub.add_argument("--rate", type=float, default=10.0, help="messages a second; 0: as fast as it goes")
     pub.add_argument("--size", type=int, default=0, help="image: bytes of data; string: characters of filler")
@@ -72,6 +76,7 @@ def arguments() -> argparse.Namespace:
     pub.add_argument("--hold", type=float, default=0.0, help="seconds to stay after the last message")
     sub = roles.add_parser("sub", parents=[common])
     sub.add_argument("--linger", type=float, default=0.0, help="seconds to listen on for duplicates after --count")
+    roles.add_parser("graph", parents=[common])
     return parser.parse_args()
 
 
@@ -108,12 +113,14 @@ def qos_of(args: argparse.Namespace):
     # A late joiner is given what the durability service keeps: 1 by default, whatever the history depth says. As
     # rmw_cyclonedds does, both get the same depth.
     service = [Policy.DurabilityService(0, history, -1, -1, -1)] if args.transient_local else []
+    deadline = [Policy.Deadline(duration(nanoseconds=int(args.deadline * 1e9)))] if args.deadline else []
     return Qos(
         *service,
+        *deadline,
         history,
         Policy.Reliability.Reliable(duration(seconds=10)) if args.reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if args.transient_local else Policy.Durability.Volatile,
-        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.DataRepresentation(use_cdrv0_representation=not args.xcdr2, use_xcdrv2_representation=args.xcdr2),
     )
 
 
@@ -132,19 +139,20 @@ class Matches:
 
 
 def publish(args, stop: Stop, deadline: float) -> int:
+    import graph
     from cyclonedds.core import Listener
-    from cyclonedds.domain import DomainParticipant
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
 
     kind, make, _ = KINDS[args.type]
-    participant = DomainParticipant(args.domain)
+    participant = graph.participant(args.domain, args.node)
     topic = Topic(participant, "rt" + args.topic, kind)
     matches = Matches()
     listener = Listener()
     listener.set_on_publication_matched(matches.update)
     writer = DataWriter(participant, topic, qos=qos_of(args), listener=listener)
+    _node = graph.announce(participant, args.node, args.gid_bytes, [], [writer]) if args.node else None
     emit("ready")
 
     def wake() -> None:
@@ -252,20 +260,21 @@ class Tally:
 
 
 def subscribe(args, stop: Stop, deadline: float) -> int:
+    import graph
     from cyclonedds.core import GuardCondition, InstanceState, Listener, ReadCondition, SampleState, ViewState, WaitSet
-    from cyclonedds.domain import DomainParticipant
     from cyclonedds.internal import InvalidSample
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
 
     kind, _, read = KINDS[args.type]
-    participant = DomainParticipant(args.domain)
+    participant = graph.participant(args.domain, args.node)
     topic = Topic(participant, "rt" + args.topic, kind)
     matches = Matches()
     listener = Listener()
     listener.set_on_subscription_matched(matches.update)
     reader = DataReader(participant, topic, qos=qos_of(args), listener=listener)
+    _node = graph.announce(participant, args.node, args.gid_bytes, [reader], []) if args.node else None
     waiting = WaitSet(participant)
     waiting.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
     ending = GuardCondition(participant)
@@ -301,6 +310,40 @@ def subscribe(args, stop: Stop, deadline: float) -> int:
     return EXIT_OK if stop.by_signal or len(tally.seen) >= args.count else EXIT_INCOMPLETE
 
 
+def watch_graph(args, stop: Stop, deadline: float) -> int:
+    """Says what nodes and endpoints there are, at each change."""
+    import graph
+    from cyclonedds.core import GuardCondition, WaitSet
+    from cyclonedds.util import duration
+
+    node = args.node or "/graph_watcher"
+    participant = graph.participant(args.domain, node)
+    view = graph.Graph(participant, args.gid_bytes)
+    _node = graph.announce(participant, node, args.gid_bytes, [], [])
+    waiting = WaitSet(participant)
+    view.attach(waiting)
+    ending = GuardCondition(participant)
+    waiting.attach(ending)
+    stop.hooks.append(lambda: ending.set(True))
+    if stop.event.is_set():
+        ending.set(True)
+    emit("ready")
+    told = None
+    while not stop.event.is_set():
+        left = deadline - time.monotonic()
+        if left <= 0 or waiting.wait(duration(milliseconds=max(1, int(left * 1000)))) == 0:
+            break
+        view.take()
+        described = view.describe()
+        if described != told:
+            told = described
+            emit("graph", **described)
+    emit("summary", role="graph")
+    stop.hooks.clear()
+    leave(participant)
+    return EXIT_OK if stop.by_signal else EXIT_INCOMPLETE
+
+
 def main() -> None:
     args = arguments()
     # Blocked before any thread starts, so that every thread inherits it and only `sigwait` takes the signal.
@@ -309,7 +352,7 @@ def main() -> None:
         os.environ["CYCLONEDDS_URI"] = configuration(args)
     stop = Stop()
     threading.Thread(target=until_signal, args=(stop,), daemon=True).start()
-    role = publish if args.role == "pub" else subscribe
+    role = {"pub": publish, "sub": subscribe, "graph": watch_graph}[args.role]
     code = role(args, stop, time.monotonic() + args.timeout)
     sys.exit(code)
 

@@ -1,0 +1,165 @@
+//! A client and a server, as `ros2-client` makes them by default (`ServiceMapping::Enhanced`): a request is known by its
+//! writer and sequence number, and a reply names both in its related sample identity.
+
+use std::pin::pin;
+use std::time::{Duration, Instant};
+
+use futures::executor::block_on;
+use futures::future::{Either, select};
+use ros2_client::qos::{Durability, History, QosProfile, Reliability, WhenFull};
+use ros2_client::{Context, Message, Name, NodeName, NodeOptions, ServiceMapping, ServiceTypeName};
+use rustdds::DomainParticipantBuilder;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::options::{Options, Role};
+use crate::{INCOMPLETE, WRONG, emit};
+
+/// `example_interfaces/srv/AddTwoInts`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Request {
+    a: i64,
+    b: i64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Response {
+    sum: i64,
+}
+
+impl Message for Request {}
+impl Message for Response {}
+
+fn ask(seq: u64) -> Request {
+    Request { a: seq as i64, b: 1000 - 3 * seq as i64 }
+}
+
+fn answer(request: &Request) -> Response {
+    Response { sum: request.a + request.b }
+}
+
+/// How long a client waits once it is matched, since the server may be so later, and how long a server stays for a client
+/// that has not yet taken the last answer.
+const SETTLE: Duration = Duration::from_secs(1);
+
+pub fn run(options: &Options) -> Result<u8, String> {
+    let deadline = Instant::now() + options.timeout;
+    let mut participant = DomainParticipantBuilder::new(options.domain);
+    if options.localhost {
+        participant = participant.with_only_networks([std::net::Ipv4Addr::LOCALHOST]);
+    }
+    let participant = participant.build().map_err(|e| e.to_string())?;
+    let context = Context::from_domain_participant(participant).map_err(|e| e.to_string())?;
+    let name =
+        NodeName::new("/", &format!("rustdds_peer_{}", std::process::id())).map_err(|e| e.to_string())?;
+    let node_options = NodeOptions::new().enable_rosout(false).start_parameter_services(false);
+    let mut node = context.new_node(name, node_options).map_err(|e| format!("{e:?}"))?;
+    let spinner = node.spinner().map_err(|e| e.to_string())?;
+    let spinning = std::thread::spawn(move || block_on(spinner.spin()));
+    let (service, kind) =
+        (Name::parse(&options.topic), ServiceTypeName::new("example_interfaces", "AddTwoInts"));
+    let service = service.map_err(|e| e.to_string())?;
+    let qos = QosProfile::publisher_default()
+        .reliability(Reliability::Reliable { when_full: WhenFull::Wait(Duration::from_secs(10)) })
+        .durability(Durability::Volatile)
+        .history(History::KeepLast { depth: options.depth });
+    let mapping = ServiceMapping::Enhanced;
+    let code = match options.role {
+        Role::Client => {
+            let client = node
+                .create_client::<Request, Response>(mapping, &service, &kind, qos.clone(), qos)
+                .map_err(|e| e.to_string())?;
+            emit("ready", json!({}));
+            let (mut sent, mut answered, mut wrong, mut foreign) = (0, 0, 0, 0);
+            let mut latency_us = Vec::new();
+            if within(deadline, client.wait_for_service(&node)).is_some() {
+                emit("matched", json!({ "count": 1 }));
+                std::thread::sleep(SETTLE);
+                while sent < options.count {
+                    let begun = Instant::now();
+                    let request = ask(options.start + sent);
+                    let right = answer(&request);
+                    let Some(id) = within(deadline, client.async_send_request(request)) else { break };
+                    let id = id.map_err(|e| e.to_string())?;
+                    sent += 1;
+                    let response = loop {
+                        match within(deadline, client.async_receive_response(id)) {
+                            None => break None,
+                            Some(Ok(response)) => break Some(response),
+                            // What it cannot read.
+                            Some(Err(_)) => foreign += 1,
+                        }
+                    };
+                    let Some(response) = response else { break };
+                    answered += 1;
+                    latency_us.push(begun.elapsed().as_micros() as u64);
+                    wrong += u64::from(response != right);
+                    if options.verbose || response != right {
+                        emit("reply", json!({ "seq": options.start + sent - 1, "ok": response == right }));
+                    }
+                    if options.rate > 0.0 {
+                        let due = begun + Duration::from_secs_f64(1.0 / options.rate);
+                        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+                    }
+                }
+            }
+            latency_us.sort_unstable();
+            let p50 = latency_us.get(latency_us.len() / 2).copied().unwrap_or(0);
+            emit(
+                "summary",
+                json!({ "role": "client", "sent": sent, "answered": answered, "wrong": wrong,
+                        "foreign": foreign, "p50_us": p50 }),
+            );
+            match (wrong, answered >= options.count) {
+                (0, true) => 0,
+                (0, false) => INCOMPLETE,
+                _ => WRONG,
+            }
+        }
+        _ => {
+            let server = node
+                .create_server::<Request, Response>(mapping, &service, &kind, qos.clone(), qos)
+                .map_err(|e| e.to_string())?;
+            emit("ready", json!({}));
+            let mut served = 0;
+            while options.count == 0 || served < options.count {
+                match within(deadline, server.async_receive_request()) {
+                    None => break,
+                    Some(Err(error)) => emit("unreadable", json!({ "error": format!("{error:?}") })),
+                    Some(Ok((id, request))) => {
+                        let response = answer(&request);
+                        block_on(server.async_send_response(id, response)).map_err(|e| e.to_string())?;
+                        served += 1;
+                        if options.verbose {
+                            emit("served", json!({ "count": served }));
+                        }
+                    }
+                }
+            }
+            std::thread::sleep(SETTLE);
+            emit("summary", json!({ "role": "server", "served": served, "unmatched": 0 }));
+            if served >= options.count { 0 } else { INCOMPLETE }
+        }
+    };
+    drop(node);
+    let _ = spinning.join();
+    drop(context);
+    Ok(code)
+}
+
+/// What a future comes to before a moment.
+fn within<T>(deadline: Instant, future: impl Future<Output = T>) -> Option<T> {
+    let left = deadline.saturating_duration_since(Instant::now());
+    let (sender, timeout) = futures::channel::oneshot::channel::<()>();
+    let (cancel, cancelled) = std::sync::mpsc::channel::<()>();
+    std::thread::spawn(move || {
+        let _ = cancelled.recv_timeout(left);
+        let _ = sender.send(());
+    });
+    let outcome = match block_on(select(pin!(future), timeout)) {
+        Either::Left((value, _)) => Some(value),
+        Either::Right(_) => None,
+    };
+    drop(cancel);
+    outcome
+}
