@@ -1,7 +1,7 @@
-//! Benchmarks of routing on real sockets; `README.md` says what each part measures and how to read it.
+//! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`forward`], [`rib`] and [`first_message`]; what they share is in
-//! [`fleet`], [`node`], [`process`] and [`report`].
+//! This file knows the command line. The parts are [`forward`], [`rib`], [`first_message`], [`teleop`] and
+//! [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
 #![forbid(unsafe_code)]
 
 mod first_message;
@@ -11,6 +11,9 @@ mod node;
 mod process;
 mod report;
 mod rib;
+mod teleop;
+mod transports;
+mod uplink;
 
 use std::path::PathBuf;
 
@@ -26,7 +29,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Everything below, one after the other
+    /// What routing costs: the first three below, one after the other
     All(RunArgs),
     /// 1 KB through one router, beside a plain TCP relay and a zenoh router
     Forward(RunArgs),
@@ -34,10 +37,21 @@ enum Command {
     Rib(RunArgs),
     /// From a publisher's link to the first message at a subscriber
     FirstMessage(RunArgs),
+    /// Commands, state and a camera over a thin uplink, by every transport; needs root
+    Teleop(RunArgs),
+    /// Links by every transport beside TCP and TLS; needs root for the part with losses
+    Transports(RunArgs),
+    /// The far end of `transports`, in a process of its own
+    #[command(hide = true)]
+    ServeLinks(transports::ServeArgs),
+    /// Memory of links, in a process of its own
+    #[command(hide = true)]
+    MeasureLinks(transports::MemoryArgs),
     /// The relay of `forward`, in a process of its own
     #[command(hide = true)]
     ServeTcp,
     /// The zenoh router of `forward`, in a process of its own
+    #[cfg(feature = "zenoh")]
     #[command(hide = true)]
     ServeZenoh,
     /// One size of `rib`, in a process of its own so that its memory can be told
@@ -62,6 +76,15 @@ struct RunArgs {
     /// Names in the router, for `rib`
     #[arg(long, value_name = "N,N,…", value_delimiter = ',', default_values_t = [10_000, 1_000_000, 10_000_000])]
     names: Vec<usize>,
+    /// Transports, for `teleop` and `transports`; those that this build does not know are left out
+    #[arg(long, value_name = "SCHEME,…", value_delimiter = ',', default_values = uplink::SCHEMES)]
+    schemes: Vec<String>,
+    /// The state and the commands of `teleop` are reliable topics
+    #[arg(long)]
+    reliable: bool,
+    /// Seconds of each run of `teleop`
+    #[arg(long, default_value_t = 15)]
+    seconds: u64,
     /// A short run that shows that all parts work; its figures mean little
     #[arg(long)]
     quick: bool,
@@ -77,7 +100,12 @@ fn main() -> Result<()> {
         Command::Forward(args) => part(&args, "forward", forward::run),
         Command::Rib(args) => part(&args, "rib", rib::run),
         Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
+        Command::Teleop(args) => part(&args, "teleop", teleop::run),
+        Command::Transports(args) => part(&args, "transports", transports::run),
+        Command::MeasureLinks(args) => transports::measure_memory_here(&args),
+        Command::ServeLinks(args) => transports::serve(&args),
         Command::ServeTcp => forward::tcp::serve(),
+        #[cfg(feature = "zenoh")]
         Command::ServeZenoh => forward::zenoh::serve(),
         Command::MeasureRib { names, samples } => rib::measure_here(names, samples),
     }

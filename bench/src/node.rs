@@ -7,12 +7,13 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use bytes::Bytes;
-use sgc_node::config::{Config, Recipient, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, ShareConfig, UseConfig};
 use sgc_node::{RunOptions, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_testkit::netsim::Namespace;
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_trust::{Identity, Suite};
-use sgc_wire::{Class, Qos};
+use sgc_wire::Qos;
 use tokio::sync::oneshot;
 
 use crate::process::{PATIENCE, status};
@@ -29,17 +30,36 @@ impl Node {
     /// Starts it; up when this returns, though not connected.
     pub(crate) fn start(config: Config, identity: Arc<Identity>, domain: &FakeDomain) -> Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+        Self::start_on(runtime, config, identity, Some(domain))
+    }
+
+    /// The same, with its sockets in a network namespace, and perhaps without a local network.
+    pub(crate) fn start_in(
+        home: &Arc<Namespace>,
+        config: Config,
+        identity: Arc<Identity>,
+        domain: Option<&FakeDomain>,
+    ) -> Result<Self> {
+        Self::start_on(runtime_in(home)?, config, identity, domain)
+    }
+
+    fn start_on(
+        runtime: tokio::runtime::Runtime,
+        config: Config,
+        identity: Arc<Identity>,
+        domain: Option<&FakeDomain>,
+    ) -> Result<Self> {
         let (stop, stopped) = oneshot::channel::<()>();
         let (ready, is_ready) = oneshot::channel();
         let (done, ended) = channel();
         let socket = config.admin_socket.clone().context("a node of a benchmark has a socket")?;
-        let network = Arc::new(domain.join(true));
+        let network = domain.map(|domain| Arc::new(domain.join(true)));
         runtime.spawn(async move {
             let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
             let stopped = async {
                 let _ = stopped.await;
             };
-            if let Err(error) = run_on::<FakeRos>(config, identity, Some(network), options, stopped).await {
+            if let Err(error) = run_on::<FakeRos>(config, identity, network, options, stopped).await {
                 eprintln!("a node ends: {error}");
             }
             let _ = done.send(());
@@ -65,6 +85,16 @@ impl Drop for Node {
     }
 }
 
+/// A runtime whose threads are in a network namespace.
+pub(crate) fn runtime_in(home: &Arc<Namespace>) -> Result<tokio::runtime::Runtime> {
+    let home = Arc::clone(home);
+    let mut builder = tokio::runtime::Builder::new_multi_thread();
+    builder.worker_threads(2).enable_all().on_thread_start(move || {
+        home.enter().expect("a namespace that is there can be entered");
+    });
+    Ok(builder.build()?)
+}
+
 /// A configuration with everything that the node writes in `dir`.
 pub(crate) fn config(dir: &Path, node: &str, routers: &[&str]) -> Result<Config> {
     Ok(Config {
@@ -77,20 +107,21 @@ pub(crate) fn config(dir: &Path, node: &str, routers: &[&str]) -> Result<Config>
 
 /// A topic for one other node.
 pub(crate) fn share(topic: &str, to: &str, suite: Suite) -> Result<ShareConfig> {
-    Ok(ShareConfig {
-        topic: topic.into(),
-        type_name: None,
-        to: vec![Recipient::Node(to.parse()?)],
-        publish: vec![],
-        priority: Class::Default,
-        suite,
-        metadata: ShareMetadata::default(),
-    })
+    let mut config = parse(&format!("[[share]]\ntopic = \"{topic}\"\nto = [\"{to}\"]\n"))?;
+    let share = config.shares.pop().context("a share")?;
+    Ok(ShareConfig { suite, ..share })
 }
 
 /// The same topic at that node.
 pub(crate) fn usage(topic: &str, from: &str) -> Result<UseConfig> {
-    Ok(UseConfig { publish: false, from: from.parse()?, topic: topic.into(), type_name: None })
+    let mut config = parse(&format!("[[use]]\nfrom = \"{from}\"\ntopic = \"{topic}\"\n"))?;
+    config.uses.pop().context("a use")
+}
+
+/// Part of a configuration as users write it, so that what it does not say is as it is for them.
+fn parse(tables: &str) -> Result<Config> {
+    let text = format!("identity = \"x\"\n[node]\nrouters = [\"quic://router\"]\n{tables}");
+    Ok(sgc_node::config::parse(&text, "benchmark", Path::new(""), &|_| None)?)
 }
 
 /// An application that publishes.

@@ -43,12 +43,7 @@ impl Server {
 
     /// CPU time that its threads have taken, user and system, seconds.
     pub(crate) fn cpu_seconds(&self) -> f64 {
-        let tasks = fs::read_dir(format!("/proc/{}/task", self.child.id()));
-        let spent = |task: fs::DirEntry| {
-            let text = fs::read_to_string(task.path().join("schedstat")).ok()?;
-            text.split(' ').next()?.parse::<f64>().ok()
-        };
-        tasks.into_iter().flatten().flatten().filter_map(spent).sum::<f64>() / 1e9
+        cpu_seconds(&format!("/proc/{}/task", self.child.id()))
     }
 
     /// Its resident memory, bytes.
@@ -141,6 +136,19 @@ pub(crate) fn status(socket: &Path) -> Result<serde_json::Value> {
     let mut text = String::new();
     stream.read_to_string(&mut text)?;
     Ok(serde_json::from_str(&text)?)
+}
+
+/// CPU time that the threads of this process have taken, user and system, seconds.
+pub(crate) fn own_cpu_seconds() -> f64 {
+    cpu_seconds("/proc/self/task")
+}
+
+fn cpu_seconds(tasks: &str) -> f64 {
+    let spent = |task: fs::DirEntry| {
+        let text = fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split(' ').next()?.parse::<f64>().ok()
+    };
+    fs::read_dir(tasks).into_iter().flatten().flatten().filter_map(spent).sum::<f64>() / 1e9
 }
 
 /// Resident memory of this process, bytes.

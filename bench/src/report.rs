@@ -84,6 +84,7 @@ pub(crate) struct Spread {
     pub(crate) mean: f64,
     pub(crate) p50: f64,
     pub(crate) p99: f64,
+    pub(crate) max: f64,
 }
 
 impl Spread {
@@ -93,7 +94,12 @@ impl Spread {
         }
         sample.sort_unstable_by(f64::total_cmp);
         let at = |part: f64| sample[((sample.len() - 1) as f64 * part) as usize];
-        Self { mean: sample.iter().sum::<f64>() / sample.len() as f64, p50: at(0.5), p99: at(0.99) }
+        Self {
+            mean: sample.iter().sum::<f64>() / sample.len() as f64,
+            p50: at(0.5),
+            p99: at(0.99),
+            max: at(1.0),
+        }
     }
 }
 

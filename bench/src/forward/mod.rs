@@ -6,6 +6,7 @@
 
 mod sgc;
 pub(crate) mod tcp;
+#[cfg(feature = "zenoh")]
 pub(crate) mod zenoh;
 
 use std::any::Any;
@@ -30,6 +31,9 @@ const BURST: usize = 32;
 const PACE: Duration = Duration::from_millis(1);
 /// Where the time of sending is in a payload: behind the CDR encapsulation header.
 const STAMP_AT: usize = 4;
+
+/// What the ways by zenoh are called.
+const ZENOH: &str = "zenoh router";
 
 /// The zero of the time stamps.
 static EPOCH: LazyLock<Instant> = LazyLock::new(Instant::now);
@@ -220,6 +224,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Report> {
     LazyLock::force(&EPOCH);
     let mut all = vec![
         Contestant::new(tcp::relayed()?, tcp::direct()?),
+        #[cfg(feature = "zenoh")]
         Contestant::new(zenoh::routed()?, zenoh::direct()?),
         Contestant::new(sgc::routed(&args.sgc, Suite::Group)?, sgc::direct(Suite::Group)?),
         Contestant::new(sgc::routed(&args.sgc, Suite::Standard)?, sgc::direct(Suite::Standard)?),
@@ -240,7 +245,7 @@ pub(crate) fn run(args: &RunArgs) -> Result<Report> {
         let found = figures.iter().find(|f| f.way == way);
         found.map_or(f64::NAN, |f| f.messages_per_second_per_router_core)
     };
-    let (tcp, zenoh) = (rate(tcp::NAME), rate(zenoh::NAME));
+    let (tcp, zenoh) = (rate(tcp::NAME), rate(ZENOH));
     let row = |f: &Figures| {
         vec![
             f.way.to_owned(),

@@ -7,7 +7,6 @@ use anyhow::{Context, Result};
 use bytes::Bytes;
 use sgc_node::config::Config;
 use sgc_testkit::FakeDomain;
-use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::Suite;
 use sgc_wire::{History, Qos};
 
@@ -37,7 +36,7 @@ pub(super) fn routed(sgc: &Path, suite: Suite) -> Result<Way> {
 pub(super) fn direct(suite: Suite) -> Result<Way> {
     let (fleet, dir) = (BenchFleet::new()?, tempfile::tempdir()?);
     let mut desk = config(dir.path(), "desk", &[])?;
-    desk.listen = vec![ListenAddr { scheme: Scheme::Quic, addr: ([127, 0, 0, 1], free_port()?).into() }];
+    desk.listen = vec![format!("quic://127.0.0.1:{}", free_port()?).parse()?];
     let url = desk.listen[0].to_string();
     let robot = config(dir.path(), "robot", &[&url])?;
     between("sgc, direct", &fleet, suite, dir, robot, |_| Ok(desk))

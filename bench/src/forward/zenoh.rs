@@ -10,7 +10,7 @@ use zenoh::{Config, Session, Wait};
 use super::{Arrivals, Sender, Way};
 use crate::process::{Server, until_stdin_closes};
 
-pub(super) const NAME: &str = "zenoh router";
+const NAME: &str = super::ZENOH;
 const KEY: &str = "bench/load";
 
 /// Through the router.
