@@ -9,12 +9,15 @@ use crate::support::{Peer, eventually};
 
 const COMMON: [&str; 5] = ["--type", "string", "--topic", "/tf_static", "--transient-local"];
 
-/// A publisher that says `count` messages from the number `start` on, and stays.
+/// A publisher that says `count` messages from the number `start` on, which the node near it has in its hands then, and
+/// stays. Were the node only about to meet it, what it is given as history and what it hears live would depend on
+/// who is quicker.
 fn talker(lab: &Lab, vendor: &str, depth: &str, start: &str, count: &str) -> Peer {
     let said = ["--depth", depth, "--start", start, "--count", count, "--rate", "0"];
-    let stays = ["--wait-matched", "0", "--hold", "2000"];
+    let stays = ["--wait-matched", "1", "--hold", "2000"];
     let mut talker = lab.peer(Site::Robot, vendor, "pub", &[&COMMON[..], &said, &stays].concat());
-    talker.wait("all sent", |e| e["event"] == "all_sent");
+    let sent = talker.wait("all sent", |e| e["event"] == "all_sent");
+    assert_eq!(sent["acknowledged"], true, "{sent}");
     talker
 }
 
