@@ -4,5 +4,9 @@
 //! A table is a module here; what it measures are [`Figure`]s, which `report` turns into pages, plots and goals.
 
 mod figures;
+mod goals;
+mod plot;
+mod report;
 
 pub(crate) use figures::{Figure, Figures};
+pub(crate) use report::Run;
