@@ -87,8 +87,18 @@ fn over_topics(compare: &Compare, kind: PathKind, system: &dyn System, steps: us
         .collect();
     let running = system.start(&lab, &topics)?;
     let together = ROBOTS.to_string();
-    let answer =
-        ["answer", "--topic", IMAGES, "--back", ACTIONS, "--together", &together, "--reliable", "--node", "server"];
+    let answer = [
+        "answer",
+        "--topic",
+        IMAGES,
+        "--back",
+        ACTIONS,
+        "--together",
+        &together,
+        "--reliable",
+        "--node",
+        "server",
+    ];
     let mut server = lab.load(&running, Side::Right, &answer)?;
     server.soon("up")?;
     let mut robots = Vec::new();
@@ -140,12 +150,14 @@ fn over_ssh(compare: &Compare, kind: PathKind, steps: usize) -> Result<Vec<f64>>
         let begun = Instant::now();
         std::thread::scope(|scope| {
             let image = &image;
-            let mut workers = vec![scope.spawn(|| server.step(step, compare.fleet_image_bytes()))];
-            for robot in &mut robots {
-                workers.push(scope.spawn(move || robot.step(step, image)));
+            let robots = robots.iter_mut().map(|robot| scope.spawn(move || robot.step(step, image)));
+            // All of them begin before the first is waited for.
+            let robots: Vec<_> = robots.collect();
+            let served = server.step(step, compare.fleet_image_bytes());
+            for robot in robots {
+                robot.join().unwrap_or_else(|_| bail!("a robot's thread ended badly"))?;
             }
-            let ends = workers.into_iter().map(|worker| worker.join());
-            ends.map(|end| end.unwrap_or_else(|_| bail!("a worker of the step ended badly"))).collect::<Result<()>>()
+            served
         })?;
         times.push(begun.elapsed().as_secs_f64() * 1e6);
     }
@@ -284,7 +296,9 @@ impl SftpRobot {
             match fs::remove_file(&self.got) {
                 Ok(()) => break,
                 Err(error) if error.kind() != ErrorKind::NotFound => return Err(error.into()),
-                Err(_) => ensure!(Instant::now() < deadline, "robot {number} has no action after {STEP_MAX:?}"),
+                Err(_) => {
+                    ensure!(Instant::now() < deadline, "robot {number} has no action after {STEP_MAX:?}")
+                }
             }
         }
         // It is the server's disk; what is left there costs no step anything.

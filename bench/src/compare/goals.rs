@@ -3,7 +3,7 @@
 //! What is compared with another system is a ratio to what that system reached in the same run, since times differ from
 //! machine to machine. It judges and measures nothing.
 
-use super::Figures;
+use super::figures::{Figure, Figures};
 use super::plot::Unit;
 
 /// A goal and what became of it.
@@ -211,7 +211,7 @@ type Place<'a> = (&'a str, &'a str, f64, &'a str);
 impl Run<'_> {
     /// The number of a system, at about this size.
     fn number(&self, (table, path, at, metric): Place<'_>, system: &str) -> Option<f64> {
-        let is_it = |f: &&super::Figure| {
+        let is_it = |f: &&Figure| {
             (&*f.table, &*f.system, &*f.path, &*f.metric) == (table, system, path, metric)
                 && (f.at - at).abs() <= at * SIZE_TOLERANCE
         };

@@ -10,8 +10,9 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 
+use super::figures::{Figure, Figures};
+use super::goals;
 use super::plot::{self, Axis, Bar, Hue, Series, Stroke, Unit, join, three_digits};
-use super::{Figure, Figures, goals};
 use crate::report::Machine;
 
 /// What a run leaves behind.
