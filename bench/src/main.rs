@@ -1,6 +1,6 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`forward`], [`rib`], [`first_message`], [`teleop`] and
+//! This file knows the command line. The parts are [`compare`], [`forward`], [`rib`], [`first_message`], [`teleop`] and
 //! [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
 #![forbid(unsafe_code)]
 
@@ -44,6 +44,8 @@ enum Command {
     Transports(RunArgs),
     /// The pages and plots of a run of `compare`, once more from its figures
     Report(ReportArgs),
+    /// SGC beside what users would pick instead, in one run over emulated paths; needs root
+    Compare(compare::CompareArgs),
     /// The far end of `transports`, in a process of its own
     #[command(hide = true)]
     ServeLinks(transports::ServeArgs),
@@ -117,6 +119,7 @@ fn main() -> Result<()> {
         Command::Teleop(args) => part(&args, "teleop", teleop::run),
         Command::Transports(args) => part(&args, "transports", transports::run),
         Command::Report(args) => compare::Run::read(&args.run)?.render(&args.out),
+        Command::Compare(args) => compare::run(args),
         Command::MeasureLinks(args) => transports::measure_memory_here(&args),
         Command::ServeLinks(args) => transports::serve(&args),
         Command::ServeTcp => forward::tcp::serve(),
