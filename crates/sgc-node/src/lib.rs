@@ -8,6 +8,9 @@
 pub mod admin;
 pub mod audit;
 mod authority;
+#[cfg(feature = "benchmarks")]
+#[doc(hidden)]
+pub mod benchmarks;
 mod calls;
 pub mod config;
 mod core;
