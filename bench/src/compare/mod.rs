@@ -4,13 +4,23 @@
 //! that know nothing of it. A table is a module here and a row of [`TABLES`]; what it measures are [`figures::Figure`]s, which
 //! `report` turns into pages, plots and goals.
 
+mod applications;
+mod fan_out;
 mod figures;
+mod fleet_step;
+mod flow;
+mod goals;
 mod lab;
+mod multi_hop;
+mod plot;
 mod program;
+mod report;
 mod round_trip;
 mod system;
+mod tally;
+mod tcp;
+mod throughput;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -21,12 +31,20 @@ use lab::PathKind;
 use system::System;
 
 pub(crate) use figures::Figures;
+pub(crate) use report::Run;
 
 /// Measures a table.
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 1] = [("round-trip", round_trip::run)];
+const TABLES: [(&str, Table); 6] = [
+    ("round-trip", round_trip::run),
+    ("throughput", throughput::run),
+    ("applications", applications::run),
+    ("fleet-step", fleet_step::run),
+    ("fan-out", fan_out::run),
+    ("multi-hop", multi_hop::run),
+];
 
 /// What `compare` is given.
 #[derive(Args, Clone, Debug)]
@@ -46,6 +64,12 @@ pub(crate) struct CompareArgs {
     /// These systems alone; a name that ends in * stands for all that begin so
     #[arg(long, value_name = "SYSTEM,…", value_delimiter = ',')]
     systems: Vec<String>,
+    /// These paths alone: bare, paper, lossy
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    paths: Vec<String>,
+    /// Bytes of the image that each robot sends in a step of `fleet-step`: 640 × 480 pixels, compressed
+    #[arg(long, value_name = "BYTES", default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(64..))]
+    fleet_image: u32,
     /// A short run that shows that all parts work; its figures mean little
     #[arg(long)]
     quick: bool,
@@ -67,7 +91,8 @@ impl Compare {
         };
         let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
         let mut systems = system::all(&args.sgc)?;
-        let names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        let mut names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        names.push(tcp::NAME.to_owned());
         for pattern in &args.systems {
             ensure!(
                 names.iter().any(|name| fits(pattern, name)),
@@ -75,9 +100,7 @@ impl Compare {
                 names.join(", ")
             );
         }
-        systems.retain(|system| {
-            args.systems.is_empty() || args.systems.iter().any(|pattern| fits(pattern, &system.name()))
-        });
+        systems.retain(|system| is_among(&args.systems, &system.name()));
         for only in &args.only {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
@@ -90,6 +113,16 @@ impl Compare {
         &self.systems
     }
 
+    /// Whether a system is asked for, whatever kind of thing it is.
+    pub(crate) fn wants(&self, system: &str) -> bool {
+        is_among(&self.args.systems, system)
+    }
+
+    /// Whether a path is asked for.
+    pub(crate) fn wants_path(&self, kind: &PathKind) -> bool {
+        self.args.paths.is_empty() || self.args.paths.iter().any(|path| path == kind.name())
+    }
+
     /// The program that talks and listens.
     pub(crate) fn load(&self) -> &Path {
         &self.load
@@ -98,6 +131,11 @@ impl Compare {
     /// The program that is measured.
     pub(crate) fn sgc(&self) -> &Path {
         &self.args.sgc
+    }
+
+    /// Bytes of an image of `fleet-step`.
+    pub(crate) fn fleet_image_bytes(&self) -> usize {
+        self.args.fleet_image as usize
     }
 
     /// Whether figures need not mean anything.
@@ -121,22 +159,28 @@ impl Compare {
     }
 }
 
+fn is_among(patterns: &[String], name: &str) -> bool {
+    patterns.is_empty() || patterns.iter().any(|pattern| fits(pattern, name))
+}
+
 fn fits(pattern: &str, name: &str) -> bool {
     pattern.strip_suffix('*').map_or(pattern == name, |start| name.starts_with(start))
 }
 
-/// Runs what is asked for and writes `compare.json`.
+/// Runs what is asked for and writes figures, report and plots, anew after each table: what was measured is not lost with what
+/// was not.
 pub(crate) fn run(args: CompareArgs) -> Result<()> {
     let compare = Compare::new(args)?;
     let mut figures = Figures::default();
     for (name, table) in TABLES {
-        if compare.args.only.is_empty() || compare.args.only.iter().any(|only| only == name) {
-            table(&compare, &mut figures).with_context(|| format!("table {name}"))?;
+        if is_among(&compare.args.only, name) {
+            if let Err(error) = table(&compare, &mut figures) {
+                figures.leave_out(&format!("the rest of {name}"), format!("{error:#}"));
+            }
+            let run = Run::here(figures.clone(), compare.is_quick());
+            run.write(&compare.args.out)?;
+            run.render(&compare.args.out)?;
         }
     }
-    let out = &compare.args.out;
-    fs::create_dir_all(out).with_context(|| out.display().to_string())?;
-    let path = out.join("compare.json");
-    let text = serde_json::to_string_pretty(&figures)? + "\n";
-    fs::write(&path, text).with_context(|| path.display().to_string())
+    Ok(())
 }
