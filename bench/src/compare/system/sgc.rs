@@ -106,8 +106,8 @@ impl System for Sgc {
         }
         for side in [Side::Right, Side::Left] {
             let node = side.name();
-            let is_router = side == Side::Right && self.routers == 0;
-            fleet.write(&dir, node, is_router)?;
+            let listens = side == Side::Right && self.routers == 0;
+            fleet.write(&dir, node, false)?;
             let dials = match (side, self.routers) {
                 (Side::Right, 0) => String::new(),
                 (Side::Right, _) => self.url("127.0.0.1", 0),
@@ -115,7 +115,7 @@ impl System for Sgc {
             };
             let mut text = format!("[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n");
             text += "[ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n";
-            if is_router {
+            if listens {
                 writeln!(text, "[router]\nlisten = [{}]", self.url("0.0.0.0", 0))?;
             }
             for topic in topics {
