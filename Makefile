@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench-routing bench-teleop bench-transports scale clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports scale clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -17,6 +17,7 @@ help:
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
 	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
 	@echo '                 model-check (larger bounds)'
+	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, hours; ARGS="--quick" is minutes)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
@@ -112,6 +113,12 @@ vendors: peers
 # The tree protocol within larger bounds than in `unit`: minutes, and some GB.
 model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
+
+# SGC and what users would pick instead, side by side. A workspace of its own, no part of `make test`.
+bench: build
+	$(CARGO) build --release --locked --workspace --no-default-features --manifest-path bench/Cargo.toml
+	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- compare \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
 # A workspace of its own, since zenoh is large: no part of `make test`.
 bench-routing: build
