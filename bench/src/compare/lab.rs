@@ -93,7 +93,7 @@ impl PathKind {
 /// The two places. What was started in them has to end before it is dropped.
 pub(crate) struct Lab {
     /// Goes first, as its devices are in the namespaces. None on [`PathKind::Bare`].
-    pub(crate) path: Option<TunLink>,
+    _path: Option<TunLink>,
     places: [Arc<Namespace>; 2],
     /// For all that is written while it is there.
     pub(crate) dir: TempDir,
@@ -116,7 +116,7 @@ impl Lab {
             place.ip(&["link", "set", "lo", "multicast", "on"])?;
         }
         let dir = tempfile::tempdir()?;
-        Ok(Self { path, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
+        Ok(Self { _path: path, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
     }
 
     /// The namespace of a place.
