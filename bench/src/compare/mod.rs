@@ -5,15 +5,21 @@
 //! `report` turns into pages, plots and goals.
 
 mod applications;
+mod fan_out;
 mod figures;
 mod fleet_step;
+mod flow;
 mod goals;
 mod lab;
+mod multi_hop;
 mod plot;
 mod program;
 mod report;
 mod round_trip;
 mod system;
+mod tally;
+mod tcp;
+mod throughput;
 
 use std::path::{Path, PathBuf};
 
@@ -31,8 +37,14 @@ pub(crate) use report::Run;
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 3] =
-    [("round-trip", round_trip::run), ("applications", applications::run), ("fleet-step", fleet_step::run)];
+const TABLES: [(&str, Table); 6] = [
+    ("round-trip", round_trip::run),
+    ("throughput", throughput::run),
+    ("fan-out", fan_out::run),
+    ("multi-hop", multi_hop::run),
+    ("applications", applications::run),
+    ("fleet-step", fleet_step::run),
+];
 
 /// What `compare` is given.
 #[derive(Args, Clone, Debug)]
@@ -52,6 +64,9 @@ pub(crate) struct CompareArgs {
     /// These systems alone; a name that ends in * stands for all that begin so
     #[arg(long, value_name = "SYSTEM,…", value_delimiter = ',')]
     systems: Vec<String>,
+    /// These paths alone: bare, paper, lossy
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    paths: Vec<String>,
     /// Bytes of the image that each robot sends in a step of `fleet-step`: 640 × 480 pixels, compressed
     #[arg(long, value_name = "BYTES", default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(64..))]
     fleet_image: u32,
@@ -76,7 +91,8 @@ impl Compare {
         };
         let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
         let mut systems = system::all(&args.sgc)?;
-        let names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        let mut names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        names.push(tcp::NAME.to_owned());
         for pattern in &args.systems {
             ensure!(
                 names.iter().any(|name| fits(pattern, name)),
@@ -84,9 +100,7 @@ impl Compare {
                 names.join(", ")
             );
         }
-        systems.retain(|system| {
-            args.systems.is_empty() || args.systems.iter().any(|pattern| fits(pattern, &system.name()))
-        });
+        systems.retain(|system| is_among(&args.systems, &system.name()));
         for only in &args.only {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
@@ -97,6 +111,16 @@ impl Compare {
     /// What is compared in this run.
     pub(crate) fn systems(&self) -> &[Box<dyn System>] {
         &self.systems
+    }
+
+    /// Whether a system is asked for, whatever kind of thing it is.
+    pub(crate) fn wants(&self, system: &str) -> bool {
+        is_among(&self.args.systems, system)
+    }
+
+    /// Whether a path is asked for.
+    pub(crate) fn wants_path(&self, kind: &PathKind) -> bool {
+        self.args.paths.is_empty() || self.args.paths.iter().any(|path| path == kind.name())
     }
 
     /// The program that talks and listens.
@@ -135,6 +159,10 @@ impl Compare {
     }
 }
 
+fn is_among(patterns: &[String], name: &str) -> bool {
+    patterns.is_empty() || patterns.iter().any(|pattern| fits(pattern, name))
+}
+
 fn fits(pattern: &str, name: &str) -> bool {
     pattern.strip_suffix('*').map_or(pattern == name, |start| name.starts_with(start))
 }
@@ -145,7 +173,7 @@ pub(crate) fn run(args: CompareArgs) -> Result<()> {
     let compare = Compare::new(args)?;
     let mut figures = Figures::default();
     for (name, table) in TABLES {
-        if compare.args.only.is_empty() || compare.args.only.iter().any(|only| only == name) {
+        if is_among(&compare.args.only, name) {
             if let Err(error) = table(&compare, &mut figures) {
                 figures.leave_out(&format!("the rest of {name}"), format!("{error:#}"));
             }

@@ -8,9 +8,10 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use serde_json::json;
 
+use super::flow::CONNECT_MAX;
 use super::lab::{Lab, PathKind, Side};
 use super::system::{System, Topic};
-use super::{Compare, Figures};
+use super::{Compare, Figures, tcp};
 use crate::report::Spread;
 
 const PING: &str = "/bench/ping";
@@ -19,21 +20,29 @@ const PONG: &str = "/bench/pong";
 const SIZES: [usize; 7] = [16, 100, 1000, 8 << 10, 64 << 10, 1 << 20, 13 << 20];
 /// From where on a message is large: few are measured, and one is enough where the path is thin.
 const LARGE_BYTES: usize = 1 << 20;
-/// How long a system may take until the first message has come back.
-const CONNECT_MAX: Duration = Duration::from_secs(30);
 /// How much longer than it may take is waited for an answer.
 const SPARE: Duration = Duration::from_secs(5);
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     for kind in [PathKind::Bare, PathKind::Paper, PathKind::Lossy] {
+        if !compare.wants_path(&kind) {
+            continue;
+        }
+        let sizes = sizes(&kind, compare.is_quick());
         let mut samples = BTreeMap::new();
         for round in 0..compare.rounds(&kind) {
             for system in compare.systems() {
                 let name = system.name();
                 compare.note(&format!("round trip, {}, round {round}: {name}", kind.name()));
-                if let Err(error) = measure(compare, &kind, &**system, &mut samples) {
+                if let Err(error) = measure(compare, &kind, &**system, sizes, &mut samples) {
                     figures.leave_out(&format!("round-trip {name} on {}", kind.name()), format!("{error:#}"));
+                }
+            }
+            if compare.wants(tcp::NAME) {
+                compare.note(&format!("round trip, {}, round {round}: {}", kind.name(), tcp::NAME));
+                if let Err(error) = measure_tcp(compare, &kind, sizes, &mut samples) {
+                    figures.leave_out(&format!("round-trip tcp on {}", kind.name()), format!("{error:#}"));
                 }
             }
         }
@@ -53,18 +62,44 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-#[derive(Default)]
-struct Sample {
-    round_trips_us: Vec<f64>,
-    lost: u64,
+/// What is measured; on a thin path the largest takes most of an hour for all systems.
+fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
+    match kind {
+        PathKind::Bare => &SIZES,
+        _ if quick => &SIZES[..SIZES.len() - 2],
+        _ => &SIZES,
+    }
 }
 
-/// One round of one system.
-fn measure(
+/// Samples by system and size.
+pub(crate) type Samples = BTreeMap<(String, usize), Sample>;
+
+/// What was measured of one size.
+#[derive(Debug, Default)]
+pub(crate) struct Sample {
+    /// Each round trip, µs.
+    pub(crate) round_trips_us: Vec<f64>,
+    /// Messages that did not come back in time.
+    pub(crate) lost: u64,
+}
+
+/// A turn of TCP.
+fn measure_tcp(compare: &Compare, kind: &PathKind, sizes: &[usize], samples: &mut Samples) -> Result<()> {
+    let lab = Lab::new(*kind, compare.load())?;
+    let plans: Vec<_> = sizes.iter().map(|&size| (size, Plan::of(kind, size, compare.is_quick()))).collect();
+    tcp::measure(&lab, &plans, |size, sample| {
+        let of_size = samples.entry((tcp::NAME.to_owned(), size)).or_default();
+        of_size.round_trips_us.extend(sample.round_trips_us);
+    })
+}
+
+/// A turn of a system.
+pub(crate) fn measure(
     compare: &Compare,
     kind: &PathKind,
     system: &dyn System,
-    samples: &mut BTreeMap<(String, usize), Sample>,
+    sizes: &[usize],
+    samples: &mut Samples,
 ) -> Result<()> {
     let lab = Lab::new(*kind, compare.load())?;
     let topics = [
@@ -77,7 +112,7 @@ fn measure(
     pong.soon("up")?;
     let mut ping = lab.load(&running, Side::Left, &[&["ping"][..], &args].concat())?;
     ping.until("connected", CONNECT_MAX)?;
-    for size in SIZES {
+    for &size in sizes {
         let plan = Plan::of(kind, size, compare.is_quick());
         ping.order(&json!({ "measure": {
             "size": size, "count": plan.count, "seconds": plan.seconds, "warm_up": plan.warm_up,
@@ -99,11 +134,16 @@ fn measure(
 }
 
 /// How one size is measured.
-struct Plan {
-    count: usize,
-    seconds: f64,
-    warm_up: usize,
-    patience: Duration,
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Plan {
+    /// At most so many that count.
+    pub(crate) count: usize,
+    /// None begins after so long.
+    pub(crate) seconds: f64,
+    /// How many come first and do not count.
+    pub(crate) warm_up: usize,
+    /// How long each is waited for.
+    pub(crate) patience: Duration,
 }
 
 impl Plan {
@@ -113,7 +153,7 @@ impl Plan {
             PathKind::Bare if is_large => (60, 3.0, 2, 20),
             PathKind::Bare => (3000, 2.0, 50, 5),
             _ if is_large => (3, 1.0, 0, 150),
-            _ => (100, 6.0, 2, 10),
+            _ => (200, 6.0, 2, 10),
         };
         let (count, seconds) = if quick { (count.min(100), seconds.min(0.5)) } else { (count, seconds) };
         Self { count, seconds, warm_up, patience: Duration::from_secs(patience) }

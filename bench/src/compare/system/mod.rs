@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
+pub(crate) use sgc::Sgc;
+
 use super::lab::{Lab, Side};
 use super::program::Program;
 

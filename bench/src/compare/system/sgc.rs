@@ -26,20 +26,23 @@ pub(crate) struct Sgc {
 
 /// Every transport with every suite, and the default transport with a router between.
 pub(crate) fn all(program: &Path) -> Result<Vec<Sgc>> {
-    let program = program.canonicalize().with_context(|| format!("{}: is it built?", program.display()))?;
-    let one = |scheme, suite, routers| Sgc { program: program.clone(), scheme, suite, routers };
+    let one = |scheme, suite, routers| Sgc::new(program, scheme, suite, routers);
     let pairs = SCHEMES.iter().flat_map(|scheme| SUITES.iter().map(move |suite| (scheme, suite)));
-    let mut systems: Vec<_> = pairs.map(|(scheme, suite)| one(scheme, suite, 0)).collect();
-    systems.extend(["group", "standard"].map(|suite| one("quic", suite, 1)));
-    Ok(systems)
+    let without = pairs.map(|(scheme, suite)| one(scheme, suite, 0));
+    without.chain(["group", "standard"].map(|suite| one("quic", suite, 1))).collect()
 }
 
 impl Sgc {
-    /// With so many routers in a row, the default transport, and a suite.
-    pub(crate) fn with_routers(program: &Path, suite: &'static str, routers: usize) -> Result<Self> {
-        let program =
-            program.canonicalize().with_context(|| format!("{}: is it built?", program.display()))?;
-        Ok(Self { program, scheme: "quic", suite, routers })
+    /// With so many routers in a row, each in a process of its own.
+    pub(crate) fn new(
+        program: &Path,
+        scheme: &'static str,
+        suite: &'static str,
+        routers: usize,
+    ) -> Result<Self> {
+        let program = program.canonicalize();
+        let program = program.with_context(|| "the program that is measured: is it built?")?;
+        Ok(Self { program, scheme, suite, routers })
     }
 
     fn start_node(&self, lab: &Lab, side: Side, node: &str, dir: &Path, text: &str) -> Result<Program> {
