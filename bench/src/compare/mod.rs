@@ -40,6 +40,8 @@ type Table = fn(&Compare, &mut Figures) -> Result<()>;
 const TABLES: [(&str, Table); 6] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    ("applications", applications::run),
+    ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
     ("applications", applications::run),
