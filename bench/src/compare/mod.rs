@@ -44,8 +44,6 @@ const TABLES: [(&str, Table); 6] = [
     ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
-    ("applications", applications::run),
-    ("fleet-step", fleet_step::run),
 ];
 
 /// What `compare` is given.
