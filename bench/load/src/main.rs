@@ -5,6 +5,7 @@
 //! takes orders from standard input ([`report::Order`]), and ends when that does. It measures; it judges nothing.
 #![deny(unsafe_code)]
 
+mod ask;
 #[allow(unsafe_code)]
 mod dds;
 mod flow;
@@ -31,6 +32,10 @@ enum Role {
     Ping(ping::PingArgs),
     /// Sends back what comes
     Pong(ping::PingArgs),
+    /// Sends requests and waits for the answer to each
+    Ask(ask::AskArgs),
+    /// Answers requests
+    Answer(ask::AnswerArgs),
     /// Sends messages
     Source(flow::SourceArgs),
     /// Counts messages and how old they were
@@ -67,6 +72,8 @@ fn main() -> Result<()> {
     match Cli::parse().role {
         Role::Ping(args) => ping::ping(&args),
         Role::Pong(args) => ping::pong(&args),
+        Role::Ask(args) => ask::ask(&args),
+        Role::Answer(args) => ask::answer(&args),
         Role::Source(args) => flow::source(&args),
         Role::Sink(args) => flow::sink(&args),
     }

@@ -25,6 +25,24 @@ pub(crate) enum Order {
         /// How long each is waited for.
         patience_seconds: f64,
     },
+    /// `ask`: requests.
+    Ask {
+        /// Bytes of a request, at least 20.
+        size: usize,
+        /// Bytes of an answer, at least 16.
+        answer: usize,
+        /// At most so many that count.
+        count: usize,
+        /// None begins after so long.
+        seconds: f64,
+        /// How many come first and do not count.
+        warm_up: usize,
+        /// How long each answer is waited for.
+        patience_seconds: f64,
+        /// Requests a second, of which those that fall due while an answer is awaited are left out; without it the next
+        /// follows upon the answer.
+        rate: Option<f64>,
+    },
     /// `source`: messages.
     Send {
         /// The number of this run, more than that of the one before; at least 1.
@@ -67,6 +85,19 @@ pub(crate) enum Event {
         round_trips_us: Vec<f64>,
         /// How many did not come back in time.
         lost: usize,
+    },
+    /// The answer to [`Order::Ask`].
+    Answered {
+        /// Bytes of a request.
+        size: usize,
+        /// From each request to its answer, in their order, µs.
+        round_trips_us: Vec<f64>,
+        /// How many were not answered in time.
+        lost: usize,
+        /// Before the first that counts, by the monotonic clock, ns.
+        begun_ns: u64,
+        /// After the last.
+        ended_ns: u64,
     },
     /// The answer to [`Order::Send`].
     Sent {

@@ -4,12 +4,17 @@
 //! that know nothing of it. A table is a module here and a row of [`TABLES`]; what it measures are [`figures::Figure`]s, which
 //! `report` turns into pages, plots and goals.
 
+mod applications;
 mod fan_out;
 mod figures;
+mod fleet_step;
 mod flow;
+mod goals;
 mod lab;
 mod multi_hop;
+mod plot;
 mod program;
+mod report;
 mod roaming;
 mod round_trip;
 mod system;
@@ -18,7 +23,6 @@ mod tcp;
 mod teleop;
 mod throughput;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -29,14 +33,17 @@ use lab::PathKind;
 use system::{Peers, System};
 
 pub(crate) use figures::Figures;
+pub(crate) use report::Run;
 
 /// Measures a table.
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 6] = [
+const TABLES: [(&str, Table); 8] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    ("applications", applications::run),
+    ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
     ("teleop", teleop::run),
@@ -66,6 +73,9 @@ pub(crate) struct CompareArgs {
     /// These paths alone: bare, paper, lossy
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     paths: Vec<String>,
+    /// Bytes of the image that each robot sends in a step of `fleet-step`: 640 × 480 pixels, compressed
+    #[arg(long, value_name = "BYTES", default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(64..))]
+    fleet_image: u32,
     /// A short run that shows that all parts work; its figures mean little
     #[arg(long)]
     quick: bool,
@@ -141,6 +151,11 @@ impl Compare {
         &self.args.sgc
     }
 
+    /// Bytes of an image of `fleet-step`.
+    pub(crate) fn fleet_image_bytes(&self) -> usize {
+        self.args.fleet_image as usize
+    }
+
     /// Whether figures need not mean anything.
     pub(crate) fn is_quick(&self) -> bool {
         self.args.quick
@@ -170,7 +185,8 @@ fn fits(pattern: &str, name: &str) -> bool {
     pattern.strip_suffix('*').map_or(pattern == name, |start| name.starts_with(start))
 }
 
-/// Runs what is asked for and writes `compare.json`.
+/// Runs what is asked for and writes figures, report and plots, anew after each table: what was measured is not lost with what
+/// was not.
 pub(crate) fn run(args: CompareArgs) -> Result<()> {
     let compare = Compare::new(args)?;
     let mut figures = Figures::default();
@@ -179,12 +195,13 @@ pub(crate) fn run(args: CompareArgs) -> Result<()> {
     }
     for (name, table) in TABLES {
         if is_among(&compare.args.only, name) {
-            table(&compare, &mut figures).with_context(|| format!("table {name}"))?;
+            if let Err(error) = table(&compare, &mut figures) {
+                figures.leave_out(&format!("the rest of {name}"), format!("{error:#}"));
+            }
+            let run = Run::here(figures.clone(), compare.is_quick());
+            run.write(&compare.args.out)?;
+            run.render(&compare.args.out)?;
         }
     }
-    let out = &compare.args.out;
-    fs::create_dir_all(out).with_context(|| out.display().to_string())?;
-    let path = out.join("compare.json");
-    let text = serde_json::to_string_pretty(&figures)? + "\n";
-    fs::write(&path, text).with_context(|| path.display().to_string())
+    Ok(())
 }

@@ -103,6 +103,12 @@ impl Program {
         writeln!(orders, "{order}").with_context(|| format!("{} takes no order", self.name))
     }
 
+    /// Tells one that takes no JSON a line.
+    pub(crate) fn tell(&mut self, line: &str) -> Result<()> {
+        let orders = self.orders.as_mut().context("a program without standard input")?;
+        writeln!(orders, "{line}").with_context(|| format!("{} takes no order", self.name))
+    }
+
     /// Its process id.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
