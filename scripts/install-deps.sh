@@ -2,7 +2,7 @@
 # Installs the Debian or Ubuntu packages that are missing, and nothing else.
 #   install-deps.sh build   what compiling the workspace needs
 #   install-deps.sh test    that, and what the test suite needs
-#   install-deps.sh bench   what `build` does, and what SGC is measured beside (make bench)
+#   install-deps.sh bench   what `build` does, what SGC is measured beside (make bench), and what counts instructions
 # A need is met when its probe succeeds, however it came here; only then unmet ones are installed, and it says which and why.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -68,6 +68,7 @@ if [ "$what" = bench ]; then
     need 'compiles c openssl/ssl.h' libssl-dev -- "DDS Security in the load generator's Cyclone DDS"
     need 'command -v ssh' openssh-client -- "files by SSH and SFTP"
     need 'test -x /usr/sbin/sshd' openssh-server -- "files by SSH and SFTP"
+    need 'command -v valgrind' valgrind -- "counts instructions (make bench-instructions)"
 fi
 [ ${#packages[@]} -gt 0 ] || exit 0
 
