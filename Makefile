@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -45,6 +45,9 @@ deps-build:
 
 deps-test:
 	@scripts/install-deps.sh test
+
+deps-bench:
+	@scripts/install-deps.sh bench
 
 peers:
 	@scripts/build-peers.sh
@@ -138,10 +141,15 @@ bench-teleop: deps-build
 bench-transports: deps-build
 	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- transports $(ARGS)
 
+# What `compare` runs beside `sgc`: the Zenoh bridge (minutes, the first time), and talkers with DDS Security.
+bench-peers: deps-bench
+	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
+		--target-dir bench/target/dds-security
+
 # Compares with bench/instructions.json and fails if something grew. ARGS=--accept takes what is for what is right, ARGS=seal
 # counts those with that in their names.
-bench-instructions:
-	@scripts/install-deps.sh bench
+bench-instructions: deps-bench
 	$(CARGO) bench --locked --manifest-path bench/Cargo.toml -p sgc-bench-instructions --bench hot -- $(ARGS)
 
 # How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
