@@ -29,9 +29,15 @@ impl BenchFleet {
 
     /// Writes the identity of a router where [`crate::process::SgcRouter`] looks for it.
     pub(crate) fn write_router(&self, dir: &Path) -> Result<()> {
+        self.write(dir, "router", true)
+    }
+
+    /// Writes `NODE.identity`, as `sgc fleet enroll` does.
+    pub(crate) fn write(&self, dir: &Path, node: &str, router: bool) -> Result<()> {
         let mut options = fs::OpenOptions::new();
-        let mut file = options.write(true).create_new(true).mode(0o600).open(dir.join("router.identity"))?;
-        Ok(file.write_all(self.issue("router", true)?.to_text().as_bytes())?)
+        let path = dir.join(format!("{node}.identity"));
+        let mut file = options.write(true).create_new(true).mode(0o600).open(path)?;
+        Ok(file.write_all(self.issue(node, router)?.to_text().as_bytes())?)
     }
 }
 

@@ -1,9 +1,10 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`forward`], [`rib`], [`first_message`], [`teleop`] and
+//! This file knows the command line. The parts are [`compare`], [`forward`], [`rib`], [`first_message`], [`teleop`] and
 //! [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
 #![forbid(unsafe_code)]
 
+mod compare;
 mod first_message;
 mod fleet;
 mod forward;
@@ -41,6 +42,10 @@ enum Command {
     Teleop(RunArgs),
     /// Links by every transport beside TCP and TLS; needs root for the part with losses
     Transports(RunArgs),
+    /// The pages and plots of a run of `compare`, once more from its figures
+    Report(ReportArgs),
+    /// SGC beside what users would pick instead, in one run over emulated paths; needs root
+    Compare(compare::CompareArgs),
     /// The far end of `transports`, in a process of its own
     #[command(hide = true)]
     ServeLinks(transports::ServeArgs),
@@ -62,6 +67,17 @@ enum Command {
         /// Single operations that are timed at that size
         samples: usize,
     },
+}
+
+/// What is rendered, and where to.
+#[derive(Args)]
+struct ReportArgs {
+    /// The `compare.json` of a run
+    #[arg(value_name = "FILE")]
+    run: PathBuf,
+    /// Where `report.md` and its plots go
+    #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
+    out: PathBuf,
 }
 
 /// What every part is given.
@@ -102,6 +118,8 @@ fn main() -> Result<()> {
         Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
         Command::Teleop(args) => part(&args, "teleop", teleop::run),
         Command::Transports(args) => part(&args, "transports", transports::run),
+        Command::Report(args) => compare::Run::read(&args.run)?.render(&args.out),
+        Command::Compare(args) => compare::run(args),
         Command::MeasureLinks(args) => transports::measure_memory_here(&args),
         Command::ServeLinks(args) => transports::serve(&args),
         Command::ServeTcp => forward::tcp::serve(),

@@ -143,6 +143,17 @@ pub(crate) fn own_cpu_seconds() -> f64 {
     cpu_seconds("/proc/self/task")
 }
 
+/// CPU time that the threads of a process have taken, those that have ended not counted, seconds.
+pub(crate) fn cpu_seconds_of(pid: u32) -> f64 {
+    cpu_seconds(&format!("/proc/{pid}/task"))
+}
+
+/// Resident memory of a process, bytes: now, and the most it ever was.
+pub(crate) fn resident_bytes_of(pid: u32) -> (u64, u64) {
+    let status = format!("/proc/{pid}/status");
+    (field_kib(&status, "VmRSS") * 1024, field_kib(&status, "VmHWM") * 1024)
+}
+
 fn cpu_seconds(tasks: &str) -> f64 {
     let spent = |task: fs::DirEntry| {
         let text = fs::read_to_string(task.path().join("schedstat")).ok()?;

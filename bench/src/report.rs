@@ -23,12 +23,20 @@ pub(crate) struct Table {
 }
 
 /// Where it was measured: enough to compare by, nothing that tells whose machine it is.
-#[derive(Serialize)]
-struct Machine {
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct Machine {
     cpu: String,
     cores: usize,
+    /// Those instructions that ciphers and hashes are made of, as far as this CPU has them.
+    #[serde(default)]
+    instructions: Vec<String>,
+    /// Whether a hypervisor is below.
+    #[serde(default)]
+    is_virtual: bool,
     memory_gib: u64,
     kernel: String,
+    #[serde(default)]
+    system: String,
     /// Processes that wanted a core, mean of the last minute; the benchmark's own count too.
     load: f64,
 }
@@ -40,8 +48,7 @@ impl Report {
 
     /// Prints the tables, Markdown.
     pub(crate) fn print(&self) {
-        let Machine { cpu, cores, memory_gib, kernel, load } = &self.machine;
-        println!("Machine: {cpu}, {cores} cores, {memory_gib} GiB, Linux {kernel}, load {load}\n");
+        println!("Machine: {}\n", self.machine.sentence());
         for table in &self.tables {
             println!("{}\n", table.title);
             println!("| {} |", table.columns.join(" | "));
@@ -62,19 +69,49 @@ impl Report {
     }
 }
 
+/// What of `/proc/cpuinfo` decides how fast ciphers and hashes are.
+const INSTRUCTIONS: [&str; 7] = ["aes", "vaes", "pclmulqdq", "sha_ni", "avx2", "avx512f", "sha2"];
+
 impl Machine {
-    fn here() -> Self {
+    /// This one.
+    pub(crate) fn here() -> Self {
         let read = |path| fs::read_to_string(path).unwrap_or_default();
         let cpu = read("/proc/cpuinfo");
-        let cpu = cpu.lines().find_map(|l| l.strip_prefix("model name")).unwrap_or_default();
+        let line = |name: &str| {
+            let line = cpu.lines().find_map(|l| l.strip_prefix(name));
+            line.unwrap_or_default().trim_start_matches(['\t', ' ', ':'])
+        };
+        let flags: Vec<_> = line("flags").split(' ').chain(line("Features").split(' ')).collect();
         let load = read("/proc/loadavg");
+        let os = read("/etc/os-release");
+        let system = os.lines().find_map(|l| l.strip_prefix("PRETTY_NAME=")).unwrap_or_default();
         Self {
-            cpu: cpu.trim_start_matches(['\t', ' ', ':']).to_owned(),
+            cpu: line("model name").to_owned(),
             cores: std::thread::available_parallelism().map_or(0, usize::from),
+            instructions: INSTRUCTIONS
+                .into_iter()
+                .filter(|name| flags.contains(name))
+                .map(str::to_owned)
+                .collect(),
+            is_virtual: flags.contains(&"hypervisor"),
             memory_gib: crate::process::memory_kib("MemTotal") / (1 << 20),
             kernel: read("/proc/sys/kernel/osrelease").trim().to_owned(),
+            system: system.trim_matches('"').to_owned(),
             load: load.split(' ').next().and_then(|l| l.parse().ok()).unwrap_or(0.0),
         }
+    }
+
+    /// All of it in a line.
+    pub(crate) fn sentence(&self) -> String {
+        let Self { cpu, cores, instructions, is_virtual, memory_gib, kernel, system, load } = self;
+        let cpu = if cpu.is_empty() { "a CPU without a name" } else { cpu };
+        let instructions =
+            if instructions.is_empty() { String::new() } else { format!(" ({})", instructions.join(", ")) };
+        let place = if *is_virtual { ", virtual" } else { "" };
+        let system = if system.is_empty() { String::new() } else { format!(", {system}") };
+        format!(
+            "{cpu}{instructions}, {cores} cores{place}, {memory_gib} GiB, Linux {kernel}{system}, load {load}"
+        )
     }
 }
 

@@ -11,7 +11,8 @@ use sgc_transport::LinkUrl;
 pub(crate) const SCHEMES: [&str; 7] = ["quic", "dtls", "udp", "tls", "tcp", "ws", "wss"];
 /// The address of the far end.
 pub(crate) const FAR: &str = "10.77.0.2";
-const NEAR: &str = "10.77.0.1";
+/// The address of the near end.
+pub(crate) const NEAR: &str = "10.77.0.1";
 const MTU: u16 = 1500;
 const SEED: u64 = 9;
 

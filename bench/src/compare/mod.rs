@@ -1,8 +1,186 @@
 //! `compare`: SGC and what a user would pick instead, side by side in one run over one emulated network.
 //!
-//! What is compared is a [`System`] between two places of a [`Lab`]: it carries topics of programs that know nothing of it.
-//! A table is a module here; what it measures are [`Figure`]s, which `report` turns into pages, plots and goals.
+//! What is compared is a [`System`](system::System) between two places of a [`Lab`](lab::Lab): it carries topics of programs
+//! that know nothing of it. A table is a module here and a row of [`TABLES`]; what it measures are [`figures::Figure`]s, which
+//! `report` turns into pages, plots and goals.
 
+mod applications;
+mod fan_out;
 mod figures;
+mod fleet_step;
+mod flow;
+mod goals;
+mod lab;
+mod multi_hop;
+mod plot;
+mod program;
+mod report;
+mod round_trip;
+mod system;
+mod tally;
+mod tcp;
+mod throughput;
 
-pub(crate) use figures::{Figure, Figures};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use sgc_testkit::netsim;
+
+use lab::PathKind;
+use system::System;
+
+pub(crate) use figures::Figures;
+pub(crate) use report::Run;
+
+/// Measures a table.
+type Table = fn(&Compare, &mut Figures) -> Result<()>;
+
+/// Every table, in the order of the report.
+const TABLES: [(&str, Table); 6] = [
+    ("round-trip", round_trip::run),
+    ("throughput", throughput::run),
+    ("applications", applications::run),
+    ("fleet-step", fleet_step::run),
+    ("fan-out", fan_out::run),
+    ("multi-hop", multi_hop::run),
+];
+
+/// What `compare` is given.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CompareArgs {
+    /// The program that is measured
+    #[arg(long, value_name = "FILE", default_value = "target/release/sgc")]
+    sgc: PathBuf,
+    /// The program that talks and listens; without it the `load` beside this one
+    #[arg(long, value_name = "FILE")]
+    load: Option<PathBuf>,
+    /// Where the results go
+    #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
+    out: PathBuf,
+    /// These tables alone
+    #[arg(long, value_name = "TABLE,…", value_delimiter = ',')]
+    only: Vec<String>,
+    /// These systems alone; a name that ends in * stands for all that begin so
+    #[arg(long, value_name = "SYSTEM,…", value_delimiter = ',')]
+    systems: Vec<String>,
+    /// These paths alone: bare, paper, lossy
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    paths: Vec<String>,
+    /// Bytes of the image that each robot sends in a step of `fleet-step`: 640 × 480 pixels, compressed
+    #[arg(long, value_name = "BYTES", default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(64..))]
+    fleet_image: u32,
+    /// A short run that shows that all parts work; its figures mean little
+    #[arg(long)]
+    quick: bool,
+}
+
+/// A run: what is measured, and how.
+pub(crate) struct Compare {
+    args: CompareArgs,
+    load: PathBuf,
+    systems: Vec<Box<dyn System>>,
+}
+
+impl Compare {
+    fn new(args: CompareArgs) -> Result<Self> {
+        netsim::on_host().context("network namespaces are needed, which take root")?;
+        let load = match &args.load {
+            Some(load) => load.clone(),
+            None => std::env::current_exe()?.with_file_name("load"),
+        };
+        let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
+        let mut systems = system::all(&args.sgc)?;
+        let mut names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        names.push(tcp::NAME.to_owned());
+        for pattern in &args.systems {
+            ensure!(
+                names.iter().any(|name| fits(pattern, name)),
+                "no system {pattern:?}: {}",
+                names.join(", ")
+            );
+        }
+        systems.retain(|system| is_among(&args.systems, &system.name()));
+        for only in &args.only {
+            let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
+            ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
+        }
+        Ok(Self { args, load, systems })
+    }
+
+    /// What is compared in this run.
+    pub(crate) fn systems(&self) -> &[Box<dyn System>] {
+        &self.systems
+    }
+
+    /// Whether a system is asked for, whatever kind of thing it is.
+    pub(crate) fn wants(&self, system: &str) -> bool {
+        is_among(&self.args.systems, system)
+    }
+
+    /// Whether a path is asked for.
+    pub(crate) fn wants_path(&self, kind: &PathKind) -> bool {
+        self.args.paths.is_empty() || self.args.paths.iter().any(|path| path == kind.name())
+    }
+
+    /// The program that talks and listens.
+    pub(crate) fn load(&self) -> &Path {
+        &self.load
+    }
+
+    /// The program that is measured.
+    pub(crate) fn sgc(&self) -> &Path {
+        &self.args.sgc
+    }
+
+    /// Bytes of an image of `fleet-step`.
+    pub(crate) fn fleet_image_bytes(&self) -> usize {
+        self.args.fleet_image as usize
+    }
+
+    /// Whether figures need not mean anything.
+    pub(crate) fn is_quick(&self) -> bool {
+        self.args.quick
+    }
+
+    /// How often each system has its turn.
+    pub(crate) fn rounds(&self, kind: &PathKind) -> usize {
+        match kind {
+            _ if self.is_quick() => 1,
+            PathKind::Bare => 3,
+            // Here the path says how long it takes, and not the machine.
+            _ => 1,
+        }
+    }
+
+    /// Says how far it is.
+    pub(crate) fn note(&self, what: &str) {
+        eprintln!("{what}");
+    }
+}
+
+fn is_among(patterns: &[String], name: &str) -> bool {
+    patterns.is_empty() || patterns.iter().any(|pattern| fits(pattern, name))
+}
+
+fn fits(pattern: &str, name: &str) -> bool {
+    pattern.strip_suffix('*').map_or(pattern == name, |start| name.starts_with(start))
+}
+
+/// Runs what is asked for and writes figures, report and plots, anew after each table: what was measured is not lost with what
+/// was not.
+pub(crate) fn run(args: CompareArgs) -> Result<()> {
+    let compare = Compare::new(args)?;
+    let mut figures = Figures::default();
+    for (name, table) in TABLES {
+        if is_among(&compare.args.only, name) {
+            if let Err(error) = table(&compare, &mut figures) {
+                figures.leave_out(&format!("the rest of {name}"), format!("{error:#}"));
+            }
+            let run = Run::here(figures.clone(), compare.is_quick());
+            run.write(&compare.args.out)?;
+            run.render(&compare.args.out)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,418 @@
+//! Cyclone DDS as this program needs it: one participant, typed readers and writers of one type, a wait set.
+//!
+//! The only file with `unsafe`. Knows nothing of what is measured.
+
+use std::ffi::{CStr, CString, c_void};
+use std::ptr::{null, null_mut};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use cyclors::*;
+
+use crate::types;
+
+/// Samples that are taken at once.
+const TAKE_MAX: usize = 128;
+/// How long a write may wait for room before it is tried again.
+const WRITE_BLOCK_MAX: Duration = Duration::from_secs(1);
+
+/// Something of Cyclone's that is deleted on drop.
+#[derive(Debug)]
+struct Entity(dds_entity_t);
+
+impl Entity {
+    fn new(handle: dds_entity_t) -> Result<Self> {
+        check(handle)?;
+        Ok(Self(handle))
+    }
+
+    fn guid(&self) -> Result<[u8; 16]> {
+        let mut guid = dds_guid_t { v: [0; 16] };
+        // SAFETY: Cyclone checks the handle; `guid` is a valid place.
+        check(unsafe { dds_get_guid(self.0, &mut guid) })?;
+        Ok(guid.v)
+    }
+}
+
+impl Drop for Entity {
+    fn drop(&mut self) {
+        // SAFETY: takes a number, which Cyclone checks.
+        unsafe { dds_delete(self.0) };
+    }
+}
+
+/// What Cyclone says of a return code, unless it is well.
+fn check(code: dds_return_t) -> Result<()> {
+    if code < 0 {
+        // SAFETY: returns a constant string for every argument.
+        bail!("Cyclone: {}", unsafe { CStr::from_ptr(dds_strretcode(code)) }.to_string_lossy());
+    }
+    Ok(())
+}
+
+/// How a topic is carried.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Quality {
+    /// Reliable, or best effort.
+    pub(crate) reliable: bool,
+    /// The newest so many messages are kept; 0 keeps all that are not acknowledged yet, so that writing waits.
+    pub(crate) depth: u32,
+}
+
+/// One message as Cyclone has it in memory: `{ uint64 seq; uint64 stamp_ns; sequence<octet> data }`.
+#[repr(C)]
+struct Sample {
+    seq: u64,
+    stamp_ns: u64,
+    data: dds_sequence_t,
+}
+
+/// One message, borrowed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Message<'a> {
+    /// Its number.
+    pub(crate) seq: u64,
+    /// When it was written, by the clock of [`crate::now_ns`].
+    pub(crate) stamp_ns: u64,
+    /// The rest.
+    pub(crate) data: &'a [u8],
+}
+
+/// A participant in a domain. Readers and writers have to go before it.
+#[derive(Debug)]
+pub(crate) struct Network {
+    participant: Entity,
+    guid: [u8; 16],
+}
+
+impl Network {
+    /// Joins a domain, with the configuration that `CYCLONEDDS_URI` says.
+    pub(crate) fn join(domain: u32) -> Result<Self> {
+        let qos = Qos::new()?;
+        // As every participant of ROS 2 has it.
+        const ENCLAVE: &[u8] = b"enclave=/;";
+        // SAFETY: pointer and length are those of a slice, which is copied; the object outlives the call.
+        let handle = unsafe {
+            dds_qset_userdata(qos.0, ENCLAVE.as_ptr().cast(), ENCLAVE.len());
+            dds_create_participant(domain, qos.0, null())
+        };
+        let participant = Entity::new(handle).with_context(|| format!("domain {domain}"))?;
+        let guid = participant.guid()?;
+        Ok(Self { participant, guid })
+    }
+
+    /// The GUID of the participant.
+    pub(crate) fn guid(&self) -> [u8; 16] {
+        self.guid
+    }
+
+    fn topic(&self, descriptor: &types::Descriptor, name: &str) -> Result<Entity> {
+        let name = CString::new(name)?;
+        let native = descriptor.native();
+        // SAFETY: descriptor, instructions and name are valid for the call, which copies them.
+        Entity::new(unsafe { dds_create_topic(self.participant.0, &native, name.as_ptr(), null(), null()) })
+    }
+}
+
+/// Cyclone's QoS object.
+struct Qos(*mut dds_qos_t);
+
+impl Qos {
+    fn new() -> Result<Self> {
+        // SAFETY: allocates.
+        let qos = unsafe { dds_create_qos() };
+        if qos.is_null() { bail!("out of memory") } else { Ok(Self(qos)) }
+    }
+
+    fn of(quality: Quality, transient_local: bool) -> Result<Self> {
+        let qos = Self::new()?;
+        let reliability = match quality.reliable {
+            true => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
+            false => dds_reliability_kind_DDS_RELIABILITY_BEST_EFFORT,
+        };
+        let (history, depth) = match quality.depth {
+            0 => (dds_history_kind_DDS_HISTORY_KEEP_ALL, 0),
+            depth => (dds_history_kind_DDS_HISTORY_KEEP_LAST, i32::try_from(depth)?),
+        };
+        // SAFETY: the object is valid, setters copy.
+        unsafe {
+            dds_qset_reliability(qos.0, reliability, WRITE_BLOCK_MAX.as_nanos() as i64);
+            dds_qset_history(qos.0, history, depth);
+            if transient_local {
+                dds_qset_durability(qos.0, dds_durability_kind_DDS_DURABILITY_TRANSIENT_LOCAL);
+            }
+        }
+        Ok(qos)
+    }
+}
+
+impl Drop for Qos {
+    fn drop(&mut self) {
+        // SAFETY: made by `dds_create_qos`, deleted once.
+        unsafe { dds_delete_qos(self.0) }
+    }
+}
+
+/// A publisher. Fields go in this order.
+#[derive(Debug)]
+pub(crate) struct Writer {
+    entity: Entity,
+    _topic: Entity,
+}
+
+impl Writer {
+    /// On the ROS 2 topic `/name`.
+    pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        Self::of(network, &types::MESSAGE, &types::dds_name(name), quality, false)
+    }
+
+    /// The writer of the ROS graph, as every node has one.
+    pub(crate) fn of_graph(network: &Network) -> Result<Self> {
+        let quality = Quality { reliable: true, depth: 1 };
+        Self::of(network, &types::GRAPH, "ros_discovery_info", quality, true)
+    }
+
+    fn of(
+        network: &Network,
+        descriptor: &types::Descriptor,
+        dds_name: &str,
+        quality: Quality,
+        transient_local: bool,
+    ) -> Result<Self> {
+        let topic = network.topic(descriptor, dds_name)?;
+        let qos = Qos::of(quality, transient_local)?;
+        // SAFETY: Cyclone checks the handles; the QoS outlives the call.
+        let handle = unsafe { dds_create_writer(network.participant.0, topic.0, qos.0, null()) };
+        let entity = Entity::new(handle).with_context(|| format!("a writer of {dds_name}"))?;
+        let mask = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;
+        // SAFETY: takes numbers.
+        check(unsafe { dds_set_status_mask(entity.0, mask) })?;
+        Ok(Self { entity, _topic: topic })
+    }
+
+    /// Its GUID.
+    pub(crate) fn guid(&self) -> Result<[u8; 16]> {
+        self.entity.guid()
+    }
+
+    /// Readers that it has found.
+    pub(crate) fn matched(&self) -> Result<u32> {
+        // SAFETY: plain numbers, of which zeros are a value.
+        let mut status: dds_publication_matched_status_t = unsafe { std::mem::zeroed() };
+        // SAFETY: Cyclone checks the handle; `status` is a valid place.
+        check(unsafe { dds_get_publication_matched_status(self.entity.0, &mut status) })?;
+        Ok(status.current_count)
+    }
+
+    /// Writes. False if there was no room for a second, in which case nothing was written.
+    pub(crate) fn write(&self, message: &Message<'_>) -> Result<bool> {
+        let sample =
+            Sample { seq: message.seq, stamp_ns: message.stamp_ns, data: types::sequence(message.data) };
+        // SAFETY: the sample is of the type of the topic and lives through the call, which reads it only.
+        self.write_raw(unsafe { dds_write(self.entity.0, (&raw const sample).cast()) })
+    }
+
+    /// Says which node the endpoints of this participant belong to. For a writer [`Self::of_graph`].
+    pub(crate) fn announce(
+        &self,
+        network: &Network,
+        node: &CStr,
+        readers: &[[u8; 16]],
+        writers: &[[u8; 16]],
+    ) -> Result<()> {
+        let entities = types::NodeEntities {
+            namespace: c"/".as_ptr(),
+            name: node.as_ptr(),
+            readers: types::sequence(readers),
+            writers: types::sequence(writers),
+        };
+        let entities = [entities];
+        let info = types::ParticipantEntities { gid: network.guid(), nodes: types::sequence(&entities) };
+        // SAFETY: as in `write`; strings and sequences live through the call.
+        self.write_raw(unsafe { dds_write(self.entity.0, (&raw const info).cast()) })?;
+        Ok(())
+    }
+
+    fn write_raw(&self, code: dds_return_t) -> Result<bool> {
+        if code == DDS_RETCODE_TIMEOUT {
+            return Ok(false);
+        }
+        check(code)?;
+        Ok(true)
+    }
+
+    /// Waits until the readers that it has found have acknowledged all. False if that took too long.
+    pub(crate) fn until_acknowledged(&self, timeout: Duration) -> Result<bool> {
+        // SAFETY: takes numbers.
+        self.write_raw(unsafe { dds_wait_for_acks(self.entity.0, nanoseconds(timeout)) })
+    }
+}
+
+/// A subscriber. Fields go in this order.
+#[derive(Debug)]
+pub(crate) struct Reader {
+    condition: Entity,
+    entity: Entity,
+    _topic: Entity,
+}
+
+impl Reader {
+    /// On the ROS 2 topic `/name`.
+    pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        let topic = network.topic(&types::MESSAGE, &types::dds_name(name))?;
+        let qos = Qos::of(quality, false)?;
+        // SAFETY: Cyclone checks the handles; the QoS outlives the call.
+        let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, null()) };
+        let entity = Entity::new(handle).with_context(|| format!("a reader of {name}"))?;
+        let mask = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
+        // SAFETY: take numbers.
+        let condition = unsafe {
+            check(dds_set_status_mask(entity.0, mask))?;
+            dds_create_readcondition(entity.0, DDS_ANY_STATE)
+        };
+        Ok(Self { condition: Entity::new(condition)?, entity, _topic: topic })
+    }
+
+    /// Its GUID.
+    pub(crate) fn guid(&self) -> Result<[u8; 16]> {
+        self.entity.guid()
+    }
+
+    /// Writers that it has found.
+    pub(crate) fn matched(&self) -> Result<u32> {
+        // SAFETY: plain numbers, of which zeros are a value.
+        let mut status: dds_subscription_matched_status_t = unsafe { std::mem::zeroed() };
+        // SAFETY: Cyclone checks the handle; `status` is a valid place.
+        check(unsafe { dds_get_subscription_matched_status(self.entity.0, &mut status) })?;
+        Ok(status.current_count)
+    }
+
+    /// Takes all that is there.
+    pub(crate) fn take(&self, mut handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
+        loop {
+            let mut samples: [*mut c_void; TAKE_MAX] = [null_mut(); TAKE_MAX];
+            // SAFETY: plain data, of which zeros are a value.
+            let mut infos: [dds_sample_info_t; TAKE_MAX] = unsafe { std::mem::zeroed() };
+            let (buffer, limit) = (samples.as_mut_ptr(), TAKE_MAX);
+            // SAFETY: both arrays have as many places as is said; null pointers ask for a loan.
+            let taken = unsafe { dds_take(self.entity.0, buffer, infos.as_mut_ptr(), limit, limit as u32) };
+            check(taken)?;
+            let taken = taken as usize;
+            let mut outcome = Ok(());
+            for (sample, info) in samples.iter().zip(&infos).take(taken) {
+                if !info.valid_data || outcome.is_err() {
+                    continue;
+                }
+                // SAFETY: a valid sample of the topic's type, ours until the loan is returned.
+                let sample = unsafe { &*sample.cast::<Sample>() };
+                // SAFETY: Cyclone made the sequence from what it received.
+                let data = unsafe { slice(&sample.data) };
+                outcome = handle(Message { seq: sample.seq, stamp_ns: sample.stamp_ns, data });
+            }
+            if taken > 0 {
+                // SAFETY: what was lent above.
+                check(unsafe { dds_return_loan(self.entity.0, buffer, taken as i32) })?;
+            }
+            outcome?;
+            if taken < TAKE_MAX {
+                return Ok(());
+            }
+        }
+    }
+}
+
+/// Rings from any thread.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Bell(dds_entity_t);
+
+impl Bell {
+    /// Wakes whoever waits.
+    pub(crate) fn ring(self) {
+        // SAFETY: takes numbers; Cyclone refuses a handle that is gone.
+        unsafe { dds_set_guardcondition(self.0, true) };
+    }
+}
+
+/// Waits for messages, matches and a bell.
+#[derive(Debug)]
+pub(crate) struct Waiter {
+    set: Entity,
+    bell: Entity,
+    sources: usize,
+}
+
+/// What a wait ended for.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Woken {
+    /// Readers that have messages, by the number under which they were attached.
+    pub(crate) readers: Vec<usize>,
+}
+
+/// The attachment of everything that is no reader's messages.
+const OTHER: dds_attach_t = -1;
+
+impl Waiter {
+    /// Waits for nothing but its bell yet.
+    pub(crate) fn new(network: &Network) -> Result<Self> {
+        let participant = network.participant.0;
+        // SAFETY: take numbers.
+        let (set, bell) =
+            unsafe { (dds_create_waitset(participant), dds_create_guardcondition(participant)) };
+        let mut waiter = Self { set: Entity::new(set)?, bell: Entity::new(bell)?, sources: 0 };
+        waiter.attach(waiter.bell.0, OTHER)?;
+        Ok(waiter)
+    }
+
+    fn attach(&mut self, handle: dds_entity_t, as_what: dds_attach_t) -> Result<()> {
+        // SAFETY: takes numbers.
+        check(unsafe { dds_waitset_attach(self.set.0, handle, as_what) })?;
+        self.sources += 1;
+        Ok(())
+    }
+
+    /// Messages and matches of a reader.
+    pub(crate) fn attach_reader(&mut self, reader: &Reader, number: usize) -> Result<()> {
+        self.attach(reader.condition.0, dds_attach_t::try_from(number)?)?;
+        self.attach(reader.entity.0, OTHER)
+    }
+
+    /// Matches of a writer.
+    pub(crate) fn attach_writer(&mut self, writer: &Writer) -> Result<()> {
+        self.attach(writer.entity.0, OTHER)
+    }
+
+    /// What wakes it from other threads.
+    pub(crate) fn bell(&self) -> Bell {
+        Bell(self.bell.0)
+    }
+
+    /// Waits for any of it, or until the time is over.
+    pub(crate) fn wait(&self, timeout: Duration) -> Result<Woken> {
+        let mut woken: Vec<dds_attach_t> = vec![OTHER; self.sources];
+        // SAFETY: `woken` has as many places as is said.
+        let count =
+            unsafe { dds_waitset_wait(self.set.0, woken.as_mut_ptr(), woken.len(), nanoseconds(timeout)) };
+        check(count)?;
+        let mut rung = false;
+        // SAFETY: takes a number and a valid place.
+        check(unsafe { dds_take_guardcondition(self.bell.0, &mut rung) })?;
+        let readers = woken.iter().take(count as usize).filter_map(|&w| usize::try_from(w).ok());
+        Ok(Woken { readers: readers.collect() })
+    }
+}
+
+/// What a sequence holds.
+///
+/// # Safety
+/// The sequence is Cyclone's, and nobody writes to it meanwhile.
+unsafe fn slice(sequence: &dds_sequence_t) -> &[u8] {
+    if sequence._buffer.is_null() || sequence._length == 0 {
+        return &[];
+    }
+    // SAFETY: by contract.
+    unsafe { std::slice::from_raw_parts(sequence._buffer, sequence._length as usize) }
+}
+
+fn nanoseconds(duration: Duration) -> i64 {
+    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
+}

@@ -1,0 +1,86 @@
+//! `load`: talkers and listeners for benchmarks. Plain Cyclone DDS programs with a ROS 2 node's names, which know nothing of
+//! what carries their topics.
+//!
+//! This file knows the command line. Each role says on standard output, in lines of JSON, what happened ([`report::Event`]),
+//! takes orders from standard input ([`report::Order`]), and ends when that does. It measures; it judges nothing.
+#![deny(unsafe_code)]
+
+mod ask;
+#[allow(unsafe_code)]
+mod dds;
+mod flow;
+mod node;
+mod ping;
+mod report;
+mod types;
+
+use anyhow::Result;
+use clap::{Args, Parser, Subcommand};
+
+use dds::Quality;
+
+/// Talkers and listeners for benchmarks, on Cyclone DDS. `CYCLONEDDS_URI` says how they join.
+#[derive(Parser)]
+struct Cli {
+    #[command(subcommand)]
+    role: Role,
+}
+
+#[derive(Subcommand)]
+enum Role {
+    /// Sends messages and waits for each to come back
+    Ping(ping::PingArgs),
+    /// Sends back what comes
+    Pong(ping::PingArgs),
+    /// Sends requests and waits for the answer to each
+    Ask(ask::AskArgs),
+    /// Answers requests
+    Answer(ask::AnswerArgs),
+    /// Sends messages
+    Source(flow::SourceArgs),
+    /// Counts messages and how old they were
+    Sink(flow::SinkArgs),
+}
+
+/// What every role is given.
+#[derive(Args, Clone, Debug)]
+struct Common {
+    /// The domain
+    #[arg(long, default_value_t = 0)]
+    domain: u32,
+    /// The name of the ROS 2 node
+    #[arg(long, default_value = "load")]
+    node: String,
+    /// The topic, as ROS 2 calls it
+    #[arg(long, value_name = "/TOPIC")]
+    topic: String,
+    /// Reliable, instead of best effort
+    #[arg(long)]
+    reliable: bool,
+    /// How many messages are kept; 0 keeps all that are not acknowledged, and writing waits for room
+    #[arg(long, default_value_t = 10)]
+    depth: u32,
+}
+
+impl Common {
+    fn quality(&self) -> Quality {
+        Quality { reliable: self.reliable, depth: self.depth }
+    }
+}
+
+fn main() -> Result<()> {
+    match Cli::parse().role {
+        Role::Ping(args) => ping::ping(&args),
+        Role::Pong(args) => ping::pong(&args),
+        Role::Ask(args) => ask::ask(&args),
+        Role::Answer(args) => ask::answer(&args),
+        Role::Source(args) => flow::source(&args),
+        Role::Sink(args) => flow::sink(&args),
+    }
+}
+
+/// The clock that all processes of a host share, nanoseconds.
+fn now_ns() -> u64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}

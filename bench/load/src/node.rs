@@ -1,0 +1,73 @@
+//! A ROS 2 node: a participant whose readers and writers are told of in `ros_discovery_info`.
+
+use std::ffi::CString;
+use std::time::Duration;
+
+use anyhow::Result;
+
+use crate::Common;
+use crate::dds::{Network, Reader, Waiter, Writer};
+use crate::report::{Event, Next, Orders, say};
+
+/// How long is waited where only an event ends the wait.
+pub(crate) const LONG: Duration = Duration::from_secs(3600);
+/// How often an unanswered first message is said again.
+pub(crate) const HELLO_EVERY: Duration = Duration::from_millis(20);
+
+/// Fields go in this order.
+pub(crate) struct Node {
+    pub(crate) readers: Vec<Reader>,
+    pub(crate) writers: Vec<Writer>,
+    pub(crate) waiter: Waiter,
+    pub(crate) orders: Orders,
+    _graph: Writer,
+    _network: Network,
+}
+
+impl Node {
+    /// Up, and told of, when this returns.
+    pub(crate) fn start(
+        common: &Common,
+        read: impl IntoIterator<Item = String>,
+        write: impl IntoIterator<Item = String>,
+    ) -> Result<Self> {
+        let network = Network::join(common.domain)?;
+        let graph = Writer::of_graph(&network)?;
+        let quality = common.quality();
+        let mut waiter = Waiter::new(&network)?;
+        let mut readers = Vec::new();
+        for topic in read {
+            let reader = Reader::new(&network, &topic, quality)?;
+            waiter.attach_reader(&reader, readers.len())?;
+            readers.push(reader);
+        }
+        let mut writers = Vec::new();
+        for topic in write {
+            let writer = Writer::new(&network, &topic, quality)?;
+            waiter.attach_writer(&writer)?;
+            writers.push(writer);
+        }
+        let reader_ids = readers.iter().map(Reader::guid).collect::<Result<Vec<_>>>()?;
+        let writer_ids = writers.iter().map(Writer::guid).collect::<Result<Vec<_>>>()?;
+        graph.announce(&network, &CString::new(&*common.node)?, &reader_ids, &writer_ids)?;
+        let orders = Orders::listen(waiter.bell());
+        say(&Event::Up)?;
+        Ok(Self { readers, writers, waiter, orders, _graph: graph, _network: network })
+    }
+
+    /// Waits until every reader and writer has found somebody, and says so; or false, if the program is to end.
+    pub(crate) fn until_matched(&self) -> Result<bool> {
+        loop {
+            let readers = self.readers.iter().map(Reader::matched);
+            let mut matched = readers.chain(self.writers.iter().map(Writer::matched));
+            if matched.try_fold(true, |all, one| Ok::<_, anyhow::Error>(all && one? > 0))? {
+                say(&Event::Matched)?;
+                return Ok(true);
+            }
+            if matches!(self.orders.next()?, Next::End) {
+                return Ok(false);
+            }
+            self.waiter.wait(LONG)?;
+        }
+    }
+}

@@ -1,0 +1,65 @@
+//! Table `fan-out`: one publisher and many subscribers at the other place, which share a process and its local network.
+//!
+//! At a steady rate, how old messages were when they were taken; as fast as they are taken, how many arrived at all
+//! subscribers together.
+
+use anyhow::Result;
+
+use super::flow::{Flow, FlowSpec, Order};
+use super::lab::{Lab, PathKind, Side};
+use super::system::{System, Topic};
+use super::tally::Tally;
+use super::{Compare, Figures};
+
+const TOPIC: &str = "/bench/fan";
+/// Subscribers.
+const SINKS: [usize; 3] = [1, 10, 100];
+const BYTES: usize = 1000;
+/// Messages a second of the steady part.
+const RATE: f64 = 100.0;
+const RUN_SECONDS: f64 = 2.0;
+const WARM_UP_SECONDS: f64 = 0.3;
+
+/// Measures it.
+pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
+    let kind = PathKind::Bare;
+    if !compare.wants_path(&kind) {
+        return Ok(());
+    }
+    let mut tally = Tally::new("fan-out");
+    for round in 0..compare.rounds(&kind) {
+        for system in compare.systems() {
+            let name = system.name();
+            compare.note(&format!("fan-out, round {round}: {name}"));
+            for sinks in SINKS {
+                if let Err(error) = measure(compare, &**system, sinks, &mut tally) {
+                    figures.leave_out(&format!("fan-out {name} to {sinks}"), format!("{error:#}"));
+                }
+            }
+        }
+    }
+    tally.write(figures);
+    Ok(())
+}
+
+fn measure(compare: &Compare, system: &dyn System, sinks: usize, tally: &mut Tally) -> Result<()> {
+    let (kind, name) = (PathKind::Bare, system.name());
+    let lab = Lab::new(kind, compare.load())?;
+    let topics = [Topic { name: TOPIC, towards: Side::Right, reliable: true }];
+    let running = system.start(&lab, &topics)?;
+    let spec = FlowSpec { topic: TOPIC, from: Side::Left, readers: sinks, reliable: true, depth: 0 };
+    let mut flow = Flow::start(&lab, &running, &spec)?;
+    let part = if compare.is_quick() { 0.2 } else { 1.0 };
+    let order = |seconds: f64, rate| Order { size: BYTES, count: u32::MAX, seconds: seconds * part, rate };
+    flow.run(&running, &order(WARM_UP_SECONDS, Some(RATE)))?;
+    let steady = flow.run(&running, &order(RUN_SECONDS, Some(RATE)))?;
+    let fast = flow.run(&running, &order(RUN_SECONDS, None))?;
+    let mut add = |metric, value| tally.add(&name, kind.name(), sinks as u64, metric, value);
+    add("p50_us", steady.age_us[0]);
+    add("p99_us", steady.age_us[1]);
+    add("max_us", steady.age_us[2]);
+    add("per_second", fast.arrived() / fast.seconds);
+    add("lost", steady.lost() + fast.lost());
+    add("cpu_us_per_message", fast.cpu_seconds * 1e6 / fast.arrived());
+    Ok(())
+}

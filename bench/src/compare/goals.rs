@@ -1,0 +1,390 @@
+//! The project's goals, each judged by the figures of one run: met, missed, or not measured.
+//!
+//! What is compared with another system is a ratio to what that system reached in the same run, since times differ from
+//! machine to machine. It judges and measures nothing.
+
+use super::figures::{Figure, Figures};
+use super::plot::Unit;
+
+/// A goal and what became of it.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Goal {
+    /// What it is about.
+    pub(crate) what: String,
+    /// The bound, with its unit.
+    pub(crate) bound: String,
+    /// What was reached: the worst of the parts, or each of them.
+    pub(crate) reached: String,
+    /// Whether that is within the bound.
+    pub(crate) verdict: Verdict,
+}
+
+/// Whether a goal is met.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// Every part of it was measured and is within the bound.
+    Met,
+    /// A part of it is not within the bound.
+    Missed,
+    /// A part of it was not measured, and those that were are within the bound.
+    NotMeasured,
+}
+
+impl Verdict {
+    /// As it stands in the report.
+    pub(crate) fn text(self) -> &'static str {
+        match self {
+            Self::Met => "met",
+            Self::Missed => "**missed**",
+            Self::NotMeasured => "not measured",
+        }
+    }
+}
+
+/// The suite that costs least, over the default transport.
+const GROUP: &str = "sgc-quic-group";
+/// What users have who choose nothing.
+const STANDARD: &str = "sgc-quic-standard";
+const ZENOH: &str = "zenoh-tcp";
+/// Sizes of messages, bytes, that are small.
+const SMALL: [f64; 4] = [16.0, 100.0, 1e3, 8e3];
+const SIZES: [f64; 7] = [16.0, 100.0, 1e3, 8e3, 64e3, 1e6, 13e6];
+const LARGE: f64 = 1e6;
+const HUGE: f64 = 13e6;
+const MESSAGE: f64 = 1e3;
+/// 64 KB may mean 64 000 or 65 536: so far a size may be from the one that is asked for.
+const SIZE_TOLERANCE: f64 = 0.1;
+
+/// One thing that a goal asks for.
+struct Part {
+    /// Where: a size, a path.
+    label: String,
+    /// `None` if it was not measured.
+    value: Option<f64>,
+}
+
+#[derive(Clone, Copy)]
+enum Bound {
+    AtMost(f64),
+    AtLeast(f64),
+}
+
+impl Bound {
+    fn holds(self, value: f64) -> bool {
+        match self {
+            Self::AtMost(most) => value <= most,
+            Self::AtLeast(least) => value >= least,
+        }
+    }
+
+    /// The bound and numbers beside it, in the same unit. A ratio has none.
+    fn text(self, unit: Option<Unit>) -> String {
+        let (sign, value) = match self {
+            Self::AtMost(most) => ("≤", most),
+            Self::AtLeast(least) => ("≥", least),
+        };
+        format!("{sign} {}", number(value, unit))
+    }
+}
+
+fn number(value: f64, unit: Option<Unit>) -> String {
+    let Some(unit) = unit else {
+        // As exactly as it takes to see on which side of 1 a ratio is.
+        let ratio = if value < 10.0 { (value * 1e3).round() / 1e3 } else { value.round() };
+        return format!("{ratio} ×");
+    };
+    unit.text(value)
+}
+
+fn goal(what: impl Into<String>, bound: Bound, unit: Option<Unit>, parts: Vec<Part>) -> Goal {
+    let is_missed = parts.iter().any(|p| p.value.is_some_and(|v| !bound.holds(v)));
+    let is_whole = !parts.is_empty() && parts.iter().all(|p| p.value.is_some());
+    let verdict = match (is_missed, is_whole) {
+        (true, _) => Verdict::Missed,
+        (false, true) => Verdict::Met,
+        (false, false) => Verdict::NotMeasured,
+    };
+    let say = |part: &Part| {
+        let value = part.value.map_or_else(|| "–".into(), |v| number(v, unit));
+        if part.label.is_empty() { value } else { format!("{}: {value}", part.label) }
+    };
+    let reached = parts.iter().map(say).collect::<Vec<_>>().join(", ");
+    Goal { what: what.into(), bound: bound.text(unit), reached, verdict }
+}
+
+/// Every goal, in the order of the issue that set them.
+pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
+    let run = Run { figures };
+    let mut goals = Vec::new();
+    for (tail, metric) in [("p50", "p50_us"), ("p99", "p99_us")] {
+        let small = |ours: &str, theirs: &str| {
+            let part =
+                |&at: &f64| run.at_size(at, run.ratio(("round-trip", "bare", at, metric), ours, theirs));
+            SMALL.iter().map(part).collect::<Vec<_>>()
+        };
+        let over = |what: &str| format!("Round trip {tail}, 16 B to 8 KB, bare link: {what}");
+        goals.extend([
+            goal(over("`group` to the Zenoh bridge over TCP"), Bound::AtMost(0.8), None, small(GROUP, ZENOH)),
+            goal(
+                over("`standard` to the Zenoh bridge over TCP"),
+                Bound::AtMost(1.0),
+                None,
+                small(STANDARD, ZENOH),
+            ),
+            goal(
+                over("with a router between to without, `group`"),
+                Bound::AtMost(1.15),
+                None,
+                small(&format!("{GROUP}-router"), GROUP),
+            ),
+        ]);
+    }
+    for (size, at) in [("1 MB", LARGE), ("13 MB", HUGE)] {
+        let ratio = run.ratio(("round-trip", "bare", at, "p50_us"), GROUP, ZENOH);
+        let what = format!("Round trip p50, {size}, bare link: `group` to the Zenoh bridge over TCP");
+        goals.push(goal(what, Bound::AtMost(0.6), None, vec![part("", ratio)]));
+    }
+
+    let throughput = |metric, ours, theirs| {
+        vec![part("", run.ratio(("throughput", "bare", MESSAGE, metric), ours, theirs))]
+    };
+    goals.extend([
+        goal(
+            "Messages of 1000 B a second: `group` to direct DDS",
+            Bound::AtLeast(0.97),
+            None,
+            throughput("per_second", GROUP, "direct"),
+        ),
+        goal(
+            "Messages of 1000 B a second: `standard` to direct DDS",
+            Bound::AtLeast(0.8),
+            None,
+            throughput("per_second", STANDARD, "direct"),
+        ),
+        goal(
+            "CPU time a message of 1000 B, both proxies: `group` to the Zenoh bridge over TCP",
+            Bound::AtMost(0.8),
+            None,
+            throughput("cpu_us_per_message", GROUP, ZENOH),
+        ),
+    ]);
+
+    let thin = ["paper", "lossy"];
+    let huge = |path| run.ratio(("round-trip", path, HUGE, "p50_us"), STANDARD, "tcp");
+    let parts = thin.iter().map(|path| part(path, huge(path))).collect();
+    goals.push(goal("13 MB over the thin links: `standard` to plain TCP", Bound::AtMost(1.1), None, parts));
+    for path in thin {
+        let beside =
+            |&at: &f64| run.at_size(at, run.ratio(("round-trip", path, at, "p50_us"), STANDARD, "wireguard"));
+        let what = format!("Round trip p50, every size, `{path}`: `standard` to DDS over WireGuard");
+        goals.push(goal(what, Bound::AtMost(1.0), None, SIZES.iter().map(beside).collect()));
+    }
+    goals.extend(run.teleop());
+    goals.extend(run.roaming());
+
+    let step = |path| run.ratio(("fleet-step", path, FLEET, "p50_us"), STANDARD, "ssh");
+    let parts = ["near", "far"].map(|path| part(path, step(path))).into();
+    goals.push(goal(
+        "Fleet step, p50: `standard` to files over SSH and SFTP",
+        Bound::AtMost(0.36),
+        None,
+        parts,
+    ));
+    goals.extend(run.footprint());
+    goals
+}
+
+/// Robots of the fleet step.
+const FLEET: f64 = 4.0;
+
+fn part(label: &str, value: Option<f64>) -> Part {
+    Part { label: label.to_owned(), value }
+}
+
+struct Run<'a> {
+    figures: &'a Figures,
+}
+
+/// Table, path, size and metric of a number.
+type Place<'a> = (&'a str, &'a str, f64, &'a str);
+
+impl Run<'_> {
+    /// The number of a system, at about this size.
+    fn number(&self, (table, path, at, metric): Place<'_>, system: &str) -> Option<f64> {
+        let is_it = |f: &&Figure| {
+            (&*f.table, &*f.system, &*f.path, &*f.metric) == (table, system, path, metric)
+                && (f.at - at).abs() <= at * SIZE_TOLERANCE
+        };
+        self.figures.figures.iter().rev().find(is_it).map(|f| f.value)
+    }
+
+    /// Ours by theirs, at the same place.
+    fn ratio(&self, place: Place<'_>, ours: &str, theirs: &str) -> Option<f64> {
+        let (ours, theirs) = (self.number(place, ours)?, self.number(place, theirs)?);
+        (theirs > 0.0).then(|| ours / theirs)
+    }
+
+    fn at_size(&self, at: f64, value: Option<f64>) -> Part {
+        Part { label: Unit::Bytes.text(at), value }
+    }
+
+    /// Driving over an uplink that a camera fills, by the default transport.
+    fn teleop(&self) -> Vec<Goal> {
+        let ms = Some(Unit::Seconds);
+        let at = |path: &str, metric, scale: f64| {
+            let place = ("teleop", path, 1.0, metric);
+            part(path, self.number(place, STANDARD).map(|v| v * scale))
+        };
+        let camera = |metric, scale| TELEOP_PATHS.map(|path| at(path, metric, scale)).into();
+        vec![
+            goal(
+                "Teleop beside a camera, age of the state p99",
+                Bound::AtMost(25e-3),
+                ms,
+                vec![at(TELEOP_PATHS[0], "state_p99_us", 1e-6)],
+            ),
+            goal(
+                "Teleop beside a camera, 40 ms one way, age of the state p99",
+                Bound::AtMost(60e-3),
+                ms,
+                vec![at(TELEOP_PATHS[1], "state_p99_us", 1e-6)],
+            ),
+            goal(
+                "Teleop, age of the camera's frames p99",
+                Bound::AtMost(160e-3),
+                ms,
+                camera("camera_p99_us", 1e-6),
+            ),
+            goal(
+                "Teleop, frames of the camera",
+                Bound::AtLeast(9.4),
+                Some(Unit::PerSecond),
+                camera("camera_per_second", 1.0),
+            ),
+        ]
+    }
+
+    /// A robot that changes its address under a reliable flow.
+    fn roaming(&self) -> Vec<Goal> {
+        let systems = [("QUIC", STANDARD), ("DTLS", "sgc-dtls-standard")];
+        let parts = |metric: &str, scale: f64| {
+            let value = |system| self.number(("roaming", "roam", 0.0, metric), system).map(|v| v * scale);
+            systems.map(|(name, system)| part(name, value(system))).into()
+        };
+        vec![
+            goal(
+                "Roaming, longest silence beyond a round trip",
+                Bound::AtMost(100e-3),
+                Some(Unit::Seconds),
+                parts("outage_us", 1e-6),
+            ),
+            goal(
+                "Roaming, messages of a reliable topic lost",
+                Bound::AtMost(0.0),
+                Some(Unit::Plain),
+                parts("lost", 1.0),
+            ),
+        ]
+    }
+
+    fn footprint(&self) -> Vec<Goal> {
+        let at =
+            |path, at, metric, system| vec![part("", self.number(("footprint", path, at, metric), system))];
+        vec![
+            goal(
+                "Resident memory of an idle proxy",
+                Bound::AtMost(15e6),
+                Some(Unit::Bytes),
+                at("topics", 0.0, "rss_bytes", "sgc-proxy"),
+            ),
+            goal(
+                "CPU of an idle proxy, of a core",
+                Bound::AtMost(0.5),
+                Some(Unit::Percent),
+                at("topics", 0.0, "idle_cpu_percent", "sgc-proxy"),
+            ),
+            goal(
+                "Resident memory of a router with 1 000 000 names",
+                Bound::AtMost(300e6),
+                Some(Unit::Bytes),
+                at("names", 1e6, "rss_bytes", "sgc-router"),
+            ),
+        ]
+    }
+}
+
+/// The uplink without a delay of its own, and with 40 ms one way.
+const TELEOP_PATHS: [&str; 2] = ["uplink", "uplink-40ms"];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WHAT: &str = "Round trip p50, 16 B to 8 KB, bare link: `group` to the Zenoh bridge over TCP";
+
+    /// Round trips of 100 µs by the Zenoh bridge, and these by ours, at the small sizes.
+    fn figures(ours: &[f64]) -> Figures {
+        let mut figures = Figures::default();
+        for (at, value) in [16.0, 100.0, 1000.0, 8192.0].into_iter().zip(ours) {
+            figures.push("round-trip", ZENOH, "bare", at, "p50_us", 100.0);
+            figures.push("round-trip", GROUP, "bare", at, "p50_us", *value);
+        }
+        figures
+    }
+
+    fn verdict(figures: &Figures, what: &str) -> (Verdict, String) {
+        let goal = judge(figures).into_iter().find(|g| g.what == what).unwrap();
+        (goal.verdict, goal.reached)
+    }
+
+    #[test]
+    fn a_goal_is_met_when_every_part_is_within_the_bound() {
+        let reached = "16 B: 0.7 ×, 100 B: 0.8 ×, 1 KB: 0.71 ×, 8 KB: 0.6 ×".to_owned();
+        assert_eq!(verdict(&figures(&[70.0, 80.0, 71.0, 60.0]), WHAT), (Verdict::Met, reached));
+    }
+
+    #[test]
+    fn one_part_beyond_the_bound_misses_it() {
+        assert_eq!(verdict(&figures(&[70.0, 81.0, 71.0, 60.0]), WHAT).0, Verdict::Missed);
+        assert_eq!(verdict(&figures(&[81.0]), WHAT).0, Verdict::Missed);
+    }
+
+    #[test]
+    fn what_is_missing_is_neither_met_nor_missed() {
+        let (verdict_of_three, reached) = verdict(&figures(&[70.0, 70.0, 70.0]), WHAT);
+        assert_eq!(verdict_of_three, Verdict::NotMeasured);
+        assert!(reached.ends_with("8 KB: –"), "{reached}");
+        assert!(judge(&Figures::default()).iter().all(|g| g.verdict == Verdict::NotMeasured));
+    }
+
+    #[test]
+    fn rates_have_to_reach_their_bound() {
+        let what = "Messages of 1000 B a second: `group` to direct DDS";
+        let mut figures = Figures::default();
+        figures.push("throughput", "direct", "bare", 1000.0, "per_second", 100_000.0);
+        figures.push("throughput", GROUP, "bare", 1000.0, "per_second", 96_000.0);
+        assert_eq!(verdict(&figures, what), (Verdict::Missed, "0.96 ×".into()));
+        // What was measured last counts.
+        figures.push("throughput", GROUP, "bare", 1000.0, "per_second", 97_000.0);
+        assert_eq!(verdict(&figures, what).0, Verdict::Met);
+    }
+
+    #[test]
+    fn a_goal_with_a_unit_says_it() {
+        let mut figures = Figures::default();
+        figures.push("footprint", "sgc-router", "names", 1e6, "rss_bytes", 310e6);
+        let goals = judge(&figures);
+        let goal = goals.iter().find(|g| g.what.contains("1 000 000 names")).unwrap();
+        assert_eq!((&*goal.bound, &*goal.reached), ("≤ 300 MB", "310 MB"));
+        assert_eq!(goal.verdict, Verdict::Missed);
+    }
+
+    #[test]
+    fn nothing_is_compared_with_a_system_that_reached_nothing() {
+        let mut figures = Figures::default();
+        figures.push("fleet-step", "ssh", "near", FLEET, "p50_us", 0.0);
+        figures.push("fleet-step", STANDARD, "near", FLEET, "p50_us", 1.0);
+        let what = "Fleet step, p50: `standard` to files over SSH and SFTP";
+        assert_eq!(verdict(&figures, what), (Verdict::NotMeasured, "near: –, far: –".into()));
+    }
+}

@@ -1,0 +1,135 @@
+//! `sgc run` at both places, as users have it: a configuration and an identity each.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+
+use super::{Dds, Running, System, Topic};
+use crate::compare::lab::{Lab, Side};
+use crate::compare::program::Program;
+use crate::fleet::BenchFleet;
+
+const SCHEMES: [&str; 4] = ["quic", "dtls", "tls", "tcp"];
+const SUITES: [&str; 3] = ["group", "standard", "paper"];
+const PORT: u16 = 7447;
+
+/// Two nodes, and perhaps routers.
+pub(crate) struct Sgc {
+    program: PathBuf,
+    scheme: &'static str,
+    suite: &'static str,
+    /// Processes between the two proxies, at the right place. Without one the right proxy listens.
+    routers: usize,
+}
+
+/// Every transport with every suite, and the default transport with a router between.
+pub(crate) fn all(program: &Path) -> Result<Vec<Sgc>> {
+    let one = |scheme, suite, routers| Sgc::new(program, scheme, suite, routers);
+    let pairs = SCHEMES.iter().flat_map(|scheme| SUITES.iter().map(move |suite| (scheme, suite)));
+    let without = pairs.map(|(scheme, suite)| one(scheme, suite, 0));
+    without.chain(["group", "standard"].map(|suite| one("quic", suite, 1))).collect()
+}
+
+impl Sgc {
+    /// With so many routers in a row, each in a process of its own.
+    pub(crate) fn new(
+        program: &Path,
+        scheme: &'static str,
+        suite: &'static str,
+        routers: usize,
+    ) -> Result<Self> {
+        let program = program.canonicalize();
+        let program = program.with_context(|| "the program that is measured: is it built?")?;
+        Ok(Self { program, scheme, suite, routers })
+    }
+
+    fn start_node(&self, lab: &Lab, side: Side, node: &str, dir: &Path, text: &str) -> Result<Program> {
+        let config = dir.join(format!("{node}.toml"));
+        let text = format!(
+            "identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\n\
+             [audit]\noff = true\n{text}"
+        );
+        fs::write(&config, text)?;
+        let mut command = lab.command(side, &self.program);
+        command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
+        // What a user's shell says of ROS 2 is not to be measured.
+        for variable in ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG"] {
+            command.env_remove(variable);
+        }
+        let mut program = Program::start(
+            node,
+            {
+                command.arg(&config);
+                command
+            },
+            dir,
+        )?;
+        program.soon("ready")?;
+        Ok(program)
+    }
+
+    fn url(&self, host: impl std::fmt::Display, number: usize) -> String {
+        format!("\"{}://{host}:{}\"", self.scheme, PORT as usize + number)
+    }
+}
+
+impl System for Sgc {
+    fn name(&self) -> String {
+        let router = match self.routers {
+            0 => String::new(),
+            1 => "-router".into(),
+            many => format!("-{many}-routers"),
+        };
+        format!("sgc-{}-{}{router}", self.scheme, self.suite)
+    }
+
+    fn start(&self, lab: &Lab, topics: &[Topic]) -> Result<Running> {
+        let dir = lab.new_dir(&self.name())?;
+        let fleet = BenchFleet::new()?;
+        let mut running = Running { processes: Vec::new(), dds: Side::BOTH.map(|_| Dds::loopback()) };
+        // Numbered from the right; each dials the one before.
+        for number in 0..self.routers {
+            let node = format!("router-{number}");
+            fleet.write(&dir, &node, true)?;
+            let listen = self.url("0.0.0.0", number);
+            let dials = match number.checked_sub(1) {
+                Some(before) => self.url("127.0.0.1", before),
+                None => String::new(),
+            };
+            let text = format!(
+                "[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n[router]\nlisten = [{listen}]\n"
+            );
+            let program = self.start_node(lab, Side::Right, &node, &dir, &text)?;
+            running.processes.push((Side::Right, program));
+        }
+        for side in [Side::Right, Side::Left] {
+            let node = side.name();
+            let is_router = side == Side::Right && self.routers == 0;
+            fleet.write(&dir, node, is_router)?;
+            let dials = match (side, self.routers) {
+                (Side::Right, 0) => String::new(),
+                (Side::Right, _) => self.url("127.0.0.1", 0),
+                (Side::Left, routers) => self.url(lab.address(Side::Right), routers.saturating_sub(1)),
+            };
+            let mut text = format!("[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n");
+            text += "[ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n";
+            if is_router {
+                writeln!(text, "[router]\nlisten = [{}]", self.url("0.0.0.0", 0))?;
+            }
+            for topic in topics {
+                let (name, other) = (topic.name, side.other().name());
+                if topic.towards == side {
+                    writeln!(text, "[[use]]\nfrom = \"{other}\"\ntopic = \"{name}\"")?;
+                } else {
+                    let suite = self.suite;
+                    writeln!(text, "[[share]]\ntopic = \"{name}\"\nto = [\"{other}\"]\nsuite = \"{suite}\"")?;
+                }
+            }
+            let program = self.start_node(lab, side, node, &dir, &text)?;
+            running.processes.push((side, program));
+        }
+        Ok(running)
+    }
+}
