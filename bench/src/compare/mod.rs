@@ -9,6 +9,7 @@ mod fan_out;
 mod figures;
 mod fleet_step;
 mod flow;
+mod footprint;
 mod goals;
 mod lab;
 mod multi_hop;
@@ -16,6 +17,7 @@ mod plot;
 mod program;
 mod report;
 mod round_trip;
+mod start_up;
 mod system;
 mod tally;
 mod tcp;
@@ -37,13 +39,15 @@ pub(crate) use report::Run;
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 6] = [
+const TABLES: [(&str, Table); 8] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    ("start-up", start_up::run),
     ("applications", applications::run),
     ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
+    ("footprint", footprint::run),
 ];
 
 /// What `compare` is given.
