@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench-routing bench-teleop bench-transports scale clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench-routing bench-teleop bench-transports bench-instructions scale clean-tools
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -19,6 +19,7 @@ help:
 	@echo '                 model-check (larger bounds)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
+	@echo '                 bench-instructions (whether hot functions take more instructions than before: bench/README.md; ARGS=--accept)'
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
 demo: build
@@ -124,6 +125,12 @@ bench-teleop: deps-build
 
 bench-transports: deps-build
 	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- transports $(ARGS)
+
+# Compares with bench/instructions.json and fails if something grew. ARGS=--accept takes what is for what is right, ARGS=seal
+# counts those with that in their names.
+bench-instructions:
+	@scripts/install-deps.sh bench
+	$(CARGO) bench --locked --manifest-path bench/Cargo.toml -p sgc-bench-instructions --bench hot -- $(ARGS)
 
 # How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
 scale:

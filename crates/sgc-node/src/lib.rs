@@ -10,6 +10,9 @@ pub mod admin;
 mod allocations;
 pub mod audit;
 mod authority;
+#[cfg(feature = "benchmarks")]
+#[doc(hidden)]
+pub mod benchmarks;
 mod calls;
 pub mod config;
 mod core;

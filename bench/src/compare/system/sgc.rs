@@ -22,6 +22,8 @@ pub(crate) struct Sgc {
     suite: &'static str,
     /// Processes between the two proxies, at the right place. Without one the right proxy listens.
     routers: usize,
+    /// Topics whose `priority` is not the default one.
+    priorities: &'static [(&'static str, &'static str)],
 }
 
 /// Every transport with every suite, and the default transport with a router between.
@@ -42,7 +44,12 @@ impl Sgc {
     ) -> Result<Self> {
         let program = program.canonicalize();
         let program = program.with_context(|| "the program that is measured: is it built?")?;
-        Ok(Self { program, scheme, suite, routers })
+        Ok(Self { program, scheme, suite, routers, priorities: &[] })
+    }
+
+    /// With priorities for some topics, instead of the default one.
+    pub(crate) fn with_priorities(self, priorities: &'static [(&'static str, &'static str)]) -> Self {
+        Self { priorities, ..self }
     }
 
     fn start_node(&self, lab: &Lab, side: Side, node: &str, dir: &Path, text: &str) -> Result<Program> {
@@ -125,6 +132,9 @@ impl System for Sgc {
                 } else {
                     let suite = self.suite;
                     writeln!(text, "[[share]]\ntopic = \"{name}\"\nto = [\"{other}\"]\nsuite = \"{suite}\"")?;
+                    if let Some((_, priority)) = self.priorities.iter().find(|(topic, _)| *topic == name) {
+                        writeln!(text, "priority = \"{priority}\"")?;
+                    }
                 }
             }
             let program = self.start_node(lab, side, node, &dir, &text)?;

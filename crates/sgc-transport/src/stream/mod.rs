@@ -4,6 +4,8 @@
 //! link talks to that machine and is woken by what it says. How the stream below is made and authenticated is in
 //! `endpoint.rs` and `handshake.rs`.
 
+#[cfg(feature = "benchmarks")]
+mod conversation;
 mod driver;
 mod endpoint;
 mod frame;
@@ -13,6 +15,8 @@ mod window;
 mod wire;
 mod ws;
 
+#[cfg(feature = "benchmarks")]
+pub use conversation::Conversation;
 pub(crate) use endpoint::{StreamDialer, StreamListener};
 pub use frame::StreamViolation;
 
