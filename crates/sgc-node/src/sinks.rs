@@ -755,8 +755,11 @@ mod tests {
         assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
     }
 
+    /// What was written, and by which thread.
+    type Written = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
+
     /// A queue whose messages are noted with the thread that took them; each takes as long as the gate is closed.
-    fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Arc<Mutex<Vec<(u64, thread::ThreadId)>>>) {
+    fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
         let taken = Arc::<Mutex<Vec<_>>>::default();
         let (note, gate) = (taken.clone(), gate.clone());
         let behind = Behind { never_blocks: true, ..Behind::default() };
