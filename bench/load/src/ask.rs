@@ -70,7 +70,15 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
             Next::Wait => drop(asker.node.waiter.wait(LONG)?),
             Next::Do(Order::Ask { size, answer, count, seconds, warm_up, patience_seconds, rate }) => {
                 let patience = Duration::try_from_secs_f64(patience_seconds)?;
-                say(&asker.questions(&Questions { size, answer, count, seconds, warm_up, patience, rate })?)?;
+                say(&asker.questions(&Questions {
+                    size,
+                    answer,
+                    count,
+                    seconds,
+                    warm_up,
+                    patience,
+                    rate,
+                })?)?;
             }
             Next::Do(order) => bail!("{order:?} is not for ask"),
         }
@@ -102,7 +110,11 @@ impl Asker {
 
     fn questions(&mut self, plan: &Questions) -> Result<Event> {
         let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
-        ensure!(size >= HEAD_BYTES + ANSWER_BYTES, "a request has {} bytes at least", HEAD_BYTES + ANSWER_BYTES);
+        ensure!(
+            size >= HEAD_BYTES + ANSWER_BYTES,
+            "a request has {} bytes at least",
+            HEAD_BYTES + ANSWER_BYTES
+        );
         ensure!((HEAD_BYTES..=ANSWER_MAX).contains(&answer), "no answer has {answer} bytes");
         ensure!(rate.is_none_or(|rate| rate > 0.0), "no rate");
         let mut data = vec![0x5a; size - HEAD_BYTES];
