@@ -6,8 +6,13 @@
 #![forbid(unsafe_code)]
 
 pub mod admin;
+#[cfg(test)]
+mod allocations;
 pub mod audit;
 mod authority;
+#[cfg(feature = "benchmarks")]
+#[doc(hidden)]
+pub mod benchmarks;
 mod calls;
 pub mod config;
 mod core;

@@ -111,7 +111,7 @@ impl OutFlow {
     }
 
     /// One that nobody empties but [`Self::queued`].
-    #[cfg(test)]
+    #[cfg(any(test, feature = "benchmarks"))]
     pub(crate) fn idle() -> Arc<Self> {
         Arc::new(Self {
             queue: Queue::new(OUTFLOW_PACKETS_MAX),
@@ -121,7 +121,7 @@ impl OutFlow {
     }
 
     /// The oldest packet that waits; it must be there.
-    #[cfg(test)]
+    #[cfg(any(test, feature = "benchmarks"))]
     pub(crate) async fn queued(&self) -> Packet {
         self.queue.pop().await.expect("it is open").0
     }

@@ -5,6 +5,7 @@
 //! at hand together share a signature; none waits for one that is not.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -456,7 +457,8 @@ impl LocalShare {
         let wanted = self.data.is_wanted(&self.name);
         move |packet| {
             if wanted && !self.closed.load(Relaxed) {
-                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
+                // By reference: tokio puts large futures on the heap.
+                self.runtime.block_on(pin!(self.data.forward(LinkId::LOCAL, packet)));
             }
         }
     }

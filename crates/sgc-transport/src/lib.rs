@@ -34,6 +34,13 @@ pub mod fuzzing {
     pub use crate::stream::{fuzz_bytes, fuzz_operations};
 }
 
+/// What is counted by itself in benchmarks, though nobody else may reach it.
+#[cfg(feature = "benchmarks")]
+#[doc(hidden)]
+pub mod benchmarks {
+    pub use crate::stream::Conversation;
+}
+
 pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
 #[doc(hidden)]

@@ -265,6 +265,14 @@ pub(crate) enum CliError {
         /// What is known beyond it, to be printed below.
         facts: Vec<String>,
     },
+    /// A measurement between two machines cannot begin, or not go on.
+    #[error("bench: {reason}")]
+    Bench {
+        /// Why, with the culprit and what to do.
+        reason: String,
+        /// What is known beyond it, to be printed below.
+        facts: Vec<String>,
+    },
     /// The system refused something without which nothing works.
     #[error("{what}: {source}")]
     System {
@@ -296,7 +304,7 @@ impl CliError {
             _ => {}
         }
         output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
-        if let Self::Demo { facts, .. } = self {
+        if let Self::Demo { facts, .. } | Self::Bench { facts, .. } = self {
             for fact in facts {
                 output::diagnostic(&format!("  {fact}"));
             }
@@ -347,6 +355,7 @@ impl CliError {
             | Self::NoHeader { .. }
             | Self::NoAudit { .. }
             | Self::Demo { .. }
+            | Self::Bench { .. }
             | Self::Tell(_)
             | Self::System { .. }
             | Self::Output(_) => EXIT_FAILURE,

@@ -1,14 +1,15 @@
 //! `sgc`: the command line of SGC, secure global connectivity for ROS 2.
 //!
 //! It parses arguments, reads and writes files, prints, and hands everything else to `sgc-node` and
-//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by [`demo`], whose talkers and
-//! listeners are plain DDS participants.
+//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by [`demo`] and [`bench`], whose
+//! programs are plain DDS participants.
 //!
 //! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
 //! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
 #![forbid(unsafe_code)]
 
 mod audit;
+mod bench;
 mod check;
 mod definitions;
 mod demo;
@@ -49,6 +50,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Demo(demo::DemoArgs),
+    Bench(bench::BenchArgs),
     Fleet(fleet::FleetArgs),
     Run(run::RunArgs),
     Router(run::RouterArgs),
@@ -80,6 +82,7 @@ fn main() -> ExitCode {
 fn run(command: Command) -> Result<ExitCode, CliError> {
     match command {
         Command::Demo(args) => return demo::demo(args),
+        Command::Bench(args) => return bench::bench(args),
         Command::Fleet(args) => fleet::fleet(args),
         Command::Run(args) => run::run(args),
         Command::Router(args) => run::router(args),

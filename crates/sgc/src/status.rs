@@ -42,7 +42,7 @@ pub(crate) struct Status {
     version: String,
     uptime_s: u64,
     pub(crate) links: Vec<Link>,
-    routers: Vec<Router>,
+    pub(crate) routers: Vec<Router>,
     pub(crate) routes: Vec<Route>,
     problems: Vec<String>,
     names: Vec<NameTraffic>,
@@ -58,9 +58,9 @@ pub(crate) struct Link {
     peer: String,
     pub(crate) remote: String,
     url: Option<String>,
-    rtt_us: u64,
+    pub(crate) rtt_us: u64,
     cost: u32,
-    silent: bool,
+    pub(crate) silent: bool,
     sent_bytes: u64,
     received_bytes: u64,
     peer_slowed: u64,
@@ -70,13 +70,14 @@ pub(crate) struct Link {
 /// A router that a node looks for.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-struct Router {
-    router: String,
+pub(crate) struct Router {
+    pub(crate) router: String,
     found_by: String,
     at: Option<String>,
     state: String,
     why_not_first: Option<String>,
-    last_failure: Option<String>,
+    pub(crate) failures: u32,
+    pub(crate) last_failure: Option<String>,
     again_in_s: Option<u64>,
 }
 

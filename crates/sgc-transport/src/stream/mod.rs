@@ -4,6 +4,8 @@
 //! link talks to that machine and is woken by what it says. How the stream below is made and authenticated is in
 //! `endpoint.rs` and `handshake.rs`.
 
+#[cfg(feature = "benchmarks")]
+mod conversation;
 mod driver;
 mod endpoint;
 mod frame;
@@ -13,6 +15,8 @@ mod window;
 mod wire;
 mod ws;
 
+#[cfg(feature = "benchmarks")]
+pub use conversation::Conversation;
 pub(crate) use endpoint::{StreamDialer, StreamListener};
 pub use frame::StreamViolation;
 
@@ -39,7 +43,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
+use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::{Notify, futures::Notified};
 
 use self::frame::DATAGRAM_BYTES_MAX;
@@ -528,7 +532,7 @@ impl Link for StreamLink {
         if bytes > max {
             return Err(LinkError::DatagramTooLong { bytes, max });
         }
-        let (shared, datagram) = (&self.handle.shared, datagram(packet, label));
+        let (shared, datagram) = (&self.handle.shared, datagram(packet, label, &mut Slab::default()));
         shared
             .until(&shared.datagrams_tx, |state| {
                 if let Some(end) = &state.end {

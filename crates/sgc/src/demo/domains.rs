@@ -28,9 +28,18 @@ impl HeldDomain {
 
 /// Finds and holds two free domains; the search begins at a place that differs from process to process.
 pub(crate) fn hold_two(seed: u32) -> Option<[HeldDomain; 2]> {
-    let count = DOMAINS.end() - DOMAINS.start() + 1;
-    let mut free = (0..count).map(|i| DOMAINS.start() + (seed.wrapping_add(i)) % count).filter_map(hold);
+    let mut free = free(seed);
     Some([free.next()?, free.next()?])
+}
+
+/// Finds and holds one.
+pub(crate) fn hold_one(seed: u32) -> Option<HeldDomain> {
+    free(seed).next()
+}
+
+fn free(seed: u32) -> impl Iterator<Item = HeldDomain> {
+    let count = DOMAINS.end() - DOMAINS.start() + 1;
+    (0..count).map(move |i| DOMAINS.start() + (seed.wrapping_add(i)) % count).filter_map(hold)
 }
 
 fn hold(id: u32) -> Option<HeldDomain> {

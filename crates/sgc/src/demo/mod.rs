@@ -4,10 +4,10 @@
 //! All of it is real: the nodes are `sgc run` with configurations as a user writes them, in processes of their own,
 //! and the talkers and listeners are DDS participants that know nothing of `sgc`. Nothing leaves this host.
 
-mod domains;
+pub(crate) mod domains;
 mod messages;
 mod peer;
-mod processes;
+pub(crate) mod processes;
 mod protocol;
 mod report;
 mod screen;

@@ -18,7 +18,7 @@ use tokio::task::JoinHandle;
 use crate::error::CliError;
 
 /// Variables that would change which network the children join.
-const ROS_VARIABLES: [&str; 5] = [
+pub(crate) const ROS_VARIABLES: [&str; 5] = [
     "ROS_DOMAIN_ID",
     "ROS_LOCALHOST_ONLY",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",

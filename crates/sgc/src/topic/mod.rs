@@ -107,6 +107,11 @@ pub(crate) fn topic(args: &TopicArgs) -> Result<ExitCode, CliError> {
 }
 
 impl NodeArgs {
+    /// The node at this socket.
+    pub(crate) fn at(socket: &Path) -> Self {
+        Self { config: None, node: None, socket: Some(socket.to_owned()) }
+    }
+
     /// Where the node is asked.
     pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
         let named = self.node.as_deref().map(sgc_node::default_socket_path);

@@ -8,6 +8,7 @@ mod near;
 #[cfg(test)]
 mod tests;
 
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Args;
@@ -108,6 +109,13 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
         }
     }
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
+}
+
+/// The first thing that is wrong on the way of a topic of the node at this socket, with the fix, as one line each.
+pub(crate) fn first_wrong(socket: &Path, topic: &str) -> Option<Vec<String>> {
+    let graph = NodeArgs::at(socket).graph(None).ok()?;
+    let step = diagnose::interface(&graph, topic).into_iter().find(|step| step.verdict == Verdict::Wrong)?;
+    Some([Some(step.found), step.fix].into_iter().flatten().map(|line| output::clean(&line)).collect())
 }
 
 /// The steps that the node's answer leads to; where none answers, that is the step.

@@ -1,0 +1,173 @@
+//! The DDS programs of `sgc bench`: plain participants, as ROS 2 programs would be, that know nothing of `sgc`.
+//!
+//! One end of a lane writes on one topic and reads on the other. The answering end sends pings back and counts streams on
+//! the thread that reads them; everything else goes to whoever runs the measurement, as an [`Event`].
+
+use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter};
+use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_wire::{History, Qos};
+
+use super::Event;
+use super::words::{Counted, Frame, Kind, Lane, TYPE};
+
+/// Messages that a reader holds: more than are ever under way.
+const READER_DEPTH: u32 = 4096;
+/// Of a stream each message of such a number is answered, so that whoever sends it knows how far it is.
+pub(crate) const PROGRESS_EVERY: u64 = 8;
+/// How long a message may wait until the local network takes it.
+const WRITE_MAX: Duration = Duration::from_secs(10);
+
+/// Where a stream stands.
+#[derive(Debug, Default)]
+pub(crate) struct Tally {
+    phase: u32,
+    received: u64,
+    repeated: u64,
+    last_seq: Option<u64>,
+    span: Option<(Instant, Instant)>,
+}
+
+impl Tally {
+    /// Counts a message; one of another measurement begins a new count.
+    fn count(&mut self, frame: &Frame, now: Instant) {
+        if frame.phase != self.phase {
+            *self = Self { phase: frame.phase, ..Self::default() };
+        }
+        // They come in the order of their numbers, or not at all.
+        if self.last_seq.is_some_and(|last| frame.seq <= last) {
+            self.repeated += 1;
+            return;
+        }
+        self.received += 1;
+        self.last_seq = Some(frame.seq);
+        self.span = Some((self.span.map_or(now, |(first, _)| first), now));
+    }
+
+    /// What came of a measurement; nothing if it is not the last one.
+    pub(crate) fn of(&self, phase: u32) -> Counted {
+        if phase != self.phase {
+            return Counted { phase, ..Counted::default() };
+        }
+        let us = self.span.map_or(0, |(first, last)| last.duration_since(first).as_micros() as u64);
+        Counted { phase, received: self.received, repeated: self.repeated, us, node_cpu_us: 0 }
+    }
+}
+
+/// One end of a lane.
+pub(crate) struct End {
+    writer: Arc<CycloneWriter>,
+    _reader: CycloneReader,
+}
+
+impl End {
+    /// The end that asks and measures.
+    pub(crate) fn asking(
+        network: &CycloneNetwork,
+        lane: Lane,
+        events: SyncSender<Event>,
+    ) -> Result<Self, RosError> {
+        let writer = Arc::new(network.create_writer(&spec(&lane.ask(), History::KeepAll))?);
+        let reader = network.create_reader(
+            &spec(&lane.answer(), History::KeepLast(READER_DEPTH)),
+            Box::new(move |sample| {
+                let now = Instant::now();
+                if let Some(frame) = Frame::decode(&sample.payload) {
+                    // Whoever listened is gone if this fails, and this reader soon as well.
+                    let _ = events.send(Event::Frame(lane, frame, now));
+                }
+            }),
+        )?;
+        Ok(Self { writer, _reader: reader })
+    }
+
+    /// The end that answers and counts.
+    pub(crate) fn answering(
+        network: &CycloneNetwork,
+        lane: Lane,
+        tally: Arc<Mutex<Tally>>,
+        events: SyncSender<Event>,
+    ) -> Result<Self, RosError> {
+        let writer = Arc::new(network.create_writer(&spec(&lane.answer(), History::KeepAll))?);
+        let back = Arc::clone(&writer);
+        let reader = network.create_reader(
+            &spec(&lane.ask(), History::KeepLast(READER_DEPTH)),
+            Box::new(move |sample| {
+                let now = Instant::now();
+                let Some(frame) = Frame::decode(&sample.payload) else { return };
+                let answer = match frame.kind {
+                    Kind::Ping => Frame { kind: Kind::Pong, ..frame },
+                    Kind::Stream => {
+                        tally.lock().unwrap_or_else(PoisonError::into_inner).count(&frame, now);
+                        if frame.seq % PROGRESS_EVERY != 0 {
+                            return;
+                        }
+                        Frame { kind: Kind::Pong, data: Default::default(), ..frame }
+                    }
+                    Kind::Pong => return,
+                    Kind::Words => {
+                        let _ = events.send(Event::Frame(lane, frame, now));
+                        return;
+                    }
+                };
+                if let Err(error) = write(&back, &answer) {
+                    tracing::warn!(%error, "an answer was not sent");
+                }
+            }),
+        )?;
+        Ok(Self { writer, _reader: reader })
+    }
+
+    /// Sends a message; waits while the local network does not take it.
+    pub(crate) fn send(&self, frame: &Frame) -> Result<(), RosError> {
+        write(&self.writer, frame)
+    }
+
+    /// True if somebody on its network listens.
+    pub(crate) fn is_heard(&self) -> bool {
+        self.writer.matched_readers() > 0
+    }
+}
+
+fn write(writer: &CycloneWriter, frame: &Frame) -> Result<(), RosError> {
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let stamp = i64::try_from(since_epoch.as_nanos()).unwrap_or(0);
+    let payload = frame.encode();
+    let begun = Instant::now();
+    loop {
+        match writer.write(SampleKind::Write, stamp, payload.clone()) {
+            Err(RosError::WriteTimeout { .. }) if begun.elapsed() < WRITE_MAX => {}
+            other => return other,
+        }
+    }
+}
+
+fn spec(topic: &str, history: History) -> EndpointSpec {
+    let qos = Qos { history, ..Qos::default() };
+    EndpointSpec { topic: dds_topic(topic), type_name: dds_type(TYPE), keyless: true, type_hash: None, qos }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(phase: u32, seq: u64) -> Frame {
+        Frame { phase, kind: Kind::Stream, seq, data: Default::default() }
+    }
+
+    #[test]
+    fn what_comes_twice_is_counted_once_and_each_measurement_by_itself() {
+        let (begun, mut tally) = (Instant::now(), Tally::default());
+        for (n, seq) in [0, 1, 1, 3, 2].into_iter().enumerate() {
+            tally.count(&frame(4, seq), begun + Duration::from_millis(n as u64));
+        }
+        let counted = Counted { phase: 4, received: 3, repeated: 2, us: 3000, node_cpu_us: 0 };
+        assert_eq!(tally.of(4), counted);
+        assert_eq!(tally.of(5), Counted { phase: 5, ..Counted::default() });
+        tally.count(&frame(5, 0), begun);
+        assert_eq!((tally.of(5).received, tally.of(4).received), (1, 0));
+    }
+}

@@ -1,0 +1,303 @@
+//! One side of `sgc bench`: a node of its own in a process of its own, on a ROS domain that nobody else uses.
+//!
+//! The node is `sgc run` with a configuration as a user writes it, and the identity that the user named. What it needs
+//! besides is in a directory that goes when the side does; only revocation lists are taken over from the user's own node.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::SyncSender;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
+use sgc_node::config;
+use sgc_trust::Suite;
+use tempfile::TempDir;
+
+use super::Event;
+use super::words::{Lane, TYPE};
+use crate::demo::domains::{HeldDomain, hold_one};
+use crate::demo::processes::{ROS_VARIABLES, last_lines};
+use crate::error::CliError;
+use crate::run::{EndSignals, ReadyLine};
+use crate::status;
+
+/// How long a node may take to end in good order.
+const END_MAX: Duration = Duration::from_secs(6);
+/// How often a node that ends is looked at.
+const END_PERIOD: Duration = Duration::from_millis(20);
+/// Revocation lists that are taken over, and bytes of each.
+const CRLS_MAX: usize = 32;
+const CRL_BYTES_MAX: u64 = 1 << 20;
+
+/// How the two nodes meet.
+#[derive(Clone, Debug)]
+pub(crate) enum Meeting {
+    /// This one listens.
+    Listen(Vec<String>),
+    /// This one connects: to the other, or to a router between them.
+    Connect(Vec<String>),
+}
+
+/// What a node is to carry.
+#[derive(Clone, Debug)]
+pub(crate) enum Topics {
+    /// Lanes that are its own, for all members of its fleet.
+    Own,
+    /// Lanes of that node.
+    Of(String, Vec<Suite>),
+}
+
+/// A side: dropping it ends its node and removes its files.
+pub(crate) struct Side {
+    dir: TempDir,
+    domain: HeldDomain,
+    node: Child,
+}
+
+impl Side {
+    /// Starts the node. Whether and when it is up, and that it ended, comes as an event.
+    pub(crate) fn start(
+        identity: &Path,
+        meeting: &Meeting,
+        topics: &Topics,
+        events: &SyncSender<Event>,
+    ) -> Result<Self, CliError> {
+        let dir = tempfile::Builder::new()
+            .prefix("sgc-bench-")
+            .tempdir()
+            .map_err(|source| CliError::Write { path: std::env::temp_dir(), source })?;
+        let domain = hold_one(std::process::id()).ok_or_else(|| {
+            super::failed(
+                "no free ROS domain among 20 to 69: other ROS 2 programs or demos run here; end one of them",
+            )
+        })?;
+        let identity = fs::canonicalize(identity)
+            .map_err(|source| CliError::Read { path: identity.to_owned(), source })?;
+        let text = configuration(&identity, meeting, topics, domain.id())?;
+        let path = dir.path().join("bench.toml");
+        fs::write(&path, text).map_err(|source| CliError::Write { path: path.clone(), source })?;
+        // What is wrong with what the user gave is said before anything runs.
+        let config = config::load(&path, &|_: &str| None).map_err(|errors| CliError::Arguments { errors })?;
+        let what = identity.display().to_string();
+        sgc_node::check_identity(&config).map_err(|source| CliError::CheckIdentity { what, source })?;
+        take_over_revocations(&config, dir.path());
+        let node = start_node(dir.path(), &path, events)?;
+        Ok(Self { dir, domain, node })
+    }
+
+    /// Joins the side's domain as a program of its own.
+    pub(crate) fn join(&self) -> Result<CycloneNetwork, CliError> {
+        let config = DdsConfig {
+            domain: self.domain.id(),
+            discovery: DiscoveryRange::LocalHost,
+            ..DdsConfig::default()
+        };
+        CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
+    }
+
+    /// How the node is doing.
+    pub(crate) fn status(&self) -> Result<status::Status, CliError> {
+        status::of_node_at(&self.socket())
+    }
+
+    /// Where it is asked.
+    pub(crate) fn socket(&self) -> PathBuf {
+        self.dir.path().join("bench.sock")
+    }
+
+    /// Its process.
+    pub(crate) fn process(&self) -> u32 {
+        self.node.id()
+    }
+
+    /// The last that it logged.
+    pub(crate) fn last_words(&self) -> Vec<String> {
+        last_lines(&self.dir.path().join("bench.log"))
+    }
+}
+
+impl Drop for Side {
+    fn drop(&mut self) {
+        drop(self.node.stdin.take());
+        let deadline = Instant::now() + END_MAX;
+        while matches!(self.node.try_wait(), Ok(None)) {
+            if Instant::now() > deadline {
+                let _ = self.node.kill();
+                let _ = self.node.wait();
+                return;
+            }
+            thread::sleep(END_PERIOD);
+        }
+    }
+}
+
+/// A domain of both machines in which each looks for the other by unicast.
+pub(crate) fn join_directly(domain: u32, peer: std::net::IpAddr) -> Result<CycloneNetwork, CliError> {
+    let config = DdsConfig {
+        domain,
+        discovery: DiscoveryRange::LocalHost,
+        static_peers: vec![peer.to_string()],
+        ..DdsConfig::default()
+    };
+    CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
+}
+
+/// Has a signal of the user's come as an event; the next one ends the process at once.
+pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|source| CliError::System { what: "cannot start a runtime", source })?;
+    let mut signals = {
+        let _guard = runtime.enter();
+        EndSignals::new()?
+    };
+    thread::spawn(move || {
+        runtime.block_on(async {
+            signals.next().await;
+            let _ = events.send(Event::Interrupted);
+            signals.next().await;
+            std::process::exit(crate::error::EXIT_FAILURE.into());
+        });
+    });
+    Ok(())
+}
+
+fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<Child, CliError> {
+    let failed = |source| CliError::System { what: "cannot start a node", source };
+    let log = dir.join("bench.log");
+    let log = File::create(&log).map_err(|source| CliError::Write { path: log, source })?;
+    let mut command = Command::new(std::env::current_exe().map_err(failed)?);
+    command
+        .args(["run", "--until-stdin-closes", "--print-ready", "-c"])
+        .arg(config)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(log)
+        // A Ctrl-C reaches this process only, which ends the node in order.
+        .process_group(0);
+    for variable in ROS_VARIABLES {
+        command.env_remove(variable);
+    }
+    let mut node = command.spawn().map_err(failed)?;
+    let (stdout, events) = (node.stdout.take(), events.clone());
+    thread::spawn(move || {
+        for line in stdout.into_iter().flat_map(|out| BufReader::new(out).lines()).map_while(Result::ok) {
+            if let Ok(ready) = serde_json::from_str::<ReadyLine>(&line) {
+                let _ = events.send(Event::NodeReady(ready.ready));
+            }
+        }
+        // Its standard output ends with it.
+        let _ = events.send(Event::NodeEnded);
+    });
+    Ok(node)
+}
+
+/// What the user's own node knows of certificates that were taken back counts here, too.
+fn take_over_revocations(config: &config::Config, dir: &Path) {
+    let mut usual = config.clone();
+    usual.state = None;
+    let Ok(name) = status::node_name(config) else { return };
+    let Some(kept) = sgc_node::state_dir(&usual, &name) else { return };
+    let state = dir.join("state");
+    let lists = crate::files::with_extension(&kept.join("crl"), "crl").unwrap_or_default();
+    if lists.is_empty() || sgc_node::create_state_dir(&state.join("crl")).is_err() {
+        return;
+    }
+    for list in lists.iter().take(CRLS_MAX) {
+        let (Some(file), Ok(metadata)) = (list.file_name(), fs::metadata(list)) else { continue };
+        // One that is broken is not believed by the node.
+        if metadata.is_file() && metadata.len() <= CRL_BYTES_MAX {
+            let _ = fs::copy(list, state.join("crl").join(file));
+        }
+    }
+}
+
+fn configuration(
+    identity: &Path,
+    meeting: &Meeting,
+    topics: &Topics,
+    domain: u32,
+) -> Result<String, CliError> {
+    let identity = identity.to_str().ok_or_else(|| CliError::Cannot {
+        reason: format!("{}: the path of an identity must be UTF-8; copy it elsewhere", identity.display()),
+    })?;
+    // A string of JSON is one of TOML.
+    let quoted = |text: &str| serde_json::Value::from(text).to_string();
+    let list = |texts: &[String]| {
+        let texts: Vec<_> = texts.iter().map(|text| quoted(text)).collect();
+        format!("[{}]", texts.join(", "))
+    };
+    let (routers, listen) = match meeting {
+        Meeting::Listen(urls) => (String::new(), format!("[router]\nlisten = {}\n\n", list(urls))),
+        Meeting::Connect(urls) => (format!("routers = {}\n", list(urls)), String::new()),
+    };
+    let mut text = format!(
+        "identity = {}\n\n[node]\nstate = \"state\"\n{routers}\n{listen}\
+         [ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\ngraph = false\n\n\
+         [audit]\noff = true\n\n[admin]\nsocket = \"bench.sock\"\n",
+        quoted(identity)
+    );
+    match topics {
+        Topics::Own => {
+            let lanes = Suite::ALL.map(|suite| (Lane::Sealed(suite), suite));
+            for (lane, suite) in lanes.into_iter().chain([(Lane::Control, Suite::Standard)]) {
+                // Questions and answers overtake what is measured.
+                let priority = if lane == Lane::Control { "realtime" } else { "default" };
+                for (topic, publish) in [(lane.ask(), "publish = [\"*\"]\n"), (lane.answer(), "")] {
+                    text += &format!(
+                        "\n[[share]]\ntopic = {}\ntype = {}\nto = [\"*\"]\nsuite = {}\npriority = {}\n{publish}",
+                        quoted(&topic),
+                        quoted(TYPE),
+                        quoted(suite.name()),
+                        quoted(priority)
+                    );
+                }
+            }
+        }
+        Topics::Of(owner, suites) => {
+            let lanes = suites.iter().map(|suite| Lane::Sealed(*suite));
+            for lane in lanes.chain([Lane::Control]) {
+                for (topic, publish) in [(lane.ask(), "publish = true\n"), (lane.answer(), "")] {
+                    text += &format!(
+                        "\n[[use]]\nfrom = {}\ntopic = {}\n{publish}",
+                        quoted(owner),
+                        quoted(&topic)
+                    );
+                }
+            }
+        }
+    }
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(meeting: &Meeting, topics: &Topics) -> config::Config {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("bench.toml");
+        let text = configuration(Path::new("/x/a \"b\".identity"), meeting, topics, 42).unwrap();
+        fs::write(&path, text).unwrap();
+        config::load(&path, &|_: &str| None).unwrap()
+    }
+
+    #[test]
+    fn both_sides_are_configured_for_the_same_topics() {
+        let listen = Meeting::Listen(vec!["quic://0.0.0.0:7448".into(), "tls://[::]:7448".into()]);
+        let own = load(&listen, &Topics::Own);
+        assert_eq!(own.identity, Path::new("/x/a \"b\".identity"));
+        assert_eq!((own.shares.len(), own.uses.len()), (2 * (Suite::ALL.len() + 1), 0));
+        let connect = Meeting::Connect(vec!["quic://desk.example:7448".into()]);
+        let used = load(&connect, &Topics::Of("desk".into(), vec![Suite::Group, Suite::PaperChacha]));
+        assert_eq!(used.uses.len(), 6);
+        for used in &used.uses {
+            assert!(own.shares.iter().any(|share| share.topic == used.topic), "{}", used.topic);
+        }
+    }
+}

@@ -1,0 +1,297 @@
+//! `sgc bench` between two sides on the loopback interface: what it measures, whom it refuses, and that it ends, with the
+//! cause, when the other side does. No figure is compared: what is checked is that all is there and nothing was lost.
+
+#![allow(clippy::unwrap_used)]
+
+#[allow(dead_code, reason = "there are no programs that are not ours here")]
+mod support;
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use support::{command, ip, say};
+use tempfile::TempDir;
+
+/// Longest wait for an event, far beyond what any takes.
+const PATIENCE: Duration = Duration::from_secs(90);
+static LABS: AtomicU32 = AtomicU32::new(0);
+
+/// Two fleets' identities, and a network that is nobody else's if there may be one.
+struct Lab {
+    dir: TempDir,
+    namespace: Option<String>,
+}
+
+impl Lab {
+    fn new() -> Self {
+        let namespace = format!("sgcb-{}-{}", std::process::id(), LABS.fetch_add(1, Ordering::Relaxed));
+        let made = ip(&["netns", "add", &namespace])
+            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "up"]))
+            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "multicast", "on"]));
+        let namespace = match made {
+            Ok(()) => Some(namespace),
+            Err(why) => {
+                say(&format!("NO NETWORK NAMESPACES ({why}): using this host's network"));
+                None
+            }
+        };
+        let lab = Self { dir: tempfile::tempdir().unwrap(), namespace };
+        fs::create_dir(lab.tmp()).unwrap();
+        for args in [
+            &["fleet", "create", "lab"][..],
+            &["fleet", "create", "other"],
+            &["fleet", "enroll", "desk", "--fleet", "lab.fleet"],
+            &["fleet", "enroll", "robot", "--fleet", "lab.fleet"],
+            &["fleet", "enroll", "cloud", "--router", "--fleet", "lab.fleet"],
+            &["fleet", "enroll", "stranger", "--fleet", "other.fleet"],
+        ] {
+            let output = lab.sgc(args).output().unwrap();
+            assert!(output.status.success(), "{output:?}");
+        }
+        lab
+    }
+
+    /// Where what both sides need for a time goes.
+    fn tmp(&self) -> std::path::PathBuf {
+        self.dir.path().join("tmp")
+    }
+
+    fn sgc(&self, args: &[&str]) -> Command {
+        let program = Path::new(env!("CARGO_BIN_EXE_sgc"));
+        let mut command = command(self.namespace.as_deref(), self.dir.path(), program);
+        command.args(args).env("TMPDIR", self.tmp()).env("ROS_DOMAIN_ID", "3");
+        command
+    }
+
+    fn answer(&self, args: &[&str]) -> Side {
+        Side::start(self.sgc(&[&["bench", "answer", "--identity", "desk.identity"][..], args].concat()))
+    }
+
+    /// A run to its end.
+    fn run(&self, identity: &str, args: &[&str]) -> Output {
+        let args = [&["bench", "run", "--identity", identity][..], args].concat();
+        let child = self.sgc(&args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        end_of(child)
+    }
+}
+
+impl Drop for Lab {
+    fn drop(&mut self) {
+        if let Some(namespace) = &self.namespace {
+            let _ = ip(&["netns", "delete", namespace]);
+        }
+    }
+}
+
+/// What a process printed, once it ended, which it must within [`PATIENCE`].
+fn end_of(child: Child) -> Output {
+    let pid = Pid::from_child(&child);
+    let (sender, ended) = channel();
+    std::thread::spawn(move || sender.send(child.wait_with_output()));
+    match ended.recv_timeout(PATIENCE) {
+        Ok(output) => output.unwrap(),
+        Err(error) => {
+            let _ = kill_process(pid, Signal::KILL);
+            panic!("it does not end: {error}");
+        }
+    }
+}
+
+/// A process whose standard output is read line by line.
+struct Side {
+    child: Child,
+    lines: Receiver<String>,
+}
+
+impl Side {
+    fn start(mut command: Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+        let out = BufReader::new(child.stdout.take().unwrap());
+        let (sender, lines) = channel();
+        std::thread::spawn(move || {
+            for line in out.lines().map_while(Result::ok) {
+                let _ = sender.send(line);
+            }
+        });
+        Self { child, lines }
+    }
+
+    /// The rest of the next line that begins so.
+    fn said(&self, begins: &str) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let line = self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now()));
+            if let Some(rest) = line.unwrap_or_else(|e| panic!("{begins}: {e}")).strip_prefix(begins) {
+                return rest.to_owned();
+            }
+        }
+    }
+
+    fn end(mut self, signal: Signal) -> Option<i32> {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+        let deadline = Instant::now() + PATIENCE;
+        while Instant::now() < deadline {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status.code();
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        panic!("it does not end");
+    }
+}
+
+impl Drop for Side {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Checks that each way was measured at each size, and lost nothing.
+fn check(report: &Value, sealed: &[&str], others: &[&str], sizes: &[u64]) {
+    let trips = report["trips"].as_array().unwrap();
+    for way in sealed.iter().chain(others) {
+        for size in sizes {
+            let row = trips.iter().find(|row| row["way"] == **way && row["size"] == *size);
+            let row = row.unwrap_or_else(|| panic!("no {way} of {size} bytes: {report}"));
+            let [p50, p99, max] = ["p50_us", "p99_us", "max_us"].map(|key| row[key].as_u64().unwrap());
+            assert!(row["count"].as_u64().unwrap() > 0 && 0 < p50 && p50 <= p99 && p99 <= max, "{row}");
+            assert_eq!(row["lost"], 0, "{row}");
+        }
+    }
+    let flows = report["flows"].as_array().unwrap();
+    for way in sealed {
+        for size in sizes {
+            let row = flows.iter().find(|row| row["way"] == **way && row["size"] == *size).unwrap();
+            assert!(row["sent"].as_u64().unwrap() > 1 && row["per_s"].as_f64().unwrap() > 0.0, "{row}");
+            assert_eq!((&row["received"], &row["repeated"]), (&row["sent"], &0.into()), "{row}");
+            assert!(row["cpu_us_here"].is_number() && row["cpu_us_there"].is_number(), "{row}");
+        }
+    }
+    for machine in ["here", "there"] {
+        assert!(report[machine]["cores"].as_u64().unwrap() > 0, "{report}");
+        assert!(report[machine]["kernel"].as_str().unwrap().starts_with("Linux"), "{report}");
+    }
+}
+
+#[test]
+fn a_run_measures_every_way_and_loses_nothing() {
+    let lab = Lab::new();
+    let answer = lab.answer(&["--listen", "quic://127.0.0.1:0,tcp://127.0.0.1:0"]);
+    let urls = answer.said("desk waits at ");
+    let (quic, tcp) = urls.split_once(',').unwrap();
+    let args = ["--with", "desk", "--to", quic, "--sizes", "16,1000,100kB", "--seconds", "1"];
+    let files = ["--json", "run.json", "--markdown", "run.md"];
+    let output = lab.run("robot.identity", &[&args[..], &files].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_eq!(stderr(&output), "");
+    answer.said("a run goes on: sgc group, sgc standard");
+    answer.said("the run is over");
+    let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
+    check(&report, &["sgc group", "sgc standard"], &["TCP", "direct DDS"], &[16, 1000, 100_000]);
+    check(&report, &[], &["UDP"], &[16, 1000]);
+    assert!(report["tcp_mbit_s"].as_f64().unwrap() > 0.0);
+    assert_eq!((&report["bare_not"], &report["direct_not"]), (&Value::Null, &Value::Null));
+    assert_eq!(report["path"]["transports"], serde_json::json!(["quic"]));
+    let (text, page) = (
+        String::from_utf8(output.stdout.clone()).unwrap(),
+        fs::read_to_string(lab.dir.path().join("run.md")).unwrap(),
+    );
+    for part in ["What that means:", "all arrived, once each", "DDS without sgc reaches"] {
+        assert!(text.contains(part), "{text}");
+    }
+    assert!(page.contains("## What that means") && page.contains("| way | size |"), "{page}");
+    assert!(
+        !page.contains("127.0.0.1") && !text.contains("127.0.0.1"),
+        "a place is nobody's business: {text}"
+    );
+
+    // Ready for another, by another transport and in a suite of its own.
+    let args = ["--with", "desk", "--to", tcp, "--sizes", "16", "--seconds", "1", "--suites", "group-chacha"];
+    let output = lab.run("robot.identity", &[&args[..], &["--json", "run.json"]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
+    check(&report, &["sgc group-chacha"], &["TCP"], &[16]);
+
+    assert_eq!(answer.end(Signal::INT), Some(0));
+    assert!(fs::read_dir(lab.tmp()).unwrap().next().is_none(), "files are left over");
+}
+
+#[test]
+fn through_a_router_all_but_the_bare_path_is_measured() {
+    let lab = Lab::new();
+    let args = ["run", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0", "--print-ready"];
+    let mut router = lab.sgc(&args);
+    router.env("XDG_STATE_HOME", lab.dir.path()).stderr(Stdio::null());
+    let router = Side::start(router);
+    let ready: Value = serde_json::from_str(&format!("{{{}", router.said("{"))).unwrap();
+    let url = ready["ready"][0].as_str().unwrap();
+    let answer = lab.answer(&["--router", url]);
+    answer.said("desk waits at ");
+    let args = ["--with", "desk", "--router", url, "--sizes", "16", "--seconds", "1", "--suites", "group"];
+    let output = lab.run("robot.identity", &[&args[..], &["--json", "run.json"]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
+    check(&report, &["sgc group"], &[], &[16]);
+    for not in ["bare_not", "direct_not"] {
+        assert!(report[not].as_str().unwrap().contains("through a router"), "{report}");
+    }
+}
+
+#[test]
+fn another_fleet_is_refused_and_told_so() {
+    let lab = Lab::new();
+    let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
+    let url = answer.said("desk waits at ");
+    let output = lab.run("stranger.identity", &["--with", "desk", "--to", &url, "--seconds", "1"]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let said = stderr(&output);
+    assert!(said.starts_with("sgc: bench: no link to desk\n"), "{said}");
+    assert!(said.contains("fleet"), "{said}");
+    assert!(output.stdout.is_empty());
+}
+
+#[test]
+fn the_end_of_the_other_side_is_told_and_ends_a_run() {
+    let lab = Lab::new();
+    let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
+    let url = answer.said("desk waits at ");
+    let args = ["bench", "run", "--identity", "robot.identity", "--with", "desk", "--to", &url];
+    let mut run = lab.sgc(&[&args[..], &["--seconds", "60", "--sizes", "1000"]].concat());
+    let run = run.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    answer.said("a run goes on");
+    answer.end(Signal::KILL);
+    let output = end_of(run);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let said = stderr(&output);
+    assert!(said.starts_with("sgc: bench: desk is silent"), "{said}");
+    assert!(said.contains("the link broke"), "{said}");
+}
+
+#[test]
+fn what_cannot_be_right_is_said_before_anything_runs() {
+    let lab = Lab::new();
+    let url = "quic://127.0.0.1:9";
+    for (args, part) in [
+        (&["--with", "robot", "--to", url][..], "cannot measure with itself"),
+        (&["--with", "desk"], "--to"),
+        (&["--with", "desk", "--to", "nonsense"], "nonsense"),
+        (&["--with", "desk", "--to", url, "--sizes", "1GB"], "1 to 32000000 bytes"),
+        (&["--with", "desk", "--to", url, "--suites", "rot13"], "rot13"),
+    ] {
+        let output = lab.run("robot.identity", args);
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{args:?}: {}", stderr(&output));
+    }
+}
