@@ -9,6 +9,7 @@ mod fan_out;
 mod figures;
 mod fleet_step;
 mod flow;
+mod footprint;
 mod goals;
 mod lab;
 mod multi_hop;
@@ -17,6 +18,7 @@ mod program;
 mod report;
 mod roaming;
 mod round_trip;
+mod start_up;
 mod system;
 mod tally;
 mod tcp;
@@ -39,15 +41,17 @@ pub(crate) use report::Run;
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 8] = [
+const TABLES: [(&str, Table); 10] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    ("start-up", start_up::run),
     ("applications", applications::run),
     ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
     ("teleop", teleop::run),
     ("roaming", roaming::run),
+    ("footprint", footprint::run),
 ];
 
 /// Of the many variants of `sgc`, those that a short run has.
