@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
 use crate::dds::Message;
-use crate::node::{HELLO_EVERY, LONG, Node};
+use crate::node::{LONG, Node};
 use crate::ping::HEAD_BYTES;
 use crate::report::{Event, Next, Order, say};
 use crate::{Common, now_ns};
@@ -58,7 +58,8 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
         return Ok(());
     }
     let mut asker = Asker { node, seq: 0 };
-    while !asker.is_heard()? {
+    while !asker.node.is_heard(asker.seq)? {
+        asker.seq += 1;
         if matches!(asker.node.orders.next()?, Next::End) {
             return Ok(());
         }
@@ -91,23 +92,6 @@ struct Asker {
 }
 
 impl Asker {
-    /// Says hello, and whether any hello was answered meanwhile: the way may take longer than what is between two.
-    fn is_heard(&mut self) -> Result<bool> {
-        self.seq += 1;
-        let hello = Message { seq: self.seq, stamp_ns: now_ns(), data: &[] };
-        self.node.writers[0].write(&hello)?;
-        let deadline = Instant::now() + HELLO_EVERY;
-        let mut is_heard = false;
-        while let Some(left) = deadline.checked_duration_since(Instant::now()).filter(|_| !is_heard) {
-            self.node.waiter.wait(left)?;
-            self.node.readers[0].take(|_| {
-                is_heard = true;
-                Ok(())
-            })?;
-        }
-        Ok(is_heard)
-    }
-
     fn questions(&mut self, plan: &Questions) -> Result<Event> {
         let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
         ensure!(
