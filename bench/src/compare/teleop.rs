@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
-use sgc_testkit::netsim::{Profile, QueueLimit};
+use sgc_testkit::netsim::{Direction, Profile, QueueLimit};
 
 use super::lab::{Lab, PathKind, Side};
 use super::program::Program;
@@ -146,7 +146,7 @@ fn measure(
     for (flow, source, sink) in &mut programs {
         let mut push = |metric: &str, value| {
             let (at, metric) = (f64::from(u8::from(with_camera)), format!("{}_{metric}", flow.figures));
-            figures.push("teleop", &system.name(), kind.name(), at, &metric, value);
+            figures.push("teleop", &system.name(), lab.kind.name(), at, &metric, value);
         };
         let outcome = outcome(source, sink, seconds).with_context(|| flow.topic.name)?;
         push("sent", outcome.sent as f64);
@@ -159,6 +159,11 @@ fn measure(
             }
         }
     }
+    // The longest that a packet waited at the uplink, since the system was started.
+    let path = lab.path.as_ref().context("an uplink without an emulator")?;
+    let waited_us = path.counters(Direction::Forth).queue_time_max.as_secs_f64() * 1e6;
+    let at = f64::from(u8::from(with_camera));
+    figures.push("teleop", &system.name(), lab.kind.name(), at, "queue_max_us", waited_us);
     Ok(())
 }
 
