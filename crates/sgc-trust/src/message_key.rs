@@ -170,13 +170,13 @@ mod tests {
             for suite in Suite::ALL {
                 assert_eq!(key.fits(suite), suite.scheme() == made_for.scheme(), "{made_for} for {suite}");
                 let verifies =
-                    VerifyKey::new(suite, key.public()).is_some_and(|v| v.verify(b"m", &signature(&key)));
+                    VerifyKey::new(suite, key.public()).is_some_and(|v| v.verify(b"m", &signature(key)));
                 assert_eq!(verifies, suite.is_signed() && key.fits(suite), "{made_for} for {suite}");
             }
         }
         let (_, key) = &keys[1];
         let verify = VerifyKey::new(Suite::Standard, key.public()).unwrap();
-        assert!(!verify.verify(b"n", &signature(&key)) && !verify.verify(b"m", b""));
+        assert!(!verify.verify(b"n", &signature(key)) && !verify.verify(b"m", b""));
         assert!(VerifyKey::new(Suite::Standard, b"").is_none());
         assert!(VerifyKey::new(Suite::Paper, b"no key").is_none());
         assert_eq!(format!("{key:?}"), "MessageKey(..)");
