@@ -58,7 +58,7 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
         return Ok(());
     }
     let mut asker = Asker { node, seq: 0 };
-    while asker.question(&[], HEAD_BYTES, HELLO_EVERY)?.is_none() {
+    while !asker.is_heard()? {
         if matches!(asker.node.orders.next()?, Next::End) {
             return Ok(());
         }
@@ -70,7 +70,15 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
             Next::Wait => drop(asker.node.waiter.wait(LONG)?),
             Next::Do(Order::Ask { size, answer, count, seconds, warm_up, patience_seconds, rate }) => {
                 let patience = Duration::try_from_secs_f64(patience_seconds)?;
-                say(&asker.questions(&Questions { size, answer, count, seconds, warm_up, patience, rate })?)?;
+                say(&asker.questions(&Questions {
+                    size,
+                    answer,
+                    count,
+                    seconds,
+                    warm_up,
+                    patience,
+                    rate,
+                })?)?;
             }
             Next::Do(order) => bail!("{order:?} is not for ask"),
         }
@@ -83,9 +91,30 @@ struct Asker {
 }
 
 impl Asker {
+    /// Says hello, and whether any hello was answered meanwhile: the way may take longer than what is between two.
+    fn is_heard(&mut self) -> Result<bool> {
+        self.seq += 1;
+        let hello = Message { seq: self.seq, stamp_ns: now_ns(), data: &[] };
+        self.node.writers[0].write(&hello)?;
+        let deadline = Instant::now() + HELLO_EVERY;
+        let mut is_heard = false;
+        while let Some(left) = deadline.checked_duration_since(Instant::now()).filter(|_| !is_heard) {
+            self.node.waiter.wait(left)?;
+            self.node.readers[0].take(|_| {
+                is_heard = true;
+                Ok(())
+            })?;
+        }
+        Ok(is_heard)
+    }
+
     fn questions(&mut self, plan: &Questions) -> Result<Event> {
         let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
-        ensure!(size >= HEAD_BYTES + ANSWER_BYTES, "a request has {} bytes at least", HEAD_BYTES + ANSWER_BYTES);
+        ensure!(
+            size >= HEAD_BYTES + ANSWER_BYTES,
+            "a request has {} bytes at least",
+            HEAD_BYTES + ANSWER_BYTES
+        );
         ensure!((HEAD_BYTES..=ANSWER_MAX).contains(&answer), "no answer has {answer} bytes");
         ensure!(rate.is_none_or(|rate| rate > 0.0), "no rate");
         let mut data = vec![0x5a; size - HEAD_BYTES];

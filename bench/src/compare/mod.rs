@@ -54,6 +54,9 @@ const TABLES: [(&str, Table); 10] = [
     ("footprint", footprint::run),
 ];
 
+/// Of the many variants of `sgc`, those that a short run has.
+const QUICK: [&str; 4] = ["sgc-quic-group", "sgc-quic-group-router", "sgc-dtls-paper", "sgc-tcp-standard"];
+
 /// What `compare` is given.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct CompareArgs {
@@ -112,6 +115,9 @@ impl Compare {
             );
         }
         systems.retain(|system| is_among(&args.systems, &system.name()));
+        if args.quick && args.systems.is_empty() {
+            systems.retain(|system| !system.name().starts_with("sgc-") || QUICK.contains(&&*system.name()));
+        }
         for only in &args.only {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));

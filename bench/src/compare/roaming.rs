@@ -25,7 +25,7 @@ const BYTES: usize = 700;
 /// Flows before the address changes.
 const CALM: Duration = Duration::from_secs(2);
 /// Flows afterwards. Who takes longer than that to come back is as good as gone.
-const SECONDS_AFTER: f64 = 18.0;
+const SECONDS_AFTER: f64 = 25.0;
 const QUICK_SECONDS_AFTER: f64 = 4.0;
 /// What is under way has come when nothing came for so long.
 const QUIET_SECONDS: f64 = 5.0;

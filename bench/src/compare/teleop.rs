@@ -82,13 +82,18 @@ fn zenoh_tuning() -> Value {
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     let systems = compare.configured(PRIORITIES, zenoh_tuning())?;
-    for (path, delay) in PATHS {
+    for (name, delay) in PATHS {
+        let kind = path(name, delay);
+        if !compare.wants_path(&kind) {
+            continue;
+        }
         for with_camera in [false, true] {
             for system in &systems {
                 let name = system.name();
                 let camera = if with_camera { "with camera" } else { "without camera" };
+                let path = kind.name();
                 compare.note(&format!("teleop, {path}, {camera}: {name}"));
-                if let Err(error) = measure(compare, path, delay, with_camera, &**system, figures) {
+                if let Err(error) = measure(compare, kind, with_camera, &**system, figures) {
                     figures.leave_out(&format!("teleop {name} on {path}, {camera}"), format!("{error:#}"));
                 }
             }
@@ -105,13 +110,12 @@ fn path(name: &'static str, delay: Duration) -> PathKind {
 
 fn measure(
     compare: &Compare,
-    path_name: &'static str,
-    delay: Duration,
+    kind: PathKind,
     with_camera: bool,
     system: &dyn System,
     figures: &mut Figures,
 ) -> Result<()> {
-    let lab = Lab::new(path(path_name, delay), compare.load())?;
+    let lab = Lab::new(kind, compare.load())?;
     let flows: Vec<_> = FLOWS.iter().filter(|flow| with_camera || flow.topic.reliable).collect();
     let topics: Vec<_> = flows.iter().map(|flow| flow.topic.clone()).collect();
     let running = system.start(&lab, &topics)?;
@@ -142,7 +146,7 @@ fn measure(
     for (flow, source, sink) in &mut programs {
         let mut push = |metric: &str, value| {
             let (at, metric) = (f64::from(u8::from(with_camera)), format!("{}_{metric}", flow.figures));
-            figures.push("teleop", &system.name(), path_name, at, &metric, value);
+            figures.push("teleop", &system.name(), kind.name(), at, &metric, value);
         };
         let outcome = outcome(source, sink, seconds).with_context(|| flow.topic.name)?;
         push("sent", outcome.sent as f64);

@@ -9,9 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use quinn::crypto::rustls::HandshakeData;
-use quinn::{
-    AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, TokioRuntime, VarInt,
-};
+use quinn::{AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use rustls::NamedGroup;
 use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
@@ -31,6 +29,7 @@ use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::overload::Overload;
+use crate::prompt::PromptRuntime;
 use crate::race;
 use crate::socket;
 use crate::tls::Findings;
@@ -84,7 +83,7 @@ impl QuicListener {
         let local = socket.local_addr()?;
         let server = config::listener(flavor, &credentials, &options);
         let endpoint_config = config::endpoint(flavor, credentials.identity().reset_key(), local.port());
-        let runtime = Arc::new(TokioRuntime);
+        let runtime = Arc::new(PromptRuntime);
         let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
         let acceptor = Arc::new(Acceptor { flavor, credentials, options, metrics, dtls });
         Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), overload: Overload::default() })
@@ -269,7 +268,7 @@ impl QuicDialer {
         }
         let (socket, _) = socket::bind(socket::any_like(remote), &self.options)?;
         let config = config::endpoint(self.flavor, None, 0);
-        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(TokioRuntime))?;
+        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(PromptRuntime))?;
         Ok(slot.insert(endpoint).clone())
     }
 
