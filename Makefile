@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench-routing bench-teleop bench-transports bench-instructions scale clean-tools
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -17,6 +17,7 @@ help:
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
 	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
 	@echo '                 model-check (larger bounds)'
+	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, hours; ARGS="--quick" is minutes)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-instructions (whether hot functions take more instructions than before: bench/README.md; ARGS=--accept)'
@@ -44,6 +45,9 @@ deps-build:
 
 deps-test:
 	@scripts/install-deps.sh test
+
+deps-bench:
+	@scripts/install-deps.sh bench
 
 peers:
 	@scripts/build-peers.sh
@@ -114,6 +118,17 @@ vendors: peers
 model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
 
+# SGC and what users would pick instead, side by side; root. What SGC is measured beside is built first, each where `compare`
+# looks for it: the load generator with DDS Security, and the Zenoh bridge as its own project builds it, which takes long.
+bench: build
+	@scripts/install-deps.sh bench
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
+		--target-dir bench/target/dds-security
+	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- compare \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
+
 # A workspace of its own, since zenoh is large: no part of `make test`.
 bench-routing: build
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml -- all \
@@ -126,10 +141,15 @@ bench-teleop: deps-build
 bench-transports: deps-build
 	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- transports $(ARGS)
 
+# What `compare` runs beside `sgc`: the Zenoh bridge (minutes, the first time), and talkers with DDS Security.
+bench-peers: deps-bench
+	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
+		--target-dir bench/target/dds-security
+
 # Compares with bench/instructions.json and fails if something grew. ARGS=--accept takes what is for what is right, ARGS=seal
 # counts those with that in their names.
-bench-instructions:
-	@scripts/install-deps.sh bench
+bench-instructions: deps-bench
 	$(CARGO) bench --locked --manifest-path bench/Cargo.toml -p sgc-bench-instructions --bench hot -- $(ARGS)
 
 # How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.

@@ -2,7 +2,7 @@
 # Installs the Debian or Ubuntu packages that are missing, and nothing else.
 #   install-deps.sh build   what compiling the workspace needs
 #   install-deps.sh test    that, and what the test suite needs
-#   install-deps.sh bench   what compiling needs, and what counting instructions does
+#   install-deps.sh bench   what `build` does, what SGC is measured beside (make bench), and what counts instructions
 # A need is met when its probe succeeds, however it came here; only then unmet ones are installed, and it says which and why.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -61,6 +61,13 @@ if [ "$what" = test ]; then
     need 'command -v openssl' openssl -- "a DTLS program that is not ours"
 fi
 if [ "$what" = bench ]; then
+    need 'command -v ip' iproute2 -- "networks of their own for what is measured (ip netns)"
+    need 'command -v wireguard-go' wireguard-go -- "DDS over WireGuard"
+    need 'command -v wg' wireguard-tools -- "DDS over WireGuard: its keys"
+    need 'command -v openssl' openssl -- "certificates for Zenoh over TLS, a keystore for DDS Security"
+    need 'compiles c openssl/ssl.h' libssl-dev -- "DDS Security in the load generator's Cyclone DDS"
+    need 'command -v ssh' openssh-client -- "files by SSH and SFTP"
+    need 'test -x /usr/sbin/sshd' openssh-server -- "files by SSH and SFTP"
     need 'command -v valgrind' valgrind -- "counts instructions (make bench-instructions)"
 fi
 [ ${#packages[@]} -gt 0 ] || exit 0

@@ -4,6 +4,7 @@
 //! before: so each run has everything in it that a start has, the owner's advertisements, the subscriber's requests to
 //! join its catalogue and its topic, two grants, and the message.
 
+use std::path::Path;
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -54,7 +55,7 @@ struct Figures {
 
 /// Measures all kinds of publishers.
 pub(crate) fn run(args: &RunArgs) -> Result<Report> {
-    tracing::subscriber::set_global_default(tracing_subscriber::registry().with(LinkWatch))?;
+    watch_links()?;
     let starts = if args.quick { 5 } else { 200 };
     let mut figures = Vec::new();
     for publisher in [Publisher::Latched, Publisher::Stream] {
@@ -88,8 +89,36 @@ fn measure(args: &RunArgs, publisher: Publisher, suite: Suite, starts: usize) ->
     let (fleet, dir) = (BenchFleet::new()?, tempfile::tempdir()?);
     fleet.write_router(dir.path())?;
     let router = SgcRouter::start(&args.sgc, dir.path())?;
+    measure_at(&router, &fleet, dir.path(), publisher, suite, starts)
+}
+
+/// From a publisher's link to a latched message at the subscriber, by this router, milliseconds.
+pub(crate) fn latched_after_link_ms(
+    router: &SgcRouter,
+    fleet: &BenchFleet,
+    dir: &Path,
+    suite: Suite,
+    starts: usize,
+) -> Result<Spread> {
+    // If another part of this process watches, it sees the same.
+    let _ = watch_links();
+    Ok(measure_at(router, fleet, dir, Publisher::Latched, suite, starts)?.after_link_ms)
+}
+
+fn watch_links() -> Result<()> {
+    Ok(tracing::subscriber::set_global_default(tracing_subscriber::registry().with(LinkWatch))?)
+}
+
+fn measure_at(
+    router: &SgcRouter,
+    fleet: &BenchFleet,
+    dir: &Path,
+    publisher: Publisher,
+    suite: Suite,
+    starts: usize,
+) -> Result<Figures> {
     let (near, far) = (FakeDomain::default(), FakeDomain::default());
-    let mut desk = config(dir.path(), "desk", &[&router.url])?;
+    let mut desk = config(dir, "desk", &[&router.url])?;
     desk.uses = vec![usage(TOPIC, "robot")?];
     let desk = Node::start(desk, fleet.issue("desk", false)?, &far)?;
     let qos = match publisher {
@@ -110,9 +139,10 @@ fn measure(args: &RunArgs, publisher: Publisher, suite: Suite, starts: usize) ->
         Ok(desk.status()?["links"].as_array().is_some_and(|l| !l.is_empty()))
     })?;
 
+    let others = router.links()?;
     let (mut after_link, mut after_start) = (Vec::new(), Vec::new());
     for _ in 0..starts {
-        let mut robot = config(dir.path(), "robot", &[&router.url])?;
+        let mut robot = config(dir, "robot", &[&router.url])?;
         robot.shares = vec![share(TOPIC, "desk", suite)?];
         *link_up() = None;
         let begun = Instant::now();
@@ -127,7 +157,9 @@ fn measure(args: &RunArgs, publisher: Publisher, suite: Suite, starts: usize) ->
         // The next start finds what the first one found: nobody has a name or a grant of this one.
         let granted = desk.route_state()?;
         drop(robot);
-        wait("the publisher is forgotten", || Ok(router.links()? == 1 && desk.route_state()? != granted))?;
+        wait("the publisher is forgotten", || {
+            Ok(router.links()? == others && desk.route_state()? != granted)
+        })?;
         while heard.try_recv().is_ok() {}
     }
     Ok(Figures {

@@ -1,5 +1,7 @@
 //! Processes that are measured: started, found by the address that they print, ended by closing their standard input.
 
+use std::collections::HashMap;
+use std::ffi::OsString;
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -39,6 +41,11 @@ impl Server {
     /// This program once more, as `role`.
     pub(crate) fn own(role: &str) -> Result<Self> {
         Self::start(Command::new(std::env::current_exe()?).arg(role))
+    }
+
+    /// Its process id.
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
     }
 
     /// CPU time that its threads have taken, user and system, seconds.
@@ -152,6 +159,24 @@ pub(crate) fn cpu_seconds_of(pid: u32) -> f64 {
 pub(crate) fn resident_bytes_of(pid: u32) -> (u64, u64) {
     let status = format!("/proc/{pid}/status");
     (field_kib(&status, "VmRSS") * 1024, field_kib(&status, "VmHWM") * 1024)
+}
+
+/// CPU time of each thread that a process has now, seconds.
+pub(crate) fn thread_seconds_of(pid: u32) -> HashMap<OsString, f64> {
+    let threads = fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    let spent = |task: fs::DirEntry| {
+        let text = fs::read_to_string(task.path().join("schedstat")).ok()?;
+        Some((task.file_name(), text.split(' ').next()?.parse::<f64>().ok()? / 1e9))
+    };
+    threads.filter_map(spent).collect()
+}
+
+/// A number of a process's /proc/PID/status, in the unit that stands there.
+pub(crate) fn status_field_of(pid: u32, field: &str) -> Result<u64> {
+    let text = fs::read_to_string(format!("/proc/{pid}/status"))?;
+    let line = text.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':'));
+    let value = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+    value.with_context(|| format!("a process without {field}"))
 }
 
 fn cpu_seconds(tasks: &str) -> f64 {

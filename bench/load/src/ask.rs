@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
 use crate::dds::Message;
-use crate::node::{HELLO_EVERY, LONG, Node};
+use crate::node::{LONG, Node};
 use crate::ping::HEAD_BYTES;
 use crate::report::{Event, Next, Order, say};
 use crate::{Common, now_ns};
@@ -58,7 +58,8 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
         return Ok(());
     }
     let mut asker = Asker { node, seq: 0 };
-    while asker.question(&[], HEAD_BYTES, HELLO_EVERY)?.is_none() {
+    while !asker.node.is_heard(asker.seq)? {
+        asker.seq += 1;
         if matches!(asker.node.orders.next()?, Next::End) {
             return Ok(());
         }
@@ -70,7 +71,15 @@ pub(crate) fn ask(args: &AskArgs) -> Result<()> {
             Next::Wait => drop(asker.node.waiter.wait(LONG)?),
             Next::Do(Order::Ask { size, answer, count, seconds, warm_up, patience_seconds, rate }) => {
                 let patience = Duration::try_from_secs_f64(patience_seconds)?;
-                say(&asker.questions(&Questions { size, answer, count, seconds, warm_up, patience, rate })?)?;
+                say(&asker.questions(&Questions {
+                    size,
+                    answer,
+                    count,
+                    seconds,
+                    warm_up,
+                    patience,
+                    rate,
+                })?)?;
             }
             Next::Do(order) => bail!("{order:?} is not for ask"),
         }
@@ -85,7 +94,11 @@ struct Asker {
 impl Asker {
     fn questions(&mut self, plan: &Questions) -> Result<Event> {
         let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
-        ensure!(size >= HEAD_BYTES + ANSWER_BYTES, "a request has {} bytes at least", HEAD_BYTES + ANSWER_BYTES);
+        ensure!(
+            size >= HEAD_BYTES + ANSWER_BYTES,
+            "a request has {} bytes at least",
+            HEAD_BYTES + ANSWER_BYTES
+        );
         ensure!((HEAD_BYTES..=ANSWER_MAX).contains(&answer), "no answer has {answer} bytes");
         ensure!(rate.is_none_or(|rate| rate > 0.0), "no rate");
         let mut data = vec![0x5a; size - HEAD_BYTES];

@@ -150,6 +150,9 @@ pub(crate) fn sink(args: &SinkArgs) -> Result<()> {
 struct Tally {
     run: u32,
     received: Vec<u32>,
+    /// When each reader's last came; 0 if none did.
+    last_ns: Vec<u64>,
+    silence_ns: u64,
     ended_ns: u64,
     ages_us: Vec<f32>,
     /// Every n-th age is kept.
@@ -159,12 +162,17 @@ struct Tally {
 
 impl Tally {
     fn new(readers: usize, run: u32) -> Self {
-        Self { run, received: vec![0; readers], ended_ns: 0, ages_us: Vec::new(), stride: 1, seen: 0 }
+        let (received, last_ns) = (vec![0; readers], vec![0; readers]);
+        Self { run, received, last_ns, silence_ns: 0, ended_ns: 0, ages_us: Vec::new(), stride: 1, seen: 0 }
     }
 
     fn count(&mut self, reader: usize, stamp_ns: u64) {
         let now = now_ns();
         self.received[reader] += 1;
+        let last = std::mem::replace(&mut self.last_ns[reader], now);
+        if last > 0 {
+            self.silence_ns = self.silence_ns.max(now.saturating_sub(last));
+        }
         self.ended_ns = now;
         self.seen += 1;
         if !self.seen.is_multiple_of(self.stride) {
@@ -190,6 +198,7 @@ impl Tally {
             run: self.run,
             received: self.received.clone(),
             ended_ns: self.ended_ns,
+            silence_us: self.silence_ns as f64 / 1e3,
             age_us: [at(0.5), at(0.99), at(1.0)],
         }
     }

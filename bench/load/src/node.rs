@@ -1,13 +1,13 @@
 //! A ROS 2 node: a participant whose readers and writers are told of in `ros_discovery_info`.
 
 use std::ffi::CString;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
-use crate::Common;
-use crate::dds::{Network, Reader, Waiter, Writer};
+use crate::dds::{Message, Network, Reader, Waiter, Writer};
 use crate::report::{Event, Next, Orders, say};
+use crate::{Common, now_ns};
 
 /// How long is waited where only an event ends the wait.
 pub(crate) const LONG: Duration = Duration::from_secs(3600);
@@ -69,5 +69,21 @@ impl Node {
             }
             self.waiter.wait(LONG)?;
         }
+    }
+
+    /// Says hello on the first topic, and whether anything came back on the first of the other way, an answer to an earlier
+    /// hello too: the way may take longer than the time between two.
+    pub(crate) fn is_heard(&self, seq: u64) -> Result<bool> {
+        self.writers[0].write(&Message { seq, stamp_ns: now_ns(), data: &[] })?;
+        let deadline = Instant::now() + HELLO_EVERY;
+        let mut is_heard = false;
+        while let Some(left) = deadline.checked_duration_since(Instant::now()).filter(|_| !is_heard) {
+            self.waiter.wait(left)?;
+            self.readers[0].take(|_| {
+                is_heard = true;
+                Ok(())
+            })?;
+        }
+        Ok(is_heard)
     }
 }

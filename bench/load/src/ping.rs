@@ -6,7 +6,7 @@ use anyhow::{Result, bail, ensure};
 use clap::Args;
 
 use crate::dds::Message;
-use crate::node::{HELLO_EVERY, LONG, Node};
+use crate::node::{LONG, Node};
 use crate::report::{Event, Next, Order, say};
 use crate::{Common, now_ns};
 
@@ -30,7 +30,8 @@ pub(crate) fn ping(args: &PingArgs) -> Result<()> {
     }
     let mut ping = Ping { node, seq: 0 };
     // Matched is what is near; whatever is in between may not be through yet, and forgets what nobody hears.
-    while ping.round_trip(&[], HELLO_EVERY)?.is_none() {
+    while !ping.node.is_heard(ping.seq)? {
+        ping.seq += 1;
         if matches!(ping.node.orders.next()?, Next::End) {
             return Ok(());
         }

@@ -118,6 +118,8 @@ pub(crate) enum Event {
         received: Vec<u32>,
         /// When the last came that any reader got, by the monotonic clock, ns; 0 if none did.
         ended_ns: u64,
+        /// The longest time between two messages of one reader, µs.
+        silence_us: f64,
         /// From before it was written until it was taken: middle, 99 of 100, most, of all readers, µs.
         age_us: [f64; 3],
     },

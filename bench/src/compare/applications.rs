@@ -39,7 +39,8 @@ const APPLICATIONS: [Application; 4] = [
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    for kind in [PathKind::Bare, PathKind::Paper, PathKind::Lossy] {
+    let kinds = [PathKind::Bare, PathKind::Paper, PathKind::Lossy];
+    for kind in kinds.into_iter().filter(|kind| compare.wants_path(kind)) {
         for system in compare.systems() {
             let name = system.name();
             if !matches!(kind, PathKind::Bare) && !is_told_apart(&name) {

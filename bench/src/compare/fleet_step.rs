@@ -48,6 +48,9 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     for (name, delay) in [("near", NEAR), ("far", FAR)] {
         let profile = Profile { delay, ..Profile::default() };
         let kind = PathKind::Other(name, [profile; 2]);
+        if !compare.wants_path(&kind) {
+            continue;
+        }
         let steps = if compare.is_quick() { 5 } else { 40 };
         compare.note(&format!("fleet step, {name}: ssh"));
         let outcome = over_ssh(compare, kind, steps);

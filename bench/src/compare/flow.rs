@@ -1,4 +1,4 @@
-//! One way: a program that sends and one that counts, at the two ends of a system, and what came of their runs.
+//! One way: a program that sends and some that count, at the two ends of a system, and what came of their runs.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::lab::{Lab, Side};
 use super::program::Program;
-use super::system::Running;
+use super::system::{Dds, Running};
 
 /// How long a system may take until the first message has arrived.
 pub(crate) const CONNECT_MAX: Duration = Duration::from_secs(30);
@@ -24,7 +24,7 @@ pub(crate) struct FlowSpec {
     pub(crate) topic: &'static str,
     /// Where it is sent from; it is counted at the other place.
     pub(crate) from: Side,
-    /// Readers there, all of one process.
+    /// Readers there, all of one process in each local network.
     pub(crate) readers: usize,
     /// Whether nothing may be lost.
     pub(crate) reliable: bool,
@@ -54,11 +54,11 @@ pub(crate) struct Outcome {
     pub(crate) received: Vec<u32>,
     /// From before the first was written until the last had been taken.
     pub(crate) seconds: f64,
-    /// From before a message was written until it was taken: p50, p99, most, µs.
+    /// From before a message was written until it was taken: p50, p99, most, µs; of several local networks the worst.
     pub(crate) age_us: [f64; 3],
     /// CPU time of the system's processes meanwhile, seconds.
     pub(crate) cpu_seconds: f64,
-    /// CPU time of the two programs meanwhile, seconds. Threads that have ended are not in it.
+    /// CPU time of these programs meanwhile, seconds. Threads that have ended are not in it.
     pub(crate) load_cpu_seconds: f64,
 }
 
@@ -74,11 +74,11 @@ impl Outcome {
     }
 }
 
-/// Both programs.
+/// The programs.
 #[derive(Debug)]
 pub(crate) struct Flow {
     source: Program,
-    sink: Program,
+    sinks: Vec<Program>,
     run: u32,
 }
 
@@ -96,19 +96,30 @@ struct Counted {
 }
 
 impl Flow {
-    /// Starts both; every reader has had a message when this returns.
+    /// Starts them; every reader has had a message when this returns.
     pub(crate) fn start(lab: &Lab, running: &Running, spec: &FlowSpec) -> Result<Self> {
+        let there = [running.dds[spec.from.other() as usize].clone()];
+        Self::start_between(lab, &running.dds[spec.from as usize], &there, spec)
+    }
+
+    /// The same from a local network here to several there.
+    pub(crate) fn start_between(lab: &Lab, here: &Dds, there: &[Dds], spec: &FlowSpec) -> Result<Self> {
         let (depth, readers) = (spec.depth.to_string(), spec.readers.to_string());
         let mut args = vec!["--topic", spec.topic, "--depth", &depth];
         if spec.reliable {
             args.push("--reliable");
         }
         let sink_args = [&["sink"][..], &args, &["--readers", &readers]].concat();
-        let mut sink = lab.load(running, spec.from.other(), &sink_args)?;
-        sink.soon("up")?;
-        let source = lab.load(running, spec.from, &[&["source"][..], &args].concat())?;
-        sink.until("connected", CONNECT_MAX)?;
-        Ok(Self { source, sink, run: 0 })
+        let sinks = there.iter().map(|dds| lab.load_in(dds, spec.from.other(), &sink_args));
+        let mut sinks = sinks.collect::<Result<Vec<_>>>()?;
+        for sink in &mut sinks {
+            sink.soon("up")?;
+        }
+        let source = lab.load_in(here, spec.from, &[&["source"][..], &args].concat())?;
+        for sink in &mut sinks {
+            sink.until("connected", CONNECT_MAX)?;
+        }
+        Ok(Self { source, sinks, run: 0 })
     }
 
     /// Sends and counts.
@@ -121,22 +132,32 @@ impl Flow {
         }}))?;
         let most = Duration::from_secs_f64(order.seconds) + SPARE;
         let sent: Sent = serde_json::from_value(self.source.until("sent", most)?)?;
-        self.sink.order(&json!({ "count": {
-            "run": self.run, "last": sent.count, "quiet_seconds": QUIET.as_secs_f64(),
-        }}))?;
-        let counted = self.sink.until("counted", most + QUIET)?;
-        let counted: Counted = serde_json::from_value(counted).context("what a sink counted")?;
+        for sink in &mut self.sinks {
+            sink.order(&json!({ "count": {
+                "run": self.run, "last": sent.count, "quiet_seconds": QUIET.as_secs_f64(),
+            }}))?;
+        }
+        let (mut received, mut ended_ns, mut age_us) = (Vec::new(), 0, [0.0_f64; 3]);
+        for sink in &mut self.sinks {
+            let counted = sink.until("counted", most + QUIET)?;
+            let counted: Counted = serde_json::from_value(counted).context("what a sink counted")?;
+            received.extend(counted.received);
+            ended_ns = ended_ns.max(counted.ended_ns);
+            for (worst, age) in age_us.iter_mut().zip(counted.age_us) {
+                *worst = worst.max(age);
+            }
+        }
         Ok(Outcome {
             sent: sent.count,
-            received: counted.received,
-            seconds: counted.ended_ns.saturating_sub(sent.begun_ns) as f64 / 1e9,
-            age_us: counted.age_us,
+            received,
+            seconds: ended_ns.saturating_sub(sent.begun_ns) as f64 / 1e9,
+            age_us,
             cpu_seconds: running.cpu_seconds() - cpu,
             load_cpu_seconds: self.cpu_seconds() - load_cpu,
         })
     }
 
     fn cpu_seconds(&self) -> f64 {
-        self.source.cpu_seconds() + self.sink.cpu_seconds()
+        self.source.cpu_seconds() + self.sinks.iter().map(Program::cpu_seconds).sum::<f64>()
     }
 }

@@ -13,7 +13,7 @@ use sgc_testkit::netsim::{Loss, Namespace, Profile, TunLink};
 use tempfile::TempDir;
 
 use super::program::Program;
-use super::system::Running;
+use super::system::{Dds, Running};
 use crate::uplink::{FAR, NEAR, Uplink};
 
 /// The interface at each end of the path.
@@ -93,10 +93,8 @@ impl PathKind {
 /// The two places. What was started in them has to end before it is dropped.
 pub(crate) struct Lab {
     /// Goes first, as its devices are in the namespaces. None on [`PathKind::Bare`].
-    pub(crate) path: Option<TunLink>,
+    _path: Option<TunLink>,
     places: [Arc<Namespace>; 2],
-    /// What lies between.
-    pub(crate) kind: PathKind,
     /// For all that is written while it is there.
     pub(crate) dir: TempDir,
     load: PathBuf,
@@ -118,7 +116,7 @@ impl Lab {
             place.ip(&["link", "set", "lo", "multicast", "on"])?;
         }
         let dir = tempfile::tempdir()?;
-        Ok(Self { path, places, kind, dir, load: load.to_owned(), started: AtomicU32::new(0) })
+        Ok(Self { _path: path, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
     }
 
     /// The namespace of a place.
@@ -148,7 +146,11 @@ impl Lab {
     /// A program of `load` at a place, in the local network that a system brings there: `args` are its role and what that
     /// is given, domain left out.
     pub(crate) fn load(&self, running: &Running, side: Side, args: &[&str]) -> Result<Program> {
-        let dds = &running.dds[side as usize];
+        self.load_in(&running.dds[side as usize], side, args)
+    }
+
+    /// The same in any local network of a place.
+    pub(crate) fn load_in(&self, dds: &Dds, side: Side, args: &[&str]) -> Result<Program> {
         let mut command = self.command(side, dds.load.as_deref().unwrap_or(&self.load));
         command.args(args).args(["--domain", &dds.domain.to_string()]);
         command.env("CYCLONEDDS_URI", &dds.uri);

@@ -9,16 +9,20 @@ mod fan_out;
 mod figures;
 mod fleet_step;
 mod flow;
+mod footprint;
 mod goals;
 mod lab;
 mod multi_hop;
 mod plot;
 mod program;
 mod report;
+mod roaming;
 mod round_trip;
+mod start_up;
 mod system;
 mod tally;
 mod tcp;
+mod teleop;
 mod throughput;
 
 use std::path::{Path, PathBuf};
@@ -28,7 +32,7 @@ use clap::Args;
 use sgc_testkit::netsim;
 
 use lab::PathKind;
-use system::System;
+use system::{Peers, System};
 
 pub(crate) use figures::Figures;
 pub(crate) use report::Run;
@@ -37,14 +41,21 @@ pub(crate) use report::Run;
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 6] = [
+const TABLES: [(&str, Table); 10] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    ("start-up", start_up::run),
     ("applications", applications::run),
     ("fleet-step", fleet_step::run),
     ("fan-out", fan_out::run),
     ("multi-hop", multi_hop::run),
+    ("teleop", teleop::run),
+    ("roaming", roaming::run),
+    ("footprint", footprint::run),
 ];
+
+/// Of the many variants of `sgc`, those that a short run has.
+const QUICK: [&str; 4] = ["sgc-quic-group", "sgc-quic-group-router", "sgc-dtls-paper", "sgc-tcp-standard"];
 
 /// What `compare` is given.
 #[derive(Args, Clone, Debug)]
@@ -58,6 +69,8 @@ pub(crate) struct CompareArgs {
     /// Where the results go
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
+    #[command(flatten)]
+    peers: Peers,
     /// These tables alone
     #[arg(long, value_name = "TABLE,…", value_delimiter = ',')]
     only: Vec<String>,
@@ -90,8 +103,9 @@ impl Compare {
             None => std::env::current_exe()?.with_file_name("load"),
         };
         let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
-        let mut systems = system::all(&args.sgc)?;
+        let mut systems = system::all(&args.sgc, &args.peers)?;
         let mut names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        names.extend(system::CONFIGURED.map(str::to_owned));
         names.push(tcp::NAME.to_owned());
         for pattern in &args.systems {
             ensure!(
@@ -101,6 +115,9 @@ impl Compare {
             );
         }
         systems.retain(|system| is_among(&args.systems, &system.name()));
+        if args.quick && args.systems.is_empty() {
+            systems.retain(|system| !system.name().starts_with("sgc-") || QUICK.contains(&&*system.name()));
+        }
         for only in &args.only {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
@@ -121,6 +138,17 @@ impl Compare {
     /// Whether a path is asked for.
     pub(crate) fn wants_path(&self, kind: &PathKind) -> bool {
         self.args.paths.is_empty() || self.args.paths.iter().any(|path| path == kind.name())
+    }
+
+    /// What is compared where users configure more than the names of topics; see [`system::configured`].
+    pub(crate) fn configured(
+        &self,
+        priorities: &'static [(&'static str, &'static str)],
+        zenoh: serde_json::Value,
+    ) -> Result<Vec<Box<dyn System>>> {
+        let mut systems = system::configured(&self.args.sgc, &self.args.peers, priorities, zenoh)?;
+        systems.retain(|system| self.wants(&system.name()));
+        Ok(systems)
     }
 
     /// The program that talks and listens.
@@ -172,6 +200,9 @@ fn fits(pattern: &str, name: &str) -> bool {
 pub(crate) fn run(args: CompareArgs) -> Result<()> {
     let compare = Compare::new(args)?;
     let mut figures = Figures::default();
+    if compare.wants("rosbridge") {
+        figures.leave_out("rosbridge", system::why_no_rosbridge());
+    }
     for (name, table) in TABLES {
         if is_among(&compare.args.only, name) {
             if let Err(error) = table(&compare, &mut figures) {

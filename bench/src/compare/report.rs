@@ -114,7 +114,7 @@ struct About<'a> {
     title: &'a str,
     /// A paragraph, and an empty line.
     says: &'a str,
-    /// What `at` counts.
+    /// What `at` counts; nothing if it counts nothing.
     at: &'static str,
     at_unit: Unit,
     plot: Plot,
@@ -189,14 +189,14 @@ impl<'a> About<'a> {
                 "Teleop under load",
                 "Commands to a robot (50 Hz × 64 B), its state (30 Hz × 700 B) and a camera (30 Hz × 60 KB) from it, which wants 14 Mbit/s \
                  of an uplink that carries 5, with a queue of 200 ms. Ages, from publishing to the subscriber.\n",
-                "",
+                "cameras",
                 Unit::Plain,
                 Plot::Nothing,
             ),
             "roaming" => (
                 "Roaming",
-                "A robot changes its address while a reliable topic flows.\n",
-                "",
+                "A robot changes its address while a reliable topic of 50 Hz flows (0), and later changes back (1).\n",
+                "return",
                 Unit::Plain,
                 Plot::Nothing,
             ),
@@ -206,6 +206,21 @@ impl<'a> About<'a> {
             other => (other, "", "", Unit::Plain, Plot::Nothing),
         };
         About { table, title, says, at, at_unit, plot }
+    }
+}
+
+impl About<'_> {
+    /// Whether its tables have a place each and metrics as columns, since there are more of these than places.
+    fn has_many_metrics(&self) -> bool {
+        matches!(self.table, "throughput" | "teleop" | "roaming")
+    }
+
+    /// A place in words.
+    fn place(&self, at: f64) -> String {
+        match self.at_unit {
+            Unit::Bytes => format!("messages of {}", Unit::Bytes.text(at)),
+            unit => format!("{} {}", unit.text(at), self.at),
+        }
     }
 }
 
@@ -273,23 +288,35 @@ fn path_tables(figures: &Figures, about: &About<'_>, path: &str) -> String {
     let cell =
         |family: &Family<'_>, system: &str, at: f64| family.cell(figures, about.table, system, path, at);
     let mut text = String::new();
-    if let [at] = *places {
-        let place = if about.at.is_empty() || at == 0.0 {
-            String::new()
-        } else {
-            format!(", {} {}", about.at_unit.text(at), about.at)
-        };
-        let _ = writeln!(text, "{}{place}\n", path_name(path));
-        let head: Vec<_> = families.iter().map(Family::name).collect();
-        header(&mut text, &head);
-        for system in &systems {
-            let cells = families.iter().map(|family| cell(family, system, at));
-            row(&mut text, system, cells);
+    if places.len() == 1 || about.has_many_metrics() {
+        for at in places {
+            let place = if about.at.is_empty() || (at == 0.0 && !about.has_many_metrics()) {
+                String::new()
+            } else {
+                format!(", {}", about.place(at))
+            };
+            let _ = writeln!(text, "{}{place}\n", path_name(path));
+            let is_any = |family: &&Family<'_>| {
+                systems.iter().any(|system| family.is_measured(figures, about.table, system, path, at))
+            };
+            let families: Vec<_> = families.iter().filter(is_any).collect();
+            header(&mut text, &families.iter().map(|family| family.name()).collect::<Vec<_>>());
+            for system in &systems {
+                let is_measured =
+                    |family: &&Family<'_>| family.is_measured(figures, about.table, system, path, at);
+                if families.iter().any(|family| is_measured(family)) {
+                    row(&mut text, system, families.iter().map(|family| cell(family, system, at)));
+                }
+            }
+            text.push('\n');
         }
-        text.push('\n');
         return text;
     }
     for family in &families {
+        if family.first() == "lost" && here.iter().all(|f| f.metric != "lost" || f.value == 0.0) {
+            let _ = writeln!(text, "{}: nothing lost\n", path_name(path));
+            continue;
+        }
         let _ = writeln!(text, "{}: {}, by {}\n", path_name(path), family.name(), or(about.at, "count"));
         let is_any =
             |at: &f64| systems.iter().any(|s| family.is_measured(figures, about.table, s, path, *at));
@@ -322,11 +349,13 @@ fn row(text: &mut String, system: &str, cells: impl Iterator<Item = String>) {
 /// A path in words.
 fn path_name(path: &str) -> String {
     let name = match path {
-        "bare" => "Bare link",
+        "bare" => "Bare link (`bare`)",
         "paper" => "76 ms round trip, 5 Mbit/s (`paper`)",
         "lossy" => "40 ms round trip, 50 Mbit/s, 2 % loss (`lossy`)",
         "near" => "10 ms round trip (`near`)",
         "far" => "76 ms round trip (`far`)",
+        "uplink" => "Uplink of 5 Mbit/s",
+        "uplink-40ms" => "Uplink of 5 Mbit/s, 40 ms one way",
         other => return format!("`{other}`"),
     };
     name.to_owned()
@@ -509,6 +538,9 @@ fn system_name(system: &str) -> String {
         "zenoh-tls" => "Zenoh bridge, TLS",
         "zenoh-bridge" => "Zenoh bridge",
         "ssh" => "SSH and SFTP",
+        "sgc-proxy" => "sgc proxy that shares",
+        "sgc-proxy-use" => "sgc proxy that uses",
+        "sgc-router" => "sgc router",
         other => other,
     };
     name.to_owned()
@@ -532,6 +564,7 @@ fn look(system: &str) -> (Hue, Stroke) {
         return (hue, stroke);
     }
     match system {
+        "sgc-proxy-use" => (Hue::Blue, Stroke::Dashed),
         "direct" => (Hue::Grey, Stroke::Solid),
         "tcp" => (Hue::Grey, Stroke::Dashed),
         "wireguard" => (Hue::Orange, Stroke::Solid),
@@ -643,11 +676,7 @@ fn bar_plots(figures: &Figures, about: &About<'_>, metric: &str) -> Vec<Page> {
                 (path_name(path).replace('`', ""), bars.collect())
             })
             .collect();
-        let place = match about.at_unit {
-            Unit::Bytes => format!("messages of {}", Unit::Bytes.text(at)),
-            unit => format!("{} {}", unit.text(at), about.at),
-        };
-        let title = format!("{}, {place}", about.title);
+        let title = format!("{}, {}", about.title, about.place(at));
         let what = match unit {
             Unit::PerSecond => "messages a second; longer is better",
             _ if tail_metric != metric => "median, and the line to p99; shorter is better",
@@ -700,7 +729,7 @@ mod tests {
         figures.push("round-trip", "direct", "bare", 16.0, "p50_us", 100.0);
         let text = page(&run(figures), "report.md");
         assert!(
-            text.contains("Bare link: p50 / p99, by bytes of a message\n\n| | 16 B | 1 MB |\n"),
+            text.contains("Bare link (`bare`): p50 / p99, by bytes of a message\n\n| | 16 B | 1 MB |\n"),
             "{text}"
         );
         assert!(text.contains("| direct DDS | 100 / – µs | – |\n"), "{text}");

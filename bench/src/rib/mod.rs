@@ -8,6 +8,8 @@ mod frames;
 mod machine;
 mod socket;
 
+pub(crate) use socket::{Neighbour, Told};
+
 use std::process::Command;
 use std::time::Instant;
 

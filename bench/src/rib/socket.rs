@@ -12,7 +12,7 @@ use rand_core::SeedableRng as _;
 use serde::Serialize;
 use sgc_transport::{AnyLink, Dialer, Link, LinkOptions, LinkUrl};
 use sgc_trust::Identity;
-use sgc_wire::{AnswerBody, Control, Decode, Encode, Hello, JoinBody, SinkId};
+use sgc_wire::{AdvertBody, AnswerBody, Control, Decode, Encode, Hello, JoinBody, Name, SinkId};
 use tokio::sync::mpsc;
 
 use super::frames::{BATCH, Member, NAMES_PER_OWNER};
@@ -96,10 +96,160 @@ async fn hear(answer: &[u8], heard: &mpsc::Sender<SinkId>) -> Result<()> {
     Ok(heard.send(AnswerBody::from_slice(answer)?.sink).await?)
 }
 
+/// Owners that are connected, each with the advertisements that it has not sent yet.
+type Owners = Vec<(Member<End>, Vec<Bytes>)>;
+
+/// Connects owners of so many names and signs what they will say; the names, each with its owner.
+async fn sign(
+    url: &LinkUrl,
+    fleet: &BenchFleet,
+    names: usize,
+    answers: &Answers,
+    heard: &mpsc::Sender<SinkId>,
+    rng: &mut ChaCha20Rng,
+) -> Result<(Owners, Vec<(usize, Name)>)> {
+    let count = names.div_ceil(NAMES_PER_OWNER);
+    let per_owner = names.div_ceil(count.max(1));
+    let (mut owners, mut targets, mut left) = (Vec::new(), Vec::new(), names);
+    for n in 0..count {
+        let identity = fleet.issue(&format!("owner-{n}"), false)?;
+        let end = End::connect(url, identity.clone(), answers.clone(), heard.clone()).await?;
+        let mut owner = Member::new(identity, end);
+        let mut own = per_owner.min(left);
+        left -= own;
+        let mut frames = Vec::new();
+        while own > 0 {
+            let advert = owner.advert(own.min(BATCH), now().unix, rng);
+            own -= advert.names.len();
+            targets.extend(advert.names.iter().map(|name| (n, *name)));
+            frames.push(advert.bytes);
+        }
+        owners.push((owner, frames));
+    }
+    Ok((owners, targets))
+}
+
+/// Sends what they have to say, all of them at once.
+async fn tell_all(owners: &mut Owners) -> Result<()> {
+    let mut sending = tokio::task::JoinSet::new();
+    for (owner, frames) in owners {
+        let (end, frames) = (owner.link.clone(), std::mem::take(frames));
+        sending.spawn(async move {
+            for frame in frames {
+                end.send(frame).await?;
+            }
+            anyhow::Ok(())
+        });
+    }
+    while let Some(sent) = sending.join_next().await {
+        sent??;
+    }
+    Ok(())
+}
+
+/// Nodes that are linked to a router for as long as this lasts, and the names that they own there.
+pub(crate) struct Told {
+    owners: Owners,
+    rng: ChaCha20Rng,
+    runtime: tokio::runtime::Runtime,
+}
+
+impl Told {
+    /// Owners of so many names, which are signed and not told yet.
+    pub(crate) fn prepare(url: &str, fleet: &BenchFleet, names: usize) -> Result<Self> {
+        let (runtime, mut rng) = (runtime()?, ChaCha20Rng::seed_from_u64(3));
+        let ((heard, _), answers) = (mpsc::channel(1), Answers::default());
+        let url = url.parse()?;
+        let signed = sign(&url, fleet, names, &answers, &heard, &mut rng);
+        let (owners, _) = runtime.block_on(signed)?;
+        Ok(Self { owners, rng, runtime })
+    }
+
+    /// Nodes without names, numbered.
+    pub(crate) fn connect(url: &str, fleet: &BenchFleet, nodes: std::ops::Range<usize>) -> Result<Self> {
+        let (runtime, rng) = (runtime()?, ChaCha20Rng::seed_from_u64(4));
+        let (heard, _) = mpsc::channel(1);
+        let url = url.parse()?;
+        let mut owners = Vec::new();
+        for n in nodes {
+            let identity = fleet.issue(&format!("node-{n}"), false)?;
+            let end = End::connect(&url, identity.clone(), Answers::default(), heard.clone());
+            owners.push((Member::new(identity, runtime.block_on(end)?), Vec::new()));
+        }
+        Ok(Self { owners, rng, runtime })
+    }
+
+    /// How many links they have, one each.
+    pub(crate) fn links(&self) -> usize {
+        self.owners.len()
+    }
+
+    /// Tells the router of the names.
+    pub(crate) fn tell(&mut self) -> Result<()> {
+        self.runtime.block_on(tell_all(&mut self.owners))
+    }
+
+    /// Tells it of one more name.
+    pub(crate) fn tell_one(&mut self) -> Result<()> {
+        let (owner, _) = self.owners.first_mut().context("nobody owns a name")?;
+        let advert = owner.advert(1, now().unix, &mut self.rng);
+        self.runtime.block_on(owner.link.send(advert.bytes))
+    }
+}
+
+/// Another router, which hears of every name and says nothing.
+pub(crate) struct Neighbour {
+    told: mpsc::Receiver<usize>,
+    _link: AnyLink,
+    _dialer: Dialer,
+    runtime: tokio::runtime::Runtime,
+}
+
+impl Neighbour {
+    /// Links it to a router and greets.
+    pub(crate) fn connect(url: &str, fleet: &BenchFleet) -> Result<Self> {
+        let runtime = runtime()?;
+        let dialer = Dialer::new(fleet.issue("neighbour", true)?, LinkOptions::default(), Arc::default());
+        let link = runtime.block_on(dialer.dial(&url.parse()?))?;
+        let (tell, told) = mpsc::channel(1024);
+        let reader = link.clone();
+        runtime.spawn(async move {
+            while let Ok(frame) = reader.recv_control().await {
+                let Ok(Control::Advert { signed, .. }) = Control::from_slice(&frame) else { continue };
+                let names = AdvertBody::from_slice(&signed.body).map_or(0, |body| body.blinds.len());
+                if tell.send(names).await.is_err() {
+                    return;
+                }
+            }
+        });
+        let hello = Hello { minor: 0, incarnation: 1, transit: true };
+        runtime.block_on(link.send_control(Control::Hello(hello).to_bytes()))?;
+        Ok(Self { told, _link: link, _dialer: dialer, runtime })
+    }
+
+    /// Waits until it has heard of so many names.
+    pub(crate) fn hears(&mut self, names: usize) -> Result<()> {
+        let told = &mut self.told;
+        self.runtime.block_on(async {
+            let mut heard = 0;
+            while heard < names {
+                match tokio::time::timeout(crate::process::PATIENCE, told.recv()).await {
+                    Ok(Some(more)) => heard += more,
+                    _ => bail!("a neighbour hears of {heard} names instead of {names}"),
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+fn runtime() -> Result<tokio::runtime::Runtime> {
+    Ok(tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?)
+}
+
 /// Measures one size.
 pub(super) fn run(sgc: &Path, names: usize) -> Result<OverSockets> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    runtime.block_on(measure(sgc, names))
+    runtime()?.block_on(measure(sgc, names))
 }
 
 async fn measure(sgc: &Path, names: usize) -> Result<OverSockets> {
@@ -112,40 +262,12 @@ async fn measure(sgc: &Path, names: usize) -> Result<OverSockets> {
     let (heard, mut hears) = mpsc::channel(2 * SUBSCRIPTIONS);
 
     // Everything is signed before the clock runs.
-    let count = names.div_ceil(NAMES_PER_OWNER);
-    let per_owner = names.div_ceil(count);
-    let (mut owners, mut targets, mut left) = (Vec::new(), Vec::new(), names);
-    for n in 0..count {
-        let identity = fleet.issue(&format!("owner-{n}"), false)?;
-        let end = End::connect(&url, identity.clone(), answers.clone(), heard.clone()).await?;
-        let mut owner = Member::new(identity, end);
-        let mut own = per_owner.min(left);
-        left -= own;
-        let mut frames = Vec::new();
-        while own > 0 {
-            let advert = owner.advert(own.min(BATCH), now().unix, &mut rng);
-            own -= advert.names.len();
-            targets.extend(advert.names.iter().map(|name| (n, *name)));
-            frames.push(advert.bytes);
-        }
-        owners.push((owner, frames));
-    }
+    let (mut owners, targets) = sign(&url, &fleet, names, &answers, &heard, &mut rng).await?;
+    let count = owners.len();
     let before = router.routed_names()?;
     let (cpu, bytes) = (router.process.cpu_seconds(), router.process.resident_bytes());
     let begun = Instant::now();
-    let mut sending = tokio::task::JoinSet::new();
-    for (owner, frames) in &mut owners {
-        let (end, frames) = (owner.link.clone(), std::mem::take(frames));
-        sending.spawn(async move {
-            for frame in frames {
-                end.send(frame).await?;
-            }
-            anyhow::Ok(())
-        });
-    }
-    while let Some(sent) = sending.join_next().await {
-        sent??;
-    }
+    tell_all(&mut owners).await?;
     tokio::task::block_in_place(|| router.until_routed(before + names as u64))?;
     let publish_us_per_name = begun.elapsed().as_secs_f64() * 1e6 / names as f64;
     let publish_cpu_us_per_name = (router.process.cpu_seconds() - cpu) * 1e6 / names as f64;

@@ -108,6 +108,12 @@ impl NativeQos {
         Ok(native)
     }
 
+    /// Lets a writer put samples into one packet until it is flushed.
+    pub(crate) fn set_batching(&self) {
+        // SAFETY: the object is valid.
+        unsafe { dds_qset_writer_batching(self.0, true) };
+    }
+
     pub(crate) fn set_user_data(&self, user_data: &[u8]) {
         if !user_data.is_empty() {
             // SAFETY: pointer and length are those of a slice, which is copied.

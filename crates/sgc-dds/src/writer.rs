@@ -10,7 +10,7 @@ use bytes::Bytes;
 use cyclors::{
     DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_create_writer,
     dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
-    dds_publication_matched_status, dds_wait_for_acks,
+    dds_publication_matched_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleKind};
 
@@ -40,6 +40,7 @@ pub struct CycloneWriter {
 impl CycloneWriter {
     pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
         let qos = participant.endpoint_qos(EndpointKind::Writer, spec, "")?;
+        qos.set_batching();
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
@@ -70,6 +71,24 @@ impl RosWriter for CycloneWriter {
     }
 
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        let written = self.write_ahead(kind, source_timestamp_ns, payload);
+        self.flush();
+        written
+    }
+
+    fn flush(&self) {
+        // SAFETY: takes a number, checked by Cyclone.
+        if let Err(reason) = check(unsafe { dds_write_flush(self.writer.handle()) }) {
+            tracing::error!(reason, "what was written does not leave");
+        }
+    }
+
+    fn write_ahead(
+        &self,
+        kind: SampleKind,
+        source_timestamp_ns: i64,
+        payload: Bytes,
+    ) -> Result<(), RosError> {
         let failed = |reason: String| RosError::Write { reason };
         let frame = Frame::new(&payload)?;
         if !(0..=TIMESTAMP_MAX_NS).contains(&source_timestamp_ns) {
@@ -106,6 +125,8 @@ impl RosWriter for CycloneWriter {
 
     fn wait_acknowledged(&self, max: Duration) -> bool {
         let ns = i64::try_from(max.as_nanos()).unwrap_or(INFINITE);
+        // What has not left cannot be acknowledged.
+        self.flush();
         // SAFETY: takes numbers; the handle is checked by Cyclone.
         unsafe { dds_wait_for_acks(self.writer.handle(), ns) >= 0 }
     }

@@ -612,6 +612,30 @@ fn partitions_keep_endpoints_apart() {
 }
 
 #[test]
+fn what_is_written_ahead_leaves_with_the_next_and_when_it_is_waited_for() {
+    let (ros, sgc) = (open(110, None), open(110, Some("arm-1")));
+    let many = with(spec("ahead"), |qos| qos.history = History::KeepLast(1000));
+    let (_reader, samples) = read(&ros, &many);
+    let writer = writer(&sgc, &many, 1);
+    let ahead = |text: &str| writer.write_ahead(SampleKind::Write, 1, string_cdr(text)).unwrap();
+    let arrive = |range: std::ops::Range<u32>| {
+        for i in range {
+            assert_eq!(next(&samples).payload, padded(&string_cdr(&i.to_string())));
+        }
+    };
+    // More than one packet of them, and one behind which none follows.
+    (0..900).for_each(|i| ahead(&i.to_string()));
+    write(&writer, &string_cdr("900"));
+    arrive(0..901);
+    ahead("901");
+    writer.flush();
+    arrive(901..902);
+    ahead("902");
+    assert!(writer.wait_acknowledged(PATIENCE), "it left");
+    arrive(902..903);
+}
+
+#[test]
 fn a_write_that_nobody_acknowledges_ends_with_a_timeout() {
     let (ros, sgc) = (open(90, None), open(90, Some("arm-1")));
     let (_reader, samples) = read(&ros, &spec("deaf"));

@@ -10,11 +10,11 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite, opened_bytes};
 use sgc_wire::{
     Decode, GRANT_SOURCES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader,
-    SinkId, SourceAnnounce, SourceId, TopicGrant,
+    SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::parking::{Parked, Parking};
@@ -229,6 +229,8 @@ pub struct Sink {
     parking: Parking,
     incomplete: u64,
     scratch: Vec<u8>,
+    /// For messages of one packet.
+    slab: Slab,
     progress: Arc<SinkProgress>,
 }
 
@@ -246,6 +248,7 @@ impl Sink {
             parking: Parking::default(),
             incomplete: 0,
             scratch: Vec::new(),
+            slab: Slab::default(),
             progress: Arc::default(),
         };
         sink.announce(grant.sources, None, false, &mut |_| ());
@@ -515,7 +518,9 @@ impl Sink {
         let key = key.ok_or(OpenError::Epoch { found: header.epoch })?;
         let text_bytes = opened_bytes(header);
         let mut opened = if header.fragments() == 1 {
-            Opened::Whole(vec![0; text_bytes])
+            let mut text = self.slab.room(text_bytes);
+            text.resize(text_bytes, 0);
+            Opened::Whole(text)
         } else if partials.place(header).is_some() {
             Opened::InPlace
         } else {
@@ -525,7 +530,8 @@ impl Sink {
             Opened::Aside(scratch)
         };
         let out = match &mut opened {
-            Opened::Whole(text) | Opened::Aside(text) => &mut text[..],
+            Opened::Whole(text) => &mut text[..],
+            Opened::Aside(text) => &mut text[..],
             Opened::InPlace => partials.place(header).unwrap_or_default(),
         };
         let mut result = key.open(header, payload, out);
@@ -545,10 +551,10 @@ impl Sink {
     /// Takes what a packet opened to: fragment, and behind the first one the head.
     fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
         let head = match opened {
-            Opened::Whole(text) | Opened::Aside(text) if header.index == 0 => {
-                let at = text.len() - MESSAGE_HEAD_BYTES;
-                let head = MessageHead::from_slice(&text[at..]).map_err(|_| SinkDrop::Head)?;
-                text.truncate(at);
+            Opened::Whole(_) | Opened::Aside(_) if header.index == 0 => {
+                let at = opened.text().len() - MESSAGE_HEAD_BYTES;
+                let head = MessageHead::from_slice(&opened.text()[at..]).map_err(|_| SinkDrop::Head)?;
+                opened.truncate(at);
                 // Number 0 is the mark that a history was sent, and nothing else.
                 if (head.kind == MessageKind::Synced) != (header.seq == 0) {
                     return Err(SinkDrop::Head);
@@ -597,15 +603,12 @@ impl Sink {
             return source.await_history(header.source);
         }
         let complete = match (opened, head) {
-            (Opened::Whole(text), Some(head)) => Some((head, Bytes::from(std::mem::take(text)))),
+            (Opened::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
             (opened, head) => {
                 if begins && header.total as usize > room {
                     return Err(SinkDrop::PartialsFull);
                 }
-                let fragment = match opened {
-                    Opened::Whole(text) | Opened::Aside(text) => Some(&text[..]),
-                    Opened::InPlace => None,
-                };
+                let fragment = (!matches!(opened, Opened::InPlace)).then(|| opened.text());
                 let max = self.limits.partials_per_source_max;
                 let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
                 self.incomplete += given_up;
@@ -626,7 +629,7 @@ impl Sink {
 /// Where a packet was opened to.
 enum Opened {
     /// Memory of its own, which becomes the message.
-    Whole(Vec<u8>),
+    Whole(BytesMut),
     /// Its place in the message.
     InPlace,
     /// Memory that is used again; the fragment is copied to its place.
@@ -637,8 +640,18 @@ impl Opened {
     /// What it was opened to, if that is here.
     fn text(&self) -> &[u8] {
         match self {
-            Self::Whole(text) | Self::Aside(text) => text,
+            Self::Whole(text) => text,
+            Self::Aside(text) => text,
             Self::InPlace => &[],
+        }
+    }
+
+    /// Leaves out what stands behind.
+    fn truncate(&mut self, bytes: usize) {
+        match self {
+            Self::Whole(text) => text.truncate(bytes),
+            Self::Aside(text) => text.truncate(bytes),
+            Self::InPlace => {}
         }
     }
 }

@@ -7,11 +7,11 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 
-use bytes::Bytes;
-use sgc_trust::{Batch, MessageKey, SourceKey, Suite};
+use bytes::{Bytes, BytesMut};
+use sgc_trust::{Batch, MessageKey, SourceKey, Suite, sealed_bytes, trailer_bytes_max};
 use sgc_wire::{
     Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader,
-    PayloadEncoding, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    PayloadEncoding, SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::history::{History, Kept, RecoveryLimits};
@@ -131,7 +131,8 @@ pub struct Source {
     seq: u64,
     batch: Batch,
     /// The packets of `batch`, sealed and not signed.
-    unsigned: Vec<(PacketHeader, Vec<u8>)>,
+    unsigned: Vec<(PacketHeader, BytesMut)>,
+    slab: Slab,
     history: History,
     progress: Arc<SourceProgress>,
 }
@@ -168,6 +169,7 @@ impl Source {
             seq: 0,
             batch: Batch::default(),
             unsigned: Vec::new(),
+            slab: Slab::default(),
             history,
             progress: Arc::new(progress),
         })
@@ -238,8 +240,9 @@ impl Source {
         self.progress.signatures.fetch_add(1, Release);
         for (index, (header, mut payload)) in self.unsigned.drain(..).enumerate() {
             signed.put_trailer(index, &mut payload);
-            emit(Packet { header, payload: Bytes::from(payload).into() });
+            emit(Packet { header, payload: payload.freeze().into() });
         }
+        self.batch.reuse(signed);
     }
 
     /// Numbers and keeps one message that nobody listens to, without sealing it: who is on another way to this
@@ -403,9 +406,13 @@ impl Source {
                 to: key.to(),
             };
             let start = index * usize::from(FRAGMENT_BYTES);
-            let sealed = key.seal(&header, head, &payload[start..start + header.fragment_bytes()]);
+            let fragment = &payload[start..start + header.fragment_bytes()];
+            let bytes = sealed_bytes(&header);
+            let mut sealed = self.slab.room(bytes + trailer_bytes_max(self.suite));
+            sealed.resize(bytes, 0);
+            key.seal(&header, head, fragment, &mut sealed);
             if !self.suite.is_signed() {
-                emit(Packet { header, payload: Bytes::from(sealed).into() });
+                emit(Packet { header, payload: sealed.freeze().into() });
                 continue;
             }
             self.batch.push(&header, &sealed);

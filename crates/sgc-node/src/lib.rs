@@ -6,6 +6,8 @@
 #![forbid(unsafe_code)]
 
 pub mod admin;
+#[cfg(test)]
+mod allocations;
 pub mod audit;
 mod authority;
 #[cfg(feature = "benchmarks")]

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
+use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError, prompt};
 use sgc_wire::{Label, Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
@@ -73,7 +73,7 @@ impl OutFlow {
             ended: watch::Sender::new(false),
         });
         let task = flow.clone();
-        tokio::spawn(async move {
+        prompt::spawn(async move {
             let mut sender = Sender {
                 by: link.clone(),
                 lane: None,

@@ -102,6 +102,20 @@ impl<T> Queue<T> {
         }
     }
 
+    /// Waits until an item is there; false once the queue is closed and empty.
+    pub(crate) async fn wait(&self) -> bool {
+        loop {
+            let is_closed = self.is_closed();
+            if !self.is_empty() {
+                return true;
+            }
+            if is_closed {
+                return false;
+            }
+            self.filled.notified().await;
+        }
+    }
+
     /// Takes the oldest item, if there is one.
     pub(crate) fn try_pop(&self) -> Option<T> {
         self.take()

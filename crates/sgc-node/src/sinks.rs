@@ -1,11 +1,12 @@
 //! This node's own subscribers: packets in, samples on the local network out.
 //!
 //! [`LocalSink::deliver`] opens packets on the task that received them. Writing may block, so each local
-//! writer has a thread, behind a bounded queue.
+//! writer has a thread, behind a bounded queue. Where it cannot block, a short message that nothing is ahead of is written
+//! by who received it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -36,6 +37,8 @@ const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
 const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
 /// Messages of a transient-local writer that are known again.
 const RECENT_MAX: usize = 4096;
+/// The longest message that is written by who received it.
+const AT_ONCE_BYTES_MAX: usize = 16 << 10;
 /// How long the network is held back by a local writer that takes nothing.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -343,7 +346,9 @@ impl LocalSink {
         }
         let mut evicted = 0;
         let tapped = self.taps.is_any().then(|| Tapped::of_message(&message));
-        if message.reliable {
+        if let Some(mut take) = writer.at_once(bytes) {
+            take(message, Next::Nothing);
+        } else if message.reliable {
             writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
         } else {
             writer.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
@@ -381,10 +386,29 @@ impl Drop for Releasing<'_> {
     }
 }
 
+/// What comes behind a message that is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Next {
+    /// Nothing that is there.
+    Nothing,
+    /// A message, when its time has come.
+    Later,
+    /// A message, at once.
+    AtOnce,
+}
+
+/// Takes messages, one after the other.
+type Take = Box<dyn FnMut(Message, Next) + Send>;
+
 /// The queue before a local writer's thread.
 pub(crate) struct WriterQueue {
     queue: Queue<Message>,
     shaper: Mutex<Shaper>,
+    /// Whether nothing is set of how much is written, to be seen without the lock.
+    is_unshaped: AtomicBool,
+    /// Held by the thread from before it takes a message from the queue until it has none in hand, so that nothing
+    /// overtakes what was queued.
+    take: Mutex<Take>,
     behind: Behind,
 }
 
@@ -394,11 +418,13 @@ pub(crate) struct Behind {
     recent: Option<Mutex<Recent>>,
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
+    /// Whether taking a short message never waits for anybody.
+    never_blocks: bool,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0) }
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), never_blocks: false }
     }
 }
 
@@ -433,6 +459,7 @@ impl WriterQueue {
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<Arc<Self>> {
         let (counted, topic) = (failures.clone(), spec.topic.clone());
+        let in_topic = topic.clone();
         let writer = Arc::new(writer);
         // The thread alone keeps it: it ends there, where it may block.
         let weak = Arc::downgrade(&writer);
@@ -441,23 +468,25 @@ impl WriterQueue {
             _ => None,
         });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched };
+        // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
+        let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
+        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, never_blocks };
         let mut decompressor = Decompressor::default();
-        Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, is_alone| {
+        let mut prepare = move |message: Message| {
             let kind = match message.head.kind {
                 MessageKind::Write => SampleKind::Write,
                 MessageKind::Dispose => SampleKind::Dispose,
                 MessageKind::Unregister => SampleKind::Unregister,
                 // Nobody calls a topic.
-                _ => return,
+                _ => return None,
             };
             let payload = match decompressor.decompress(message.head.encoding, message.payload) {
                 Ok(payload) => payload,
                 Err(error) => {
                     if counted.count("decompress") {
-                        warn!(%topic, %error, "a message is not given to the local network; counted from here on");
+                        warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
                     }
-                    return;
+                    return None;
                 }
             };
             let prefix = frames.as_ref().and_then(|frames| frames.load_full());
@@ -467,44 +496,80 @@ impl WriterQueue {
                     Ok(rewritten) => rewritten.into(),
                     Err(error) => {
                         if counted.count("frames") {
-                            warn!(%topic, %error, "a message is not given to the local network; counted from here on");
+                            warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
                         }
-                        return;
+                        return None;
                     }
                 },
             };
-            burst.before_next(&*writer, is_alone);
-            if let Err(error) = writer.write(kind, message.head.source_timestamp_ns, payload)
-                && counted.count(failure_key(&error))
+            Some((kind, message.head.source_timestamp_ns, payload))
+        };
+        let refused = failures.clone();
+        Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, next| {
+            let Some((kind, timestamp_ns, payload)) = prepare(message) else {
+                return if next != Next::AtOnce {
+                    writer.flush()
+                };
+            };
+            burst.before_next(&*writer, next == Next::Nothing);
+            let written = match next {
+                Next::AtOnce => writer.write_ahead(kind, timestamp_ns, payload),
+                Next::Nothing | Next::Later => writer.write(kind, timestamp_ns, payload),
+            };
+            if let Err(error) = written
+                && refused.count(failure_key(&error))
             {
                 warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
             }
         })
     }
 
-    /// The same with somebody else who takes the messages, one after the other, and hears whether none waits behind it; it may
-    /// block.
+    /// The same with somebody else who takes the messages, one after the other, and hears what is behind each; it may block, unless `behind` says that it never does.
     pub(crate) fn spawn_with(
         thread_name: &str,
         behind: Behind,
         shaping: Shaping,
         drops: Arc<Drops>,
         alive: mpsc::Sender<()>,
-        mut take: impl FnMut(Message, bool) + Send + 'static,
+        take: impl FnMut(Message, Next) + Send + 'static,
     ) -> std::io::Result<Arc<Self>> {
         let mut shaper = Shaper::default();
         shaper.set(shaping);
-        let this = Arc::new(Self { queue: Queue::new(WRITER_MESSAGES_MAX), shaper: shaper.into(), behind });
+        let this = Arc::new(Self {
+            queue: Queue::new(WRITER_MESSAGES_MAX),
+            shaper: shaper.into(),
+            is_unshaped: AtomicBool::new(shaping == Shaping::default()),
+            take: Mutex::new(Box::new(take)),
+            behind,
+        });
         let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
         thread::Builder::new().name(thread_name.into()).spawn(move || {
             let _alive = alive;
-            let mut behind = None;
-            while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
-                let is_alone = task.queue.is_empty();
-                take(message, is_alone);
+            while runtime.block_on(task.queue.wait()) {
+                let mut take = task.take.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut behind = None;
+                while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
+                    let next = match behind.is_none() && task.queue.is_empty() {
+                        true => Next::Nothing,
+                        false if task.is_unshaped.load(Relaxed) => Next::AtOnce,
+                        false => Next::Later,
+                    };
+                    take(message, next);
+                }
             }
+            // What it holds, a writer, may block when it goes.
+            let end: Take = Box::new(|_, _| ());
+            drop(std::mem::replace(&mut *task.take.lock().unwrap_or_else(PoisonError::into_inner), end));
         })?;
         Ok(this)
+    }
+
+    /// Who takes a message of so many bytes now: if that does not block, and nothing is ahead of it. Only for who queues, while
+    /// nobody else does.
+    fn at_once(&self, bytes: usize) -> Option<MutexGuard<'_, Take>> {
+        let may = self.behind.never_blocks && bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
+        let take = if may { self.take.try_lock().ok() } else { None };
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed())
     }
 
     /// The writer's.
@@ -514,15 +579,16 @@ impl WriterQueue {
 
     /// Sets how much is written from here on.
     pub(crate) fn set_shaping(&self, shaping: Shaping) {
+        self.is_unshaped.store(shaping == Shaping::default(), Relaxed);
         self.shaper().set(shaping);
     }
 
-    /// The next message whose time has come; the newest of those that came meanwhile where one gives way to the next.
-    /// `behind` is what was taken after it and may not overtake it.
+    /// The next message of the queue when its time has come, if there is one; the newest of those that came meanwhile where
+    /// one gives way to the next. `behind` is what was taken after it and may not overtake it.
     async fn next(&self, behind: &mut Option<Message>, drops: &Drops) -> Option<Message> {
         let mut message = match behind.take() {
             Some(message) => message,
-            None => self.queue.pop().await?,
+            None => self.queue.try_pop()?,
         };
         loop {
             let now = Instant::now();
@@ -642,7 +708,7 @@ pub(crate) fn failure_key(error: &RosError) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicBool, AtomicUsize};
+    use std::sync::atomic::AtomicUsize;
 
     use bytes::Bytes;
 
@@ -687,5 +753,60 @@ mod tests {
         let mut other = Burst::new(None);
         (0..100).for_each(|_| other.before_next(&writer, false));
         assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
+    }
+
+    /// What was written, and by which thread.
+    type Written = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
+
+    /// A queue whose messages are noted with the thread that took them; each takes as long as the gate is closed.
+    fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
+        let taken = Arc::<Mutex<Vec<_>>>::default();
+        let (note, gate) = (taken.clone(), gate.clone());
+        let behind = Behind { never_blocks: true, ..Behind::default() };
+        let (alive, _) = mpsc::channel(1);
+        let take = move |message: Message, _| {
+            drop(gate.lock().unwrap());
+            note.lock().unwrap().push((message.seq, thread::current().id()));
+        };
+        let shaping = Shaping::default();
+        let queue = WriterQueue::spawn_with("test", behind, shaping, Arc::default(), alive, take).unwrap();
+        (queue, taken)
+    }
+
+    fn message(seq: u64, bytes: usize) -> Message {
+        let head =
+            MessageHead { encoding: Default::default(), kind: MessageKind::Write, source_timestamp_ns: 1 };
+        Message { source: SourceId([1; 16]), seq, head, reliable: true, payload: vec![0; bytes].into() }
+    }
+
+    /// As a sink does.
+    fn give(queue: &WriterQueue, message: Message) {
+        let bytes = message.payload.len();
+        match queue.at_once(bytes) {
+            Some(mut take) => take(message, Next::Nothing),
+            None => queue.queue.try_push(message, bytes, WRITER_BYTES_MAX).unwrap(),
+        }
+    }
+
+    #[tokio::test]
+    async fn who_received_a_message_writes_it_unless_something_is_ahead_of_it() {
+        let gate = Arc::default();
+        let (queue, taken) = noting(&gate);
+        give(&queue, message(0, 16));
+        assert_eq!(*taken.lock().unwrap(), [(0, thread::current().id())]);
+        let is_stuck = gate.lock().unwrap();
+        // The long one is the thread's, and what follows does not overtake it, wherever it is by now.
+        give(&queue, message(1, AT_ONCE_BYTES_MAX + 1));
+        (2..100).for_each(|seq| give(&queue, message(seq, 16)));
+        drop(is_stuck);
+        let begun = Instant::now();
+        while taken.lock().unwrap().len() < 100 {
+            assert!(begun.elapsed() < Duration::from_secs(20));
+            thread::yield_now();
+        }
+        let taken = taken.lock().unwrap();
+        assert!(taken.iter().map(|(seq, _)| *seq).eq(0..100));
+        assert!(taken[1..].iter().all(|(_, by)| *by != thread::current().id()));
+        queue.close();
     }
 }

@@ -5,6 +5,7 @@
 //! at hand together share a signature; none waits for one that is not.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -15,6 +16,7 @@ use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
 use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
+use sgc_transport::prompt::{self, AtHand};
 use sgc_wire::{
     MessageHead, MessageKind, Name, Packet, PayloadEncoding, Recover, SinkId, SourceId, TopicGrant,
 };
@@ -29,6 +31,9 @@ use crate::tap::{Tapped, Taps};
 
 /// Samples that may wait for their writer to be discovered.
 const EARLY_SAMPLES_MAX: usize = 256;
+
+/// The longest message that the reader's thread sends itself, if nothing comes behind it.
+const AT_HAND_BYTES_MAX: usize = 16 << 10;
 
 /// A source and what it is for.
 #[derive(Clone)]
@@ -206,6 +211,9 @@ impl LocalShare {
 
     /// Publishes a sample, now or when its time has come; called on the reader's thread.
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
+        // With others behind it, or in many packets, it is sent by the runtime while this thread seals.
+        let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
+        let _at_hand = is_alone.then(|| AtHand::begin(&self.runtime));
         if !self.is_shaped.load(Relaxed) {
             return self.publish_now(sample);
         }
@@ -456,7 +464,8 @@ impl LocalShare {
         let wanted = self.data.is_wanted(&self.name);
         move |packet| {
             if wanted && !self.closed.load(Relaxed) {
-                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
+                // By reference: tokio puts large futures on the heap.
+                prompt::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
             }
         }
     }

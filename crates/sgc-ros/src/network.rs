@@ -295,6 +295,19 @@ pub trait RosWriter: Send + Sync + 'static {
     /// Writes, disposes or unregisters with the given source time stamp (nanoseconds since the Unix epoch).
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError>;
 
+    /// The same, but it need not leave before the next write, or [`Self::flush`]: short samples share packets.
+    fn write_ahead(
+        &self,
+        kind: SampleKind,
+        source_timestamp_ns: i64,
+        payload: Bytes,
+    ) -> Result<(), RosError> {
+        self.write(kind, source_timestamp_ns, payload)
+    }
+
+    /// Lets leave what was written ahead.
+    fn flush(&self) {}
+
     /// Waits until all reliable readers have what was written; false if they have not after `max`.
     fn wait_acknowledged(&self, max: Duration) -> bool {
         let _ = max;

@@ -4,17 +4,14 @@
 //! the tables are of the virtual clock, those of the processor are this machine's. `--full` goes to 1000 routers, 100 000
 //! flooded names and a million that are asked for; `--sizes 10,30` and `--only flood` or
 //! `query` choose; `--csv DIR` writes the tables there too.
-#![allow(unsafe_code, reason = "an allocator is unsafe by its nature; this one counts and hands on")]
 #![allow(clippy::print_stdout, reason = "the tables are what it is for")]
 
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::Duration;
 
 use sgc_router::{LinkId, MappingKind, Output};
 use sgc_testkit::mesh::{BATCH_NAMES, Mesh, Tally};
-use sgc_testkit::{Member, identity};
+use sgc_testkit::{CountingAllocator, Member, identity, live_bytes};
 use sgc_trust::verify_link_state;
 use sgc_wire::{Adjacency, LinkStateBody, Name, NodeId, Now};
 
@@ -29,31 +26,8 @@ const QUESTIONS: usize = 10;
 /// Searches, link states that are timed.
 const TIMED: u32 = 50;
 
-struct Counting;
-
-static LIVE: AtomicI64 = AtomicI64::new(0);
-
-fn count(bytes: usize, sign: i64) {
-    LIVE.fetch_add(sign * bytes as i64, Ordering::Relaxed);
-}
-
-// SAFETY: every call is handed on to the system's allocator as it is.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count(layout.size(), 1);
-        // SAFETY: the caller's promise.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        count(layout.size(), -1);
-        // SAFETY: the caller's promise.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-}
-
 #[global_allocator]
-static COUNTING: Counting = Counting;
+static COUNTING: CountingAllocator = CountingAllocator;
 
 /// Time of the processor that this thread has had.
 fn cpu() -> Duration {
@@ -198,9 +172,9 @@ fn kb(bytes: u64, by: usize) -> String {
 
 /// Bytes that the router that was written down would hold by itself.
 fn held(mesh: &Mesh) -> i64 {
-    let before = LIVE.load(Ordering::Relaxed);
+    let before = live_bytes();
     let router = mesh.recording().replay();
-    let held = LIVE.load(Ordering::Relaxed) - before;
+    let held = live_bytes() - before;
     drop(router);
     held
 }

@@ -7,7 +7,7 @@
 //!
 //! There is no socket, no thread and no sleep here, and no ROS: what a node publishes is a numbered message.
 //! Sealing is as in production; the provider's own randomness in signatures decides nothing. [`netsim`] alone is
-//! different: it is a bad network for real processes, in real time.
+//! different: it is a bad network for real processes, in real time. [`CountingAllocator`] is for tests of what allocates.
 //!
 //! ```
 //! use std::time::Duration;
@@ -24,8 +24,9 @@
 //! world.run(Duration::from_secs(1));
 //! assert_eq!(world.received(desk, arm, "/chatter"), [message]);
 //! ```
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
+mod allocator;
 mod cast;
 mod clock;
 mod evil;
@@ -41,6 +42,9 @@ mod trust;
 mod wires;
 mod world;
 
+pub use allocator::{
+    Allocations, CountingAllocator, allocated_here, allocations, allocations_of, live_bytes,
+};
 pub use cast::{Member, identity, revocation_list};
 pub use clock::Clock;
 pub use evil::{Captured, CapturedPacket};

@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use sgc_wire::{Label, Packet};
+use sgc_wire::{Label, Packet, Slab};
 
 use crate::error::{FlowEnd, FlowError, LinkError};
 use crate::framing::{Pieces, packet_head};
@@ -21,6 +21,8 @@ const JOINED_PAYLOAD_BYTES_MAX: usize = 1024;
 pub struct FlowTx {
     outlet: Outlet,
     has_begun: bool,
+    /// For what stands before payloads.
+    heads: Slab,
 }
 
 #[derive(Debug)]
@@ -41,7 +43,7 @@ macro_rules! each {
 
 impl FlowTx {
     pub(crate) fn new(outlet: Outlet) -> Self {
-        Self { outlet, has_begun: false }
+        Self { outlet, has_begun: false, heads: Slab::default() }
     }
 
     /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied, unless it is
@@ -59,7 +61,7 @@ impl FlowTx {
         let pieces = packet.payload.0.iter().filter(|p| !joined && !p.is_empty()).cloned();
         each!(Outlet, &mut self.outlet, outlet => {
             outlet.flush().await?;
-            let head = packet_head(packet, label, !self.has_begun, joined);
+            let head = packet_head(packet, label, !self.has_begun, joined, &mut self.heads);
             self.has_begun = true;
             outlet.queue(std::iter::once(head).chain(pieces));
             outlet.flush().await

@@ -10,7 +10,7 @@ use std::collections::VecDeque;
 use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use sgc_wire::{
     Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, LaneToken, PAYLOAD_BYTES_MAX, Packet, PacketHeader,
-    Payload, Reader, Writer,
+    Payload, Reader, Slab, Writer,
 };
 
 use crate::error::{FlowError, ProtocolError};
@@ -141,6 +141,14 @@ impl Pieces {
     fn take(&mut self, mut n: usize) -> Payload {
         self.bytes -= n;
         let mut out = Payload::default();
+        let mut ahead = 0;
+        let pieces = self.pieces.iter().take_while(|piece| {
+            let is_part = ahead < n;
+            ahead += piece.len();
+            is_part
+        });
+        // At once, where there are more than it holds by itself.
+        out.0.reserve(pieces.count());
         while n > 0 {
             let Some(mut front) = self.pieces.pop_front() else { break };
             if front.len() > n {
@@ -161,11 +169,17 @@ pub(crate) fn control_head(length: usize) -> Bytes {
 }
 
 /// What stands before the payload of a packet in a flow, with the flow's version if it is the first; `joined` with the
-/// payload behind it.
-pub(crate) fn packet_head(packet: &Packet, label: Option<Label>, is_first: bool, joined: bool) -> Bytes {
+/// payload behind it. It is written to memory of `slab`.
+pub(crate) fn packet_head(
+    packet: &Packet,
+    label: Option<Label>,
+    is_first: bool,
+    joined: bool,
+    slab: &mut Slab,
+) -> Bytes {
     let payload_bytes = if joined { packet.payload.len() } else { 0 };
     let header_bytes = packet.header.encoded_bytes_as(label);
-    let mut head = BytesMut::with_capacity(1 + LENGTH_BYTES + header_bytes + payload_bytes);
+    let mut head = slab.room(1 + LENGTH_BYTES + header_bytes + payload_bytes);
     if is_first {
         head.put_u8(FLOW_VERSION);
     }
@@ -177,9 +191,9 @@ pub(crate) fn packet_head(packet: &Packet, label: Option<Label>, is_first: bool,
     head.freeze()
 }
 
-/// A packet in one piece, as a datagram carries it.
-pub(crate) fn datagram(packet: &Packet, label: Option<Label>) -> Bytes {
-    let mut out = BytesMut::with_capacity(packet.encoded_bytes_as(label));
+/// A packet in one piece, as a datagram carries it, in memory of `slab`.
+pub(crate) fn datagram(packet: &Packet, label: Option<Label>, slab: &mut Slab) -> Bytes {
+    let mut out = slab.room(packet.encoded_bytes_as(label));
     packet.header.put_as(label, &mut out);
     packet.payload.copy_into(&mut out);
     out.freeze()
@@ -257,10 +271,10 @@ mod tests {
         let sent: Vec<_> = sent.iter().chain(&sent).collect();
         let labels = Labels::default();
         labels.define(Label::new(0).unwrap(), sent[0].header.name).unwrap();
-        let mut stream = Vec::new();
+        let (mut stream, mut slab) = (Vec::new(), Slab::default());
         for (index, p) in sent.iter().enumerate() {
             let label = Label::new(0).filter(|_| index > 2);
-            stream.extend_from_slice(&packet_head(p, label, index == 0, index == 1));
+            stream.extend_from_slice(&packet_head(p, label, index == 0, index == 1, &mut slab));
             if index != 1 {
                 p.payload.copy_into(&mut stream);
             }
@@ -271,7 +285,7 @@ mod tests {
             for p in &sent {
                 let got = pieces.next_packet(&labels).unwrap().unwrap();
                 assert_eq!(got.header, p.header);
-                assert_eq!(datagram(&got, None), datagram(p, None));
+                assert_eq!(datagram(&got, None, &mut slab), datagram(p, None, &mut slab));
             }
             assert!(pieces.is_empty() && pieces.next_packet(&labels).unwrap().is_none());
         }
@@ -285,7 +299,8 @@ mod tests {
     #[test]
     fn payloads_are_slices_of_what_was_received() {
         let p = packet(&[7; 300], None);
-        let stream = Bytes::from([&packet_head(&p, None, false, false)[..], &[7; 300]].concat());
+        let stream =
+            Bytes::from([&packet_head(&p, None, false, false, &mut Slab::default())[..], &[7; 300]].concat());
         let (mut pieces, labels) = (Pieces::default(), Labels::default());
         pieces.push(stream.slice(..200));
         pieces.push(stream.slice(200..));

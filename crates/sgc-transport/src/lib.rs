@@ -21,6 +21,7 @@ mod link;
 mod metrics;
 mod options;
 mod overload;
+pub mod prompt;
 mod quic;
 mod race;
 mod socket;

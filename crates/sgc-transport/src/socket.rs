@@ -1,19 +1,22 @@
 //! UDP sockets, with the options that links may have.
 //!
-//! Quinn's own socket is used wherever it will do. A link that is marked (DSCP) or goes without offloads has one that sends
-//! and receives datagram by datagram: quinn's writes the whole type-of-service byte of each datagram for the sake of ECN, and
-//! has the kernel join what it receives.
+//! Sending and receiving is quinn's wherever that will do. A link that is marked (DSCP) or goes without offloads has a socket
+//! that does so datagram by datagram: quinn's way writes the whole type-of-service byte of each datagram for the sake of ECN,
+//! and has the kernel join what it receives.
 
 use std::future::Future;
 use std::io::{self, IoSliceMut};
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll, ready};
 
-use quinn::udp::{RecvMeta, Transmit};
-use quinn::{AsyncUdpSocket, Runtime, TokioRuntime, UdpPoller};
+use quinn::udp::{RecvMeta, Transmit, UdpSocketState};
+use quinn::{AsyncUdpSocket, UdpPoller};
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
+use tokio::io::Interest;
+use tokio::io::unix::AsyncFd;
 
 use crate::options::LinkOptions;
 
@@ -55,7 +58,7 @@ pub(crate) fn bind(
     let socket = std::net::UdpSocket::from(socket);
     let local = socket.local_addr()?;
     let socket: Arc<dyn AsyncUdpSocket> = match options.dscp.is_none() && options.offload {
-        true => TokioRuntime.wrap_udp_socket(socket)?,
+        true => Arc::new(BatchSocket::new(socket)?),
         false => Arc::new(PlainSocket { io: tokio::net::UdpSocket::from_std(socket)? }),
     };
     Ok((socket, local))
@@ -130,6 +133,110 @@ impl AsyncUdpSocket for PlainSocket {
     }
 }
 
+/// Quinn's sending and receiving, with offloads, on a socket of which the runtime is told only that something came. It would
+/// hear of room, too, after each datagram that left, and wake a thread for it.
+#[derive(Debug)]
+struct BatchSocket {
+    io: AsyncFd<std::net::UdpSocket>,
+    state: UdpSocketState,
+    /// Whether the last datagram found no room.
+    is_full: AtomicBool,
+}
+
+impl BatchSocket {
+    fn new(socket: std::net::UdpSocket) -> io::Result<Self> {
+        let state = UdpSocketState::new((&socket).into())?;
+        let io = watch(socket, Interest::READABLE)?;
+        Ok(Self { io, state, is_full: AtomicBool::new(false) })
+    }
+}
+
+/// Has the runtime told of one direction of a socket only.
+#[expect(
+    deprecated,
+    reason = "what replaces it is unsafe, for descriptors that close early; this one is the socket's own"
+)]
+fn watch(socket: std::net::UdpSocket, interest: Interest) -> io::Result<AsyncFd<std::net::UdpSocket>> {
+    AsyncFd::with_interest(socket, interest)
+}
+
+impl AsyncUdpSocket for BatchSocket {
+    fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
+        Box::pin(Room { socket: self, waiting: None })
+    }
+
+    fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
+        let result = self.state.send(self.io.get_ref().into(), transmit);
+        let is_full = matches!(&result, Err(error) if error.kind() == io::ErrorKind::WouldBlock);
+        if is_full || self.is_full.load(Ordering::Relaxed) {
+            self.is_full.store(is_full, Ordering::Relaxed);
+        }
+        result
+    }
+
+    fn poll_recv(
+        &self,
+        cx: &mut Context<'_>,
+        bufs: &mut [IoSliceMut<'_>],
+        meta: &mut [RecvMeta],
+    ) -> Poll<io::Result<usize>> {
+        loop {
+            let mut ready = ready!(self.io.poll_read_ready(cx))?;
+            if let Ok(result) = ready.try_io(|io| self.state.recv(io.get_ref().into(), bufs, meta)) {
+                return Poll::Ready(result);
+            }
+        }
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        self.io.get_ref().local_addr()
+    }
+
+    fn may_fragment(&self) -> bool {
+        self.state.may_fragment()
+    }
+
+    fn max_transmit_segments(&self) -> usize {
+        self.state.max_gso_segments()
+    }
+
+    fn max_receive_segments(&self) -> usize {
+        self.state.gro_segments()
+    }
+}
+
+/// Waits until a socket takes more, if it took no more.
+struct Room {
+    socket: Arc<BatchSocket>,
+    waiting: Option<Waiting>,
+}
+
+impl std::fmt::Debug for Room {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Room").field(&self.socket).finish()
+    }
+}
+
+impl UdpPoller for Room {
+    fn poll_writable(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let Self { socket, waiting } = &mut *self;
+        if waiting.is_none() && !socket.is_full.load(Ordering::Relaxed) {
+            return Poll::Ready(Ok(()));
+        }
+        let future = waiting.get_or_insert_with(|| {
+            let socket = Arc::clone(socket);
+            // Registered for as long as it is waited for. What was room before that is reported, too.
+            Box::pin(async move {
+                let room = watch(socket.io.get_ref().try_clone()?, Interest::WRITABLE)?;
+                room.writable().await.map(drop)
+            })
+        });
+        let done = ready!(future.as_mut().poll(cx));
+        *waiting = None;
+        Poll::Ready(done)
+    }
+}
+
 type Waiting = Pin<Box<dyn Future<Output = io::Result<()>> + Send + Sync>>;
 
 /// Waits until a socket takes more.
@@ -154,5 +261,49 @@ impl UdpPoller for Writable {
         let done = ready!(future.as_mut().poll(cx));
         *waiting = None;
         Poll::Ready(done)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::poll_fn;
+    use std::time::Duration;
+
+    use tokio::time::timeout;
+
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(20);
+
+    #[tokio::test]
+    async fn datagrams_pass_and_who_found_no_room_hears_of_it() {
+        let new = || {
+            let socket = std::net::UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+            socket.set_nonblocking(true).unwrap();
+            Arc::new(BatchSocket::new(socket).unwrap())
+        };
+        let (from, to) = (new(), new());
+        let destination = to.local_addr().unwrap();
+        let mut room = from.clone().create_io_poller();
+        // As if the last had found none.
+        from.is_full.store(true, Ordering::Relaxed);
+        timeout(PATIENCE, poll_fn(|cx| room.as_mut().poll_writable(cx))).await.unwrap().unwrap();
+        let contents = [7; 3 * 1000];
+        let segments = from.max_transmit_segments().min(3);
+        for part in contents.chunks(segments * 1000) {
+            let transmit =
+                Transmit { destination, ecn: None, contents: part, segment_size: Some(1000), src_ip: None };
+            from.try_send(&transmit).unwrap();
+        }
+        assert!(!from.is_full.load(Ordering::Relaxed));
+        let (mut buffer, mut got) = (vec![0; 64 << 10], 0);
+        while got < contents.len() {
+            let mut meta = [RecvMeta::default()];
+            let mut bufs = [IoSliceMut::new(&mut buffer)];
+            let received = poll_fn(|cx| to.poll_recv(cx, &mut bufs, &mut meta));
+            assert_eq!(timeout(PATIENCE, received).await.unwrap().unwrap(), 1);
+            assert_eq!(meta[0].stride, 1000);
+            got += meta[0].len;
+        }
     }
 }

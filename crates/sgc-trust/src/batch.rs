@@ -8,6 +8,7 @@
 use std::collections::VecDeque;
 
 use aws_lc_rs::digest;
+use bytes::BufMut;
 use sgc_wire::PacketHeader;
 
 use crate::message_key::VerifyKey;
@@ -34,10 +35,12 @@ type Hash = [u8; HASH_BYTES];
 #[derive(Debug, Default)]
 pub struct Batch {
     leaves: Vec<Hash>,
+    /// One that is over: its memory serves the next.
+    spare: SignedBatch,
 }
 
 /// A batch with its signature.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct SignedBatch {
     count: usize,
     /// All levels, leaves first.
@@ -54,8 +57,10 @@ impl Batch {
 
     /// Signs what was gathered, and begins anew. There must be something.
     pub fn sign(&mut self, key: &MessageKey) -> SignedBatch {
-        let mut nodes = Vec::with_capacity(2 * self.leaves.len() + 6);
+        let SignedBatch { mut nodes, mut signature, .. } = std::mem::take(&mut self.spare);
         let count = self.leaves.len();
+        nodes.clear();
+        nodes.reserve(2 * count + 6);
         nodes.append(&mut self.leaves);
         let (mut start, mut width) = (0, count);
         while width > 1 {
@@ -68,8 +73,13 @@ impl Batch {
             }
             (start, width) = (start + width, width.div_ceil(2));
         }
-        let signature = key.sign(&signed_bytes(count as u16, &nodes[start]));
+        key.sign(&signed_bytes(count as u16, &nodes[start]), &mut signature);
         SignedBatch { count, nodes, signature }
+    }
+
+    /// Takes back one that is over, so that signing the next takes no memory.
+    pub fn reuse(&mut self, over: SignedBatch) {
+        self.spare = over;
     }
 
     /// Packets gathered.
@@ -90,13 +100,13 @@ impl Batch {
 
 impl SignedBatch {
     /// Appends the trailer of the packet that was added as number `index`.
-    pub fn put_trailer(&self, index: usize, out: &mut Vec<u8>) {
+    pub fn put_trailer(&self, index: usize, out: &mut impl BufMut) {
         for (level, sibling) in siblings(index, self.count) {
-            out.extend_from_slice(&self.nodes[position(self.count, level, sibling)]);
+            out.put_slice(&self.nodes[position(self.count, level, sibling)]);
         }
-        out.extend_from_slice(&(index as u16).to_be_bytes());
-        out.extend_from_slice(&(self.count as u16).to_be_bytes());
-        out.extend_from_slice(&self.signature);
+        out.put_u16(index as u16);
+        out.put_u16(self.count as u16);
+        out.put_slice(&self.signature);
     }
 }
 

@@ -49,7 +49,7 @@ pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
 pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
-pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes};
+pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};
 pub use signed::{
     CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState, signed_digest,

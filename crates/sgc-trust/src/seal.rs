@@ -9,7 +9,7 @@ use aws_lc_rs::hkdf;
 use sgc_wire::{MESSAGE_HEAD_BYTES, MessageHead, Name, PacketHeader, SinkId, SourceId, TopicGrant};
 use zeroize::Zeroizing;
 
-use crate::{Suite, trailer_bytes_max};
+use crate::Suite;
 
 /// Bytes that sealing adds to a fragment.
 pub const TAG_BYTES: usize = 16;
@@ -100,19 +100,17 @@ impl SourceKey {
         self.to
     }
 
-    /// A sealed fragment: `fragment`, behind the first one the message's head, and the tag; with room for a
-    /// trailer.
+    /// Seals a fragment: `fragment`, behind the first one the message's head, and the tag. `out` must have
+    /// [`sealed_bytes`] bytes, all of which are written.
     ///
     /// The header must be of this key's suite, epoch and addressee. The caller must seal one text only under
     /// each (sequence, index): the nonce is made of them.
-    pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8]) -> Vec<u8> {
-        use sgc_wire::Encode;
+    pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8], out: &mut [u8]) {
         debug_assert_eq!(fragment.len(), header.fragment_bytes());
         debug_assert_eq!((header.suite, header.epoch, header.to), (self.suite.id(), self.epoch, self.to));
-        let head = if header.index == 0 { head.to_vec() } else { Vec::new() };
-        let sealed = fragment.len() + head.len() + TAG_BYTES;
-        let mut out = Vec::with_capacity(sealed + trailer_bytes_max(self.suite));
-        out.resize(sealed, 0);
+        debug_assert_eq!(out.len(), sealed_bytes(header));
+        let head = head.to_array();
+        let head = if header.index == 0 { &head[..] } else { &[] };
         let (text, rest) = out.split_at_mut(fragment.len());
         self.key
             .seal_out_of_place_scatter(
@@ -120,11 +118,10 @@ impl SourceKey {
                 Aad::from(header.associated_data()),
                 fragment,
                 text,
-                &head,
+                head,
                 rest,
             )
             .expect("fragments are far below the AEAD's length limit");
-        out
     }
 
     /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes; what it holds after an
@@ -160,6 +157,11 @@ impl SourceKey {
 /// Bytes that a packet's payload opens to: the fragment, and behind the first one the message's head.
 pub fn opened_bytes(header: &PacketHeader) -> usize {
     header.fragment_bytes() + if header.index == 0 { MESSAGE_HEAD_BYTES } else { 0 }
+}
+
+/// Bytes that a fragment is sealed to: what it opens to, and the tag.
+pub fn sealed_bytes(header: &PacketHeader) -> usize {
+    opened_bytes(header) + TAG_BYTES
 }
 
 fn nonce(header: &PacketHeader) -> Nonce {
@@ -213,7 +215,9 @@ mod tests {
         MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 99 };
 
     fn sealed(h: &PacketHeader) -> Vec<u8> {
-        key(h).seal(h, &HEAD, &vec![5; h.fragment_bytes()])
+        let mut out = vec![0; sealed_bytes(h)];
+        key(h).seal(h, &HEAD, &vec![5; h.fragment_bytes()], &mut out);
+        out
     }
 
     fn opened(h: &PacketHeader, key: &SourceKey, sealed: &[u8]) -> Result<Vec<u8>, OpenError> {

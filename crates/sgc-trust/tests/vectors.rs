@@ -3,7 +3,7 @@
 
 use sgc_trust::{
     Batch, BatchVerifier, GrantError, Kem, MessageKey, OpenError, ReplyKey, SourceKey, Suite, TAG_BYTES,
-    opened_bytes, seal_grant,
+    opened_bytes, seal_grant, sealed_bytes,
 };
 use sgc_wire::{
     Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader,
@@ -81,7 +81,8 @@ fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
     let (mut batch, mut out) = (Batch::default(), Vec::new());
     for header in &vector.headers {
         let (fragment, head) = plain(header);
-        let sealed = key(vector.suite, header).seal(header, &head, &fragment);
+        let mut sealed = vec![0; sealed_bytes(header)];
+        key(vector.suite, header).seal(header, &head, &fragment, &mut sealed);
         batch.push(header, &sealed);
         out.push(sealed);
     }

@@ -14,6 +14,7 @@ mod metadata;
 mod packet;
 mod qos;
 mod ros_node;
+mod slab;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
@@ -38,3 +39,4 @@ pub use packet::{
 };
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
 pub use ros_node::RosNode;
+pub use slab::Slab;

@@ -63,6 +63,15 @@ impl MessageHead {
         Self { kind, encoding: PayloadEncoding::Plain, source_timestamp_ns: number as i64 }
     }
 
+    /// The encoding.
+    pub fn to_array(self) -> [u8; MESSAGE_HEAD_BYTES] {
+        let mut out = [0; MESSAGE_HEAD_BYTES];
+        out[0] = self.kind as u8;
+        out[1] = self.encoding as u8;
+        out[4..].copy_from_slice(&self.source_timestamp_ns.to_be_bytes());
+        out
+    }
+
     /// The call that a message is about.
     pub fn call(&self) -> u64 {
         self.source_timestamp_ns as u64
@@ -71,10 +80,7 @@ impl MessageHead {
 
 impl Encode for MessageHead {
     fn encode(&self, w: &mut Writer) {
-        w.u8(self.kind as u8);
-        w.u8(self.encoding as u8);
-        w.u16(0);
-        w.u64(self.source_timestamp_ns as u64);
+        w.raw(&self.to_array());
     }
 }
 

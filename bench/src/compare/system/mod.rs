@@ -1,12 +1,17 @@
 //! What is compared: ways to join the DDS networks of two places. A system is a file here and a row of [`all`].
 
 mod direct;
+mod security;
 mod sgc;
+mod wireguard;
+mod zenoh;
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use clap::Args;
+use serde_json::Value;
 
 pub(crate) use sgc::Sgc;
 
@@ -98,9 +103,64 @@ impl Drop for Running {
     }
 }
 
+/// Programs of others, which `make bench` builds. Whether they are there shows when they are started.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Peers {
+    /// The Zenoh bridge, of bench/zenoh-bridge
+    #[arg(long, value_name = "FILE", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/zenoh-bridge/target/release/zenoh-bridge"))]
+    zenoh_bridge: PathBuf,
+    /// The program that talks and listens, built with its feature `dds-security`
+    #[arg(long, value_name = "FILE", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/target/dds-security/release/load"))]
+    secure_load: PathBuf,
+}
+
 /// Every system, in the order of the report. `sgc` is the program under test.
-pub(crate) fn all(sgc: &Path) -> Result<Vec<Box<dyn System>>> {
-    let mut systems: Vec<Box<dyn System>> = vec![Box::new(direct::Direct)];
+pub(crate) fn all(sgc: &Path, peers: &Peers) -> Result<Vec<Box<dyn System>>> {
+    let mut systems: Vec<Box<dyn System>> = vec![
+        Box::new(direct::Direct),
+        Box::new(wireguard::WireGuard),
+        Box::new(security::DdsSecurity::new(&peers.secure_load)),
+    ];
+    systems.extend(zenoh::all(&peers.zenoh_bridge).map(|system| Box::new(system) as Box<dyn System>));
     systems.extend(sgc::all(sgc)?.into_iter().map(|system| Box::new(system) as Box<dyn System>));
     Ok(systems)
+}
+
+/// Systems that [`configured`] has beside those of [`all`].
+pub(crate) const CONFIGURED: [&str; 1] = ["zenoh-tcp-tuned"];
+
+/// Those that tables compare for which users configure more than names of topics: priorities for the topics of SGC, and a
+/// Zenoh bridge with `zenoh` beside the one with its defaults.
+pub(crate) fn configured(
+    sgc: &Path,
+    peers: &Peers,
+    priorities: &'static [(&'static str, &'static str)],
+    zenoh: Value,
+) -> Result<Vec<Box<dyn System>>> {
+    let [zenoh_tcp, _] = zenoh::all(&peers.zenoh_bridge);
+    let mut systems: Vec<Box<dyn System>> = vec![
+        Box::new(direct::Direct),
+        Box::new(wireguard::WireGuard),
+        Box::new(zenoh_tcp),
+        Box::new(zenoh::Zenoh::tuned(&peers.zenoh_bridge, zenoh)),
+    ];
+    for scheme in ["quic", "dtls", "tls"] {
+        systems.push(Box::new(sgc::Sgc::new(sgc, scheme, "standard", 0)?.with_priorities(priorities)));
+    }
+    Ok(systems)
+}
+
+/// Why rosbridge is not compared. What the programs here say is of a type of their own, and it carries those only that are
+/// installed as packages of ROS 2, beside rosbridge itself.
+pub(crate) fn why_no_rosbridge() -> String {
+    let installed = std::fs::read_dir("/opt/ros").into_iter().flatten().flatten();
+    let installed: Vec<_> =
+        installed.map(|distro| distro.file_name().to_string_lossy().into_owned()).collect();
+    if installed.is_empty() {
+        return "it needs an installation of ROS 2, and there is none in /opt/ros".into();
+    }
+    format!(
+        "ROS 2 {} is here, but rosbridge carries types of installed packages only, and that of the load generator is none",
+        installed.join(", ")
+    )
 }

@@ -22,6 +22,8 @@ pub(crate) struct Sgc {
     suite: &'static str,
     /// Processes between the two proxies, at the right place. Without one the right proxy listens.
     routers: usize,
+    /// Topics whose `priority` is not the default one.
+    priorities: &'static [(&'static str, &'static str)],
 }
 
 /// Every transport with every suite, and the default transport with a router between.
@@ -42,7 +44,12 @@ impl Sgc {
     ) -> Result<Self> {
         let program = program.canonicalize();
         let program = program.with_context(|| "the program that is measured: is it built?")?;
-        Ok(Self { program, scheme, suite, routers })
+        Ok(Self { program, scheme, suite, routers, priorities: &[] })
+    }
+
+    /// With priorities for some topics, instead of the default one.
+    pub(crate) fn with_priorities(self, priorities: &'static [(&'static str, &'static str)]) -> Self {
+        Self { priorities, ..self }
     }
 
     fn start_node(&self, lab: &Lab, side: Side, node: &str, dir: &Path, text: &str) -> Result<Program> {
@@ -73,6 +80,44 @@ impl Sgc {
     fn url(&self, host: impl std::fmt::Display, number: usize) -> String {
         format!("\"{}://{host}:{}\"", self.scheme, PORT as usize + number)
     }
+}
+
+impl Sgc {
+    /// Several nodes at the right place, each with a local network of its own and a link to the node at the left, which
+    /// shares the topic with all of them. Also how users join those networks.
+    pub(crate) fn start_fan(&self, lab: &Lab, topic: &str, nodes: u32) -> Result<(Running, Vec<Dds>)> {
+        let dir = lab.new_dir("fan")?;
+        let fleet = BenchFleet::new()?;
+        let mut running = Running { processes: Vec::new(), dds: Side::BOTH.map(|_| Dds::loopback()) };
+        let mut networks = Vec::new();
+        let listen = self.url("0.0.0.0", 0);
+        let dials = self.url(lab.address(Side::Left), 0);
+        fleet.write(&dir, "left", false)?;
+        let text = format!(
+            "[node]\nstate = \"left.state\"\n[router]\nlisten = [{listen}]\n{}\
+             [[share]]\ntopic = \"{topic}\"\nto = [\"*\"]\nsuite = \"{}\"\n",
+            ros(0),
+            self.suite
+        );
+        running.processes.push((Side::Left, self.start_node(lab, Side::Left, "left", &dir, &text)?));
+        for domain in 0..nodes {
+            let node = format!("right-{domain}");
+            fleet.write(&dir, &node, false)?;
+            let text = format!(
+                "[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n{}\
+                 [[use]]\nfrom = \"left\"\ntopic = \"{topic}\"\n",
+                ros(domain)
+            );
+            running.processes.push((Side::Right, self.start_node(lab, Side::Right, &node, &dir, &text)?));
+            networks.push(Dds { domain, ..Dds::loopback() });
+        }
+        Ok((running, networks))
+    }
+}
+
+/// The local network of a place.
+fn ros(domain: u32) -> String {
+    format!("[ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n")
 }
 
 impl System for Sgc {
@@ -106,16 +151,16 @@ impl System for Sgc {
         }
         for side in [Side::Right, Side::Left] {
             let node = side.name();
-            let is_router = side == Side::Right && self.routers == 0;
-            fleet.write(&dir, node, is_router)?;
+            let listens = side == Side::Right && self.routers == 0;
+            fleet.write(&dir, node, false)?;
             let dials = match (side, self.routers) {
                 (Side::Right, 0) => String::new(),
                 (Side::Right, _) => self.url("127.0.0.1", 0),
                 (Side::Left, routers) => self.url(lab.address(Side::Right), routers.saturating_sub(1)),
             };
             let mut text = format!("[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n");
-            text += "[ros]\ndomain_id = 0\ndiscovery_range = \"localhost\"\nstatic_peers = []\n";
-            if is_router {
+            text += &ros(0);
+            if listens {
                 writeln!(text, "[router]\nlisten = [{}]", self.url("0.0.0.0", 0))?;
             }
             for topic in topics {
@@ -125,6 +170,9 @@ impl System for Sgc {
                 } else {
                     let suite = self.suite;
                     writeln!(text, "[[share]]\ntopic = \"{name}\"\nto = [\"{other}\"]\nsuite = \"{suite}\"")?;
+                    if let Some((_, priority)) = self.priorities.iter().find(|(topic, _)| *topic == name) {
+                        writeln!(text, "priority = \"{priority}\"")?;
+                    }
                 }
             }
             let program = self.start_node(lab, side, node, &dir, &text)?;

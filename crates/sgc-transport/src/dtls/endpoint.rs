@@ -4,7 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use quinn::{Connection, Endpoint, TokioRuntime};
+use quinn::{Connection, Endpoint};
 use sgc_trust::VerifiedPeer;
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -17,6 +17,7 @@ use crate::error::{CloseReason, DialError, LinkError, ProtocolError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
+use crate::prompt::PromptRuntime;
 use crate::quic::{self, Flavor, QuicLink, QuicListener};
 use crate::tls::Findings;
 use crate::url::LinkUrl;
@@ -193,7 +194,7 @@ impl Shared {
         let (mux, _) = Mux::start(true, io, credentials, options, Arc::clone(&self.metrics))?;
         let config = quic::endpoint_config(Flavor::Dtls, None, 0);
         let endpoint =
-            Endpoint::new_with_abstract_socket(config, None, mux.socket(), Arc::new(TokioRuntime))?;
+            Endpoint::new_with_abstract_socket(config, None, mux.socket(), Arc::new(PromptRuntime))?;
         let attempt = Attempt(Dialed { remote, mux, endpoint });
         let dialed = &attempt.0;
         let mut progress = dialed.mux.dial(remote).ok_or(LinkError::KeyUnsupported)?;

@@ -11,6 +11,7 @@ use quinn::{
 };
 
 use super::clear::Clear;
+use super::places;
 use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
@@ -61,7 +62,7 @@ pub(crate) fn transport(flavor: Flavor, options: &LinkOptions) -> (Arc<Transport
     config
         // The control stream, opened by the dialer; listeners open none.
         .max_concurrent_bidi_streams(VarInt::from_u32(1))
-        .max_concurrent_uni_streams(VarInt::from_u32(options.flows_max))
+        .max_concurrent_uni_streams(VarInt::from_u32(places::at_first(options.flows_max)))
         .max_idle_timeout(Some(IdleTimeout::from(millis(options.idle_timeout))))
         .keep_alive_interval(Some(options.keep_alive))
         .receive_window(VarInt::from_u32(options.receive_window_bytes))

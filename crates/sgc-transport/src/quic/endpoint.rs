@@ -9,9 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use quinn::crypto::rustls::HandshakeData;
-use quinn::{
-    AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, TokioRuntime, VarInt,
-};
+use quinn::{AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use rustls::NamedGroup;
 use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
@@ -20,7 +18,7 @@ use tokio::time::timeout;
 
 use super::config::Flavor;
 use super::{
-    ControlRx, Fate, Inlet, Outlet, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
+    ControlRx, Fate, Inlet, Outlet, Places, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
 };
 use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
@@ -31,6 +29,7 @@ use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::overload::Overload;
+use crate::prompt::PromptRuntime;
 use crate::race;
 use crate::socket;
 use crate::tls::Findings;
@@ -84,7 +83,7 @@ impl QuicListener {
         let local = socket.local_addr()?;
         let server = config::listener(flavor, &credentials, &options);
         let endpoint_config = config::endpoint(flavor, credentials.identity().reset_key(), local.port());
-        let runtime = Arc::new(TokioRuntime);
+        let runtime = Arc::new(PromptRuntime);
         let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
         let acceptor = Arc::new(Acceptor { flavor, credentials, options, metrics, dtls });
         Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), overload: Overload::default() })
@@ -171,7 +170,7 @@ impl Acceptor {
         let greeted = async {
             let (tx, rx) = connection.accept_bi().await.map_err(|e| fate.explain(&e))?;
             let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
-            let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
+            let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
             let greeting = hear_greeting(&mut rx).await?;
             send_frame(&mut tx, Greeting::default().to_bytes()).await?;
             Ok((greeting, (tx, rx)))
@@ -179,7 +178,8 @@ impl Acceptor {
         match greeted.await {
             Ok((greeting, control)) => {
                 let ended = claim.as_ref().map(Claim::ended);
-                let link = link(connection, &findings, false, greeting, control, fate, claim);
+                let places = Places::new(self.options.flows_max);
+                let link = link(connection, &findings, false, greeting, control, (fate, places), claim);
                 let link = link.map_err(Refusal::Certificate)?;
                 if let Some(ended) = ended {
                     link.end_with(ended);
@@ -268,7 +268,7 @@ impl QuicDialer {
         }
         let (socket, _) = socket::bind(socket::any_like(remote), &self.options)?;
         let config = config::endpoint(self.flavor, None, 0);
-        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(TokioRuntime))?;
+        let endpoint = Endpoint::new_with_abstract_socket(config, None, socket, Arc::new(PromptRuntime))?;
         Ok(slot.insert(endpoint).clone())
     }
 
@@ -296,7 +296,7 @@ pub(crate) async fn greet(
     let greeted = async {
         let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
         let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
-        let mut rx = ControlRx { inlet: Inlet::new(rx, &fate), pieces: Pieces::default() };
+        let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
         // At once: the listener learns of the stream from what is sent on it.
         send_frame(&mut tx, greeting.to_bytes()).await?;
         hear_greeting(&mut rx).await?;
@@ -304,7 +304,9 @@ pub(crate) async fn greet(
     };
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
         Ok(control) => {
-            link(connection, &findings, true, greeting, control, fate, None).map_err(LinkError::RefusedHere)
+            let places = Places::new(options.flows_max);
+            link(connection, &findings, true, greeting, control, (fate, places), None)
+                .map_err(LinkError::RefusedHere)
         }
         Err(error) => {
             if let LinkError::Protocol(why) = &error {
@@ -343,7 +345,7 @@ fn link(
     is_dialer: bool,
     Greeting { lane }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
-    fate: Arc<Fate>,
+    (fate, places): (Arc<Fate>, Arc<Places>),
     claim: Option<Claim>,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
@@ -361,8 +363,10 @@ fn link(
         control_tx,
         control_rx,
         labels,
+        datagrams: std::sync::Mutex::default(),
         fate,
         gate,
+        places,
         _claim: claim,
     };
     Ok(QuicLink { shared: Arc::new(shared) })

@@ -6,6 +6,7 @@
 mod clear;
 mod config;
 mod endpoint;
+mod places;
 
 #[cfg(test)]
 pub(crate) use config::transport;
@@ -16,7 +17,7 @@ use std::fmt;
 use std::future::{Future as _, poll_fn};
 use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, OnceLock, PoisonError};
 use std::task::Poll;
 use std::time::Duration;
 
@@ -26,9 +27,10 @@ use quinn::{
     WriteError,
 };
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
+use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::Mutex;
 
+use self::places::{Place, Places};
 use crate::congestion::Gate;
 use crate::dtls::Claim;
 use crate::error::{CloseReason, FlowEnd, FlowError, LabelError, LinkError, ProtocolError};
@@ -57,8 +59,11 @@ struct Shared {
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
     labels: Arc<Labels>,
+    /// For datagrams that leave.
+    datagrams: std::sync::Mutex<Slab>,
     fate: Arc<Fate>,
     gate: Arc<Gate>,
+    places: Arc<Places>,
     /// Its hold on what it travels in.
     _claim: Option<Claim>,
 }
@@ -106,6 +111,8 @@ pub(crate) struct Outlet {
     stream: SendStream,
     urgency: Urgency,
     pending: Chunks,
+    /// The part of it that is being written.
+    piece: Chunks,
     fate: Arc<Fate>,
     gate: Arc<Gate>,
 }
@@ -115,7 +122,7 @@ impl Outlet {
         // Fails only on a stream that is closed already, which the first write then says.
         let _ = stream.set_priority(urgency.priority());
         let (fate, gate) = (Arc::clone(fate), Arc::clone(gate));
-        Self { stream, urgency, pending: Vec::new(), fate, gate }
+        Self { stream, urgency, pending: Vec::new(), piece: Vec::new(), fate, gate }
     }
 
     pub(crate) fn queue(&mut self, chunks: impl Iterator<Item = Bytes>) {
@@ -159,23 +166,27 @@ impl Outlet {
                 }),
             },
         };
-        let mut piece = front(&self.pending, permit.bytes());
+        front(&self.pending, permit.bytes(), &mut self.piece);
         let mut permit = Some(permit);
         let (stream, gate) = (&mut self.stream, &self.gate);
-        let mut write = pin!(stream.write_chunks(&mut piece));
-        let written = poll_fn(|cx| {
-            let result = write.as_mut().poll(cx);
-            // The peer takes no more of this flow: others need not wait for it.
-            let leave = permit.take();
-            match (&result, leave) {
-                (Poll::Ready(Ok(written)), Some(leave)) => leave.written(written.bytes),
-                (Poll::Ready(Ok(written)), None) => gate.note_written(written.bytes),
-                _ => {}
-            }
-            result
-        });
-        let written = written.await?;
-        skip(&mut self.pending, written.bytes);
+        let written = {
+            let mut write = pin!(stream.write_chunks(&mut self.piece));
+            poll_fn(|cx| {
+                let result = write.as_mut().poll(cx);
+                // The peer takes no more of this flow: others need not wait for it.
+                let leave = permit.take();
+                match (&result, leave) {
+                    (Poll::Ready(Ok(written)), Some(leave)) => leave.written(written.bytes),
+                    (Poll::Ready(Ok(written)), None) => gate.note_written(written.bytes),
+                    _ => {}
+                }
+                result
+            })
+            .await
+        };
+        // What is left of it is pending, too; references would keep memory that has left.
+        self.piece.clear();
+        skip(&mut self.pending, written?.bytes);
         Ok(())
     }
 
@@ -218,9 +229,9 @@ impl Drop for Outlet {
     }
 }
 
-/// The first `bytes` of these, or all.
-fn front(chunks: &[Bytes], mut bytes: usize) -> Chunks {
-    let mut out = Chunks::new();
+/// Makes `out` the first `bytes` of these, or all.
+fn front(chunks: &[Bytes], mut bytes: usize, out: &mut Chunks) {
+    out.clear();
     for chunk in chunks {
         let n = chunk.len().min(bytes);
         out.push(chunk.slice(..n));
@@ -229,7 +240,6 @@ fn front(chunks: &[Bytes], mut bytes: usize) -> Chunks {
             break;
         }
     }
-    out
 }
 
 /// Drops the first `bytes` of these, and what is empty then.
@@ -254,11 +264,13 @@ fn skip(chunks: &mut Chunks, mut bytes: usize) {
 pub(crate) struct Inlet {
     stream: RecvStream,
     fate: Arc<Fate>,
+    /// None for the control stream, which is no flow.
+    _place: Option<Place>,
 }
 
 impl Inlet {
-    fn new(stream: RecvStream, fate: &Arc<Fate>) -> Self {
-        Self { stream, fate: Arc::clone(fate) }
+    fn new(stream: RecvStream, fate: &Arc<Fate>, place: Option<Place>) -> Self {
+        Self { stream, fate: Arc::clone(fate), _place: place }
     }
 
     /// Waits for more of the stream and appends it; false at its end.
@@ -372,9 +384,10 @@ impl Link for QuicLink {
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
-        let Shared { connection, fate, labels, .. } = &*self.shared;
+        let Shared { connection, fate, labels, places, .. } = &*self.shared;
         let stream = connection.accept_uni().await.map_err(|e| fate.explain(&e))?;
-        Ok(FlowRx::new(flow::Inlet::Quic(Inlet::new(stream, fate)), Arc::clone(labels)))
+        let inlet = Inlet::new(stream, fate, Some(places.take(connection)));
+        Ok(FlowRx::new(flow::Inlet::Quic(inlet), Arc::clone(labels)))
     }
 
     fn datagram_max(&self) -> Option<usize> {
@@ -382,7 +395,7 @@ impl Link for QuicLink {
     }
 
     async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let Shared { connection, fate, gate, .. } = &*self.shared;
+        let Shared { connection, fate, gate, datagrams, .. } = &*self.shared;
         let bytes = packet.encoded_bytes_as(label);
         let max = connection.max_datagram_size().unwrap_or(0);
         if bytes > max {
@@ -396,7 +409,8 @@ impl Link for QuicLink {
             },
         };
         permit.written(bytes);
-        connection.send_datagram_wait(datagram(packet, label)).await.map_err(|e| match e {
+        let datagram = datagram(packet, label, &mut datagrams.lock().unwrap_or_else(PoisonError::into_inner));
+        connection.send_datagram_wait(datagram).await.map_err(|e| match e {
             SendDatagramError::ConnectionLost(e) => fate.explain(&e),
             // The path may have narrowed in between.
             _ => LinkError::DatagramTooLong { bytes, max: connection.max_datagram_size().unwrap_or(0) },

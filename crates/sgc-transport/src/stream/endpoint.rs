@@ -22,6 +22,7 @@ use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::overload::Overload;
+use crate::prompt;
 use crate::race;
 use crate::url::{LinkUrl, ListenAddr, Scheme};
 
@@ -238,7 +239,7 @@ impl Links {
         let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
         let shared = Shared::new(options, counters);
         shared.lock().mux.note_handshake(rtt);
-        tokio::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
+        prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
         let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
         if all.len() == all.capacity() {
             all.retain(|link| link.strong_count() > 0);

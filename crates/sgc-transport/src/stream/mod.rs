@@ -43,7 +43,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
+use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::{Notify, futures::Notified};
 
 use self::frame::DATAGRAM_BYTES_MAX;
@@ -532,7 +532,7 @@ impl Link for StreamLink {
         if bytes > max {
             return Err(LinkError::DatagramTooLong { bytes, max });
         }
-        let (shared, datagram) = (&self.handle.shared, datagram(packet, label));
+        let (shared, datagram) = (&self.handle.shared, datagram(packet, label, &mut Slab::default()));
         shared
             .until(&shared.datagrams_tx, |state| {
                 if let Some(end) = &state.end {

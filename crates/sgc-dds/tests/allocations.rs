@@ -1,0 +1,65 @@
+//! How often this side of Cyclone allocates for a sample: once where it is taken, for the reference to it, and not at all
+//! where it is written. What Cyclone takes itself, in C, is not counted.
+#![allow(clippy::unwrap_used)]
+
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
+use sgc_ros::{EndpointSpec, RosNetwork as _, RosWriter as _, SampleKind};
+use sgc_testkit::{CountingAllocator, allocated_here, allocations};
+use sgc_wire::Qos;
+
+#[global_allocator]
+static COUNTING: CountingAllocator = CountingAllocator;
+
+const DOMAIN: u32 = 99;
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Who wrote the first is looked up.
+const WARM_UP: usize = 100;
+const SAMPLES: usize = 1000;
+
+fn open() -> CycloneNetwork {
+    let config = DdsConfig { domain: DOMAIN, discovery: DiscoveryRange::LocalHost, ..DdsConfig::default() };
+    CycloneNetwork::open(&config).unwrap()
+}
+
+#[test]
+fn a_sample_is_one_allocation_where_it_is_taken_and_none_where_it_is_written() {
+    let spec = EndpointSpec {
+        topic: "rt/allocations".into(),
+        type_name: "std_msgs::msg::dds_::ByteMultiArray_".into(),
+        keyless: true,
+        type_hash: None,
+        qos: Qos::default(),
+    };
+    let (near, far) = (open(), open());
+    let (tell, told) = channel();
+    // So far, on the reader's thread; the channel's own blocks are in it.
+    let handler = move |_| {
+        let _ = tell.send(allocated_here().count);
+    };
+    let _reader = far.create_reader(&spec, Box::new(handler)).unwrap();
+    let writer = near.create_writer(&spec).unwrap();
+    let deadline = Instant::now() + PATIENCE;
+    while writer.matched_readers() == 0 {
+        assert!(Instant::now() < deadline, "the reader does not match");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let payload = Bytes::from([&[0, 1, 0, 0][..], &[7; 1000]].concat());
+    let (mut counts, mut written) = (Vec::new(), 0);
+    for n in 0..WARM_UP + SAMPLES {
+        let payload = payload.clone();
+        let (taken, result) = allocations(|| writer.write(SampleKind::Write, 1_000_000_000, payload));
+        result.unwrap();
+        counts.push(told.recv_timeout(PATIENCE).expect("the sample arrives"));
+        if n >= WARM_UP {
+            written += taken.count;
+        }
+    }
+    assert_eq!(written, 0);
+    let taken = counts[WARM_UP + SAMPLES - 1] - counts[WARM_UP - 1];
+    assert!(taken >= SAMPLES, "the allocator counts");
+    assert!(taken <= SAMPLES + SAMPLES / 16, "{taken} for {SAMPLES} samples");
+}

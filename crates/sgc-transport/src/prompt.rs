@@ -1,0 +1,417 @@
+//! Tasks that may be run by the thread that wakes them.
+//!
+//! A thread outside of the runtime that hands a packet to a task has to wake a thread of the runtime, and where the
+//! machine is idle that takes longer than all the work. Within an [`AtHand`] the tasks that the thread wakes are run by it,
+//! at the end. Whatever else wakes a task has the runtime run it, as any other; a task never runs twice at once, and what
+//! wakes it while it runs has it run again. Decides nothing about what tasks do, and makes no threads.
+
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::fmt;
+use std::future::Future;
+use std::marker::PhantomData;
+use std::pin::{Pin, pin};
+use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::task::{Context, Poll, Wake, Waker, ready};
+use std::time::Instant;
+
+use quinn::{AsyncTimer, AsyncUdpSocket, Runtime, TokioRuntime};
+use tokio::runtime::{EnterGuard, Handle};
+use tokio::time::{Sleep, sleep_until};
+
+/// Tasks that one thread runs at once; what is left is the runtime's. One that wakes itself is not to keep it for ever.
+const RUNS_MAX: usize = 16;
+
+thread_local! {
+    /// What this thread woke and will run, if it is to.
+    static AT_HAND: RefCell<Option<VecDeque<Arc<Task>>>> = const { RefCell::new(None) };
+}
+
+type Work = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// Nothing is to be done until it is woken.
+const IDLE: u8 = 0;
+/// It was woken, and whoever did sees to it that it is run.
+const DUE: u8 = 1;
+/// A thread runs it.
+const RUNS: u8 = 2;
+/// The same, and it was woken meanwhile.
+const RUNS_AGAIN: u8 = 3;
+/// It has ended.
+const DONE: u8 = 4;
+
+struct Task {
+    state: AtomicU8,
+    work: Mutex<Option<Work>>,
+    /// Wakes the runtime's own task, which runs this one.
+    runtime: OnceLock<Waker>,
+}
+
+/// Starts a task, in the runtime around it.
+pub fn spawn(work: impl Future<Output = ()> + Send + 'static) {
+    let work: Work = Box::pin(work);
+    let task = Task { state: AtomicU8::new(DUE), work: Mutex::new(Some(work)), runtime: OnceLock::new() };
+    tokio::spawn(Runner(Arc::new(task)));
+}
+
+impl Task {
+    fn work(&self) -> MutexGuard<'_, Option<Work>> {
+        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// True if the caller has to see to it that it is run.
+    fn is_due_now(&self) -> bool {
+        let woken = |state| match state {
+            IDLE => Some(DUE),
+            RUNS => Some(RUNS_AGAIN),
+            _ => None,
+        };
+        self.state.fetch_update(Ordering::AcqRel, Ordering::Acquire, woken) == Ok(IDLE)
+    }
+
+    /// Sees to it that it is run: by this thread if it collects what it wakes, or else by the runtime.
+    fn schedule(self: &Arc<Self>) {
+        let collect = |at_hand: &RefCell<Option<VecDeque<_>>>| match &mut *at_hand.borrow_mut() {
+            Some(tasks) => {
+                tasks.push_back(Arc::clone(self));
+                true
+            }
+            None => false,
+        };
+        // A thread that ends has no such list any more.
+        if !AT_HAND.try_with(collect).unwrap_or(false) {
+            self.hand_over();
+        }
+    }
+
+    fn hand_over(&self) {
+        // There is none before the runtime ran it first, which it is about to.
+        if let Some(runtime) = self.runtime.get() {
+            runtime.wake_by_ref();
+        }
+    }
+
+    /// Runs it if it is due; otherwise another thread did or does.
+    fn run(self: &Arc<Self>) {
+        if self.state.compare_exchange(DUE, RUNS, Ordering::AcqRel, Ordering::Acquire).is_err() {
+            return;
+        }
+        let waker = Waker::from(Arc::clone(self));
+        {
+            let mut work = self.work();
+            let is_over =
+                work.as_mut().is_none_or(|w| w.as_mut().poll(&mut Context::from_waker(&waker)).is_ready());
+            if is_over {
+                *work = None;
+                self.state.store(DONE, Ordering::Release);
+                return self.hand_over();
+            }
+        }
+        let rests = |state| match state {
+            RUNS => Some(IDLE),
+            RUNS_AGAIN => Some(DUE),
+            _ => None,
+        };
+        if self.state.fetch_update(Ordering::AcqRel, Ordering::Acquire, rests) == Ok(RUNS_AGAIN) {
+            self.schedule();
+        }
+    }
+}
+
+impl Wake for Task {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        if self.is_due_now() {
+            self.schedule();
+        }
+    }
+}
+
+/// The runtime's own task, for one of ours.
+struct Runner(Arc<Task>);
+
+impl Future for Runner {
+    type Output = ();
+
+    fn poll(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        // A task of the runtime has one waker for all its life.
+        self.0.runtime.get_or_init(|| cx.waker().clone());
+        self.0.run();
+        match self.0.state.load(Ordering::Acquire) {
+            DONE => Poll::Ready(()),
+            _ => Poll::Pending,
+        }
+    }
+}
+
+impl Drop for Runner {
+    fn drop(&mut self) {
+        // The runtime ends: what the task holds may hold the task.
+        let work = self.0.work().take();
+        self.0.state.store(DONE, Ordering::Release);
+        drop(work);
+    }
+}
+
+/// While it is there, tasks that this thread wakes wait for its end, and then this thread runs them. Not for threads of the
+/// runtime.
+pub struct AtHand<'a> {
+    /// Whether this thread collects already: then the outer one runs them.
+    is_inner: bool,
+    _runtime: EnterGuard<'a>,
+    /// It is of one thread.
+    _thread: PhantomData<*const ()>,
+}
+
+impl<'a> AtHand<'a> {
+    /// Begins to collect, in this runtime.
+    pub fn begin(runtime: &'a Handle) -> Self {
+        let is_inner = AT_HAND.with_borrow_mut(|at_hand| {
+            let is_inner = at_hand.is_some();
+            at_hand.get_or_insert_default();
+            is_inner
+        });
+        Self { is_inner, _runtime: runtime.enter(), _thread: PhantomData }
+    }
+}
+
+impl fmt::Debug for AtHand<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("AtHand").finish_non_exhaustive()
+    }
+}
+
+impl Drop for AtHand<'_> {
+    fn drop(&mut self) {
+        if self.is_inner {
+            return;
+        }
+        for _ in 0..RUNS_MAX {
+            let next = AT_HAND.with_borrow_mut(|at_hand| at_hand.as_mut().and_then(VecDeque::pop_front));
+            let Some(task) = next else { break };
+            task.run();
+        }
+        hand_over(AT_HAND.take());
+    }
+}
+
+/// Waits for something on a thread outside of the runtime. What it has at hand is the runtime's from then on, unless nothing
+/// is to be waited for.
+pub fn block_on<T>(runtime: &Handle, future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    {
+        let _runtime = runtime.enter();
+        if let Poll::Ready(done) = future.as_mut().poll(&mut Context::from_waker(Waker::noop())) {
+            return done;
+        }
+    }
+    hand_over(AT_HAND.with_borrow_mut(|at_hand| at_hand.as_mut().map(std::mem::take)));
+    runtime.block_on(future)
+}
+
+fn hand_over(tasks: Option<VecDeque<Arc<Task>>>) {
+    for task in tasks.into_iter().flatten() {
+        task.hand_over();
+    }
+}
+
+/// Tokio for quinn, whose tasks may be run by who wakes them.
+#[derive(Debug)]
+pub(crate) struct PromptRuntime;
+
+impl Runtime for PromptRuntime {
+    fn new_timer(&self, at: Instant) -> Pin<Box<dyn AsyncTimer>> {
+        Box::pin(Timer { at, sleep: Box::pin(sleep_until(at.into())) })
+    }
+
+    fn spawn(&self, future: Work) {
+        spawn(future);
+    }
+
+    fn wrap_udp_socket(
+        &self,
+        socket: std::net::UdpSocket,
+    ) -> std::io::Result<std::sync::Arc<dyn AsyncUdpSocket>> {
+        TokioRuntime.wrap_udp_socket(socket)
+    }
+
+    fn now(&self) -> Instant {
+        TokioRuntime.now()
+    }
+}
+
+/// A timer that is put off without telling the runtime: a connection does so with each packet, and one that is put forward
+/// wakes a thread of the runtime.
+#[derive(Debug)]
+struct Timer {
+    at: Instant,
+    sleep: Pin<Box<Sleep>>,
+}
+
+impl AsyncTimer for Timer {
+    fn reset(mut self: Pin<&mut Self>, at: Instant) {
+        self.at = at;
+        if self.sleep.deadline() > at.into() {
+            self.sleep.as_mut().reset(at.into());
+        }
+    }
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        loop {
+            ready!(Future::poll(self.sleep.as_mut(), cx));
+            let at = self.at.into();
+            if self.sleep.deadline() >= at {
+                return Poll::Ready(());
+            }
+            self.sleep.as_mut().reset(at);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::poll_fn;
+    use std::sync::Weak;
+    use std::sync::atomic::AtomicUsize;
+    use std::thread;
+    use std::time::Duration;
+
+    use tokio::sync::{Notify, oneshot};
+    use tokio::time::timeout;
+
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(20);
+
+    fn runtime() -> tokio::runtime::Runtime {
+        tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap()
+    }
+
+    /// A task that notes who runs it after each ring of its bell, and has been run once.
+    fn listening(runtime: &tokio::runtime::Runtime) -> (Arc<Notify>, Arc<Mutex<Vec<thread::ThreadId>>>) {
+        let (bell, heard) = (Arc::new(Notify::new()), Arc::new(Mutex::new(Vec::new())));
+        let (ring, note) = (bell.clone(), heard.clone());
+        runtime.block_on(async {
+            spawn(async move {
+                loop {
+                    ring.notified().await;
+                    note.lock().unwrap().push(thread::current().id());
+                }
+            });
+            tokio::task::yield_now().await;
+        });
+        (bell, heard)
+    }
+
+    #[test]
+    fn who_wakes_a_task_runs_it() {
+        // Nobody drives the runtime meanwhile.
+        let runtime = runtime();
+        let (bell, heard) = listening(&runtime);
+        {
+            let _outer = AtHand::begin(runtime.handle());
+            let inner = AtHand::begin(runtime.handle());
+            bell.notify_one();
+            drop(inner);
+            assert!(heard.lock().unwrap().is_empty(), "not before the end");
+        }
+        assert_eq!(*heard.lock().unwrap(), [thread::current().id()]);
+        bell.notify_one();
+        assert_eq!(heard.lock().unwrap().len(), 1, "otherwise the runtime does");
+        runtime.block_on(tokio::task::yield_now());
+        assert_eq!(heard.lock().unwrap().len(), 2);
+    }
+
+    #[test]
+    fn what_is_at_hand_does_not_wait_for_who_waits() {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let (bell, (answer, answered)) = (Arc::new(Notify::new()), oneshot::channel());
+        let (begun, has_begun) = std::sync::mpsc::channel();
+        let ring = bell.clone();
+        runtime.block_on(async move {
+            spawn(async move {
+                let _ = begun.send(());
+                ring.notified().await;
+                let _ = answer.send(());
+            });
+        });
+        has_begun.recv_timeout(PATIENCE).unwrap();
+        let _at_hand = AtHand::begin(runtime.handle());
+        bell.notify_one();
+        block_on(runtime.handle(), async { timeout(PATIENCE, answered).await }).unwrap().unwrap();
+    }
+
+    #[test]
+    fn no_wake_is_lost_between_threads() {
+        const RINGS: usize = 20_000;
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let (asked, seen) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0)));
+        let waker = Arc::new(Mutex::new(None::<Waker>));
+        let (count, note, slot) = (asked.clone(), seen.clone(), waker.clone());
+        runtime.block_on(async move {
+            spawn(poll_fn(move |cx| {
+                *slot.lock().unwrap() = Some(cx.waker().clone());
+                let asked = count.load(Ordering::SeqCst);
+                note.store(asked, Ordering::SeqCst);
+                if asked == 3 * RINGS { Poll::Ready(()) } else { Poll::Pending }
+            }));
+        });
+        thread::scope(|scope| {
+            for by_hand in [true, true, false] {
+                let (asked, waker, runtime) = (&asked, &waker, &runtime);
+                scope.spawn(move || {
+                    for _ in 0..RINGS {
+                        let _at_hand = by_hand.then(|| AtHand::begin(runtime.handle()));
+                        asked.fetch_add(1, Ordering::SeqCst);
+                        let waker = waker.lock().unwrap().clone();
+                        waker.into_iter().for_each(Waker::wake);
+                    }
+                });
+            }
+        });
+        let begun = Instant::now();
+        while seen.load(Ordering::SeqCst) < 3 * RINGS {
+            assert!(begun.elapsed() < PATIENCE, "{} of {} seen", seen.load(Ordering::SeqCst), 3 * RINGS);
+            thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn a_runtime_that_ends_takes_its_tasks_along() {
+        struct Held(Mutex<Option<Waker>>);
+        let runtime = runtime();
+        let held = Arc::new(Held(Mutex::new(None)));
+        let weak: Weak<Held> = Arc::downgrade(&held);
+        runtime.block_on(async {
+            // It holds what holds its own waker.
+            spawn(poll_fn(move |cx| {
+                *held.0.lock().unwrap() = Some(cx.waker().clone());
+                Poll::Pending
+            }));
+            tokio::task::yield_now().await;
+        });
+        assert!(weak.upgrade().is_some_and(|held| held.0.lock().unwrap().is_some()));
+        drop(runtime);
+        assert!(weak.upgrade().is_none());
+    }
+
+    #[tokio::test]
+    async fn a_timer_rings_when_it_was_last_set_to() {
+        let begun = Instant::now();
+        let after = |ms| begun + Duration::from_millis(ms);
+        let mut late = PromptRuntime.new_timer(after(10));
+        late.as_mut().reset(after(60));
+        let mut early = PromptRuntime.new_timer(after(600_000));
+        early.as_mut().reset(after(30));
+        for (timer, ms) in [(&mut early, 30), (&mut late, 60)] {
+            timeout(PATIENCE, poll_fn(|cx| timer.as_mut().poll(cx))).await.unwrap();
+            assert!(begun.elapsed() >= Duration::from_millis(ms));
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! How many flows a peer may have open: a few at first, and more as it opens them. QUIC keeps a place for each that it may,
+//! used or not. Which flows there are is QUIC's to know.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use quinn::{Connection, VarInt};
+
+/// How many a peer may have open before it has opened any. A peer that wants more waits a round trip each time that it is
+/// given twice as many.
+const FLOWS_AT_FIRST: u32 = 256;
+
+/// How many it may have open at first where it may have so many in the end.
+pub(super) fn at_first(flows_max: u32) -> u32 {
+    flows_max.min(FLOWS_AT_FIRST)
+}
+
+/// The places of one link.
+#[derive(Debug)]
+pub(crate) struct Places {
+    open: AtomicU32,
+    permitted: AtomicU32,
+    max: u32,
+}
+
+/// A flow's place, for as long as somebody reads it.
+#[derive(Debug)]
+pub(crate) struct Place(Arc<Places>);
+
+impl Places {
+    /// Those of a link that was made with [`at_first`].
+    pub(super) fn new(flows_max: u32) -> Arc<Self> {
+        let permitted = at_first(flows_max).into();
+        Arc::new(Self { open: AtomicU32::new(0), permitted, max: flows_max })
+    }
+
+    /// A flow that was accepted takes its place. The peer may open more where it uses half of what it has.
+    pub(super) fn take(self: &Arc<Self>, connection: &Connection) -> Place {
+        if let Some(more) = self.note_taken() {
+            connection.set_max_concurrent_uni_streams(VarInt::from_u32(more));
+        }
+        Place(Arc::clone(self))
+    }
+
+    /// How many are permitted from here on, if that changes.
+    fn note_taken(&self) -> Option<u32> {
+        let open = self.open.fetch_add(1, Relaxed).saturating_add(1);
+        let permitted = self.permitted.load(Relaxed);
+        if permitted >= self.max || open.saturating_mul(2) <= permitted {
+            return None;
+        }
+        let more = permitted.saturating_mul(2).min(self.max);
+        self.permitted.compare_exchange(permitted, more, Relaxed, Relaxed).ok().map(|_| more)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.0.open.fetch_sub(1, Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_opens_many_may_open_more_up_to_the_bound() {
+        let places = Places::new(1000);
+        let given: Vec<_> = (0..1000).filter_map(|n| Some((n, places.note_taken()?))).collect();
+        assert_eq!(given, [(128, 512), (256, 1000)]);
+        let few = Places::new(10);
+        assert!((0..10).all(|_| few.note_taken().is_none()));
+    }
+
+    #[test]
+    fn who_opens_and_ends_needs_no_more() {
+        let places = Places::new(1000);
+        for _ in 0..1000 {
+            assert_eq!(places.note_taken(), None);
+            drop(Place(places.clone()));
+        }
+    }
+}
