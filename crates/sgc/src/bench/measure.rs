@@ -17,7 +17,7 @@ use sgc_trust::{NodeName, Suite};
 
 use super::echo::{Tcp, UDP_BYTES_MAX, Udp};
 use super::machine::{Machine, cpu_us};
-use super::program::{End, PROGRESS_EVERY};
+use super::program::End;
 use super::report::{Flow, Path, Report, Trips};
 use super::side::{self, Meeting, Side, Topics};
 use super::words::{Answer, Ask, Counted, Frame, Kind, Lane, PROTOCOL, Question, RunId, Size, Tell};
@@ -46,6 +46,8 @@ const TRIPS_MAX: usize = 1000;
 /// Messages of a stream that are under way at most, and their bytes.
 const WINDOW: (u64, u64) = (8, 1000);
 const WINDOW_BYTES: u64 = 8_000_000;
+/// Of so many parts of what may be under way one message each is answered.
+const WINDOW_MARKS: u64 = 8;
 /// How long a stream waits for word of its progress before it goes on without.
 const PROGRESS_MAX: Duration = Duration::from_secs(2);
 /// How long what is missing at the end of a stream may still come.
@@ -439,14 +441,17 @@ impl<'a> Measuring<'a> {
         let cpu_before = cpu_us(self.side.process());
         let data = bytes::Bytes::from(vec![0x5a; size.0]);
         let window = (WINDOW_BYTES / size.0 as u64).clamp(WINDOW.0, WINDOW.1);
+        let every = window / WINDOW_MARKS;
         let (begun, mut sent, mut known) = (Instant::now(), 0, 0);
         let mut heard = Instant::now();
         while begun.elapsed() < self.seconds() {
             while sent - known < window && begun.elapsed() < self.seconds() {
-                let frame = Frame { phase, kind: Kind::Stream, seq: sent, data: data.clone() };
+                let is_marked = sent % every == 0;
+                let kind = if is_marked { Kind::Marked } else { Kind::Stream };
+                let frame = Frame { phase, kind, seq: sent, data: data.clone() };
                 self.ends[&lane].send(&frame).map_err(from_dds)?;
                 sent += 1;
-                if sent % PROGRESS_EVERY == 0 {
+                if is_marked {
                     break;
                 }
             }

@@ -16,8 +16,6 @@ use super::words::{Counted, Frame, Kind, Lane, TYPE};
 
 /// Messages that a reader holds: more than are ever under way.
 const READER_DEPTH: u32 = 4096;
-/// Of a stream each message of such a number is answered, so that whoever sends it knows how far it is.
-pub(crate) const PROGRESS_EVERY: u64 = 8;
 /// How long a message may wait until the local network takes it.
 const WRITE_MAX: Duration = Duration::from_secs(10);
 
@@ -100,9 +98,9 @@ impl End {
                 let Some(frame) = Frame::decode(&sample.payload) else { return };
                 let answer = match frame.kind {
                     Kind::Ping => Frame { kind: Kind::Pong, ..frame },
-                    Kind::Stream => {
+                    Kind::Stream | Kind::Marked => {
                         tally.lock().unwrap_or_else(PoisonError::into_inner).count(&frame, now);
-                        if frame.seq % PROGRESS_EVERY != 0 {
+                        if frame.kind == Kind::Stream {
                             return;
                         }
                         Frame { kind: Kind::Pong, data: Default::default(), ..frame }

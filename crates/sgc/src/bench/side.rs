@@ -279,10 +279,10 @@ fn configuration(
 mod tests {
     use super::*;
 
-    fn load(meeting: &Meeting, topics: &Topics) -> config::Config {
+    fn load(identity: &Path, meeting: &Meeting, topics: &Topics) -> config::Config {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("bench.toml");
-        let text = configuration(Path::new("/x/a \"b\".identity"), meeting, topics, 42).unwrap();
+        let text = configuration(identity, meeting, topics, 42).unwrap();
         fs::write(&path, text).unwrap();
         config::load(&path, &|_: &str| None).unwrap()
     }
@@ -290,11 +290,15 @@ mod tests {
     #[test]
     fn both_sides_are_configured_for_the_same_topics() {
         let listen = Meeting::Listen(vec!["quic://0.0.0.0:7448".into(), "tls://[::]:7448".into()]);
-        let own = load(&listen, &Topics::Own);
-        assert_eq!(own.identity, Path::new("/x/a \"b\".identity"));
+        let place = tempfile::tempdir().unwrap();
+        let identity = place.path().join("a \"b\".identity");
+        crate::files::write_secret(&identity, "", crate::files::Existing::Keep("")).unwrap();
+        let own = load(&identity, &listen, &Topics::Own);
+        assert_eq!(own.identity, identity);
         assert_eq!((own.shares.len(), own.uses.len()), (2 * (Suite::ALL.len() + 1), 0));
         let connect = Meeting::Connect(vec!["quic://desk.example:7448".into()]);
-        let used = load(&connect, &Topics::Of("desk".into(), vec![Suite::Group, Suite::PaperChacha]));
+        let used =
+            load(&identity, &connect, &Topics::Of("desk".into(), vec![Suite::Group, Suite::PaperChacha]));
         assert_eq!(used.uses.len(), 6);
         for used in &used.uses {
             assert!(own.shares.iter().any(|share| share.topic == used.topic), "{}", used.topic);

@@ -74,12 +74,14 @@ pub(crate) enum Kind {
     Pong,
     /// One of many that are counted.
     Stream,
+    /// One of those that is also answered, without its data, so that whoever sends them knows how far they are.
+    Marked,
     /// A question or an answer.
     Words,
 }
 
 impl Kind {
-    const ALL: [Self; 4] = [Self::Ping, Self::Pong, Self::Stream, Self::Words];
+    const ALL: [Self; 5] = [Self::Ping, Self::Pong, Self::Stream, Self::Marked, Self::Words];
 }
 
 /// A message.
