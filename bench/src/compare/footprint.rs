@@ -55,11 +55,17 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     let stage = Stage { program, is_quick: compare.is_quick() };
     let fits = |count: &&usize| !compare.is_quick() || **count <= QUICK_MAX;
     let sizes = |all: &[usize]| all.iter().filter(fits).copied().collect::<Vec<_>>();
-    stage.topics(&sizes(&TOPICS), compare, figures)?;
-    stage.links(&sizes(&LINKS), compare, figures)?;
+    if let Err(error) = stage.topics(&sizes(&TOPICS), compare, figures) {
+        figures.leave_out("footprint, topics", format!("{error:#}"));
+    }
+    if let Err(error) = stage.links(&sizes(&LINKS), compare, figures) {
+        figures.leave_out("footprint, links", format!("{error:#}"));
+    }
     for names in NAMES.into_iter().filter(|names| !compare.is_quick() || *names <= QUICK_NAMES_MAX) {
         compare.note(&format!("footprint, {names} names"));
-        stage.names(names, figures)?;
+        if let Err(error) = stage.names(names, figures) {
+            figures.leave_out(&format!("footprint, {names} names"), format!("{error:#}"));
+        }
     }
     bridges(compare, if compare.is_quick() { IDLE_QUICK } else { IDLE }, figures)
 }
