@@ -51,6 +51,7 @@ impl Side {
 
 /// What lies between the two places.
 #[derive(Clone, Copy, Debug)]
+#[expect(clippy::large_enum_variant, reason = "there are a few in a run")]
 pub(crate) enum PathKind {
     /// A pair of virtual Ethernet interfaces, and nothing else.
     Bare,
@@ -93,7 +94,9 @@ impl PathKind {
 /// The two places. What was started in them has to end before it is dropped.
 pub(crate) struct Lab {
     /// Goes first, as its devices are in the namespaces. None on [`PathKind::Bare`].
-    _path: Option<TunLink>,
+    pub(crate) path: Option<TunLink>,
+    /// What it is.
+    pub(crate) kind: PathKind,
     places: [Arc<Namespace>; 2],
     /// For all that is written while it is there.
     pub(crate) dir: TempDir,
@@ -116,7 +119,7 @@ impl Lab {
             place.ip(&["link", "set", "lo", "multicast", "on"])?;
         }
         let dir = tempfile::tempdir()?;
-        Ok(Self { _path: path, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
+        Ok(Self { path, kind, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
     }
 
     /// The namespace of a place.

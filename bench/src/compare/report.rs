@@ -304,7 +304,7 @@ fn path_tables(figures: &Figures, about: &About<'_>, path: &str) -> String {
             for system in &systems {
                 let is_measured =
                     |family: &&Family<'_>| family.is_measured(figures, about.table, system, path, at);
-                if families.iter().any(|family| is_measured(family)) {
+                if families.iter().any(is_measured) {
                     row(&mut text, system, families.iter().map(|family| cell(family, system, at)));
                 }
             }
