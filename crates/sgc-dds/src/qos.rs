@@ -25,6 +25,11 @@ pub const HISTORY_DEPTH_MAX: u32 = 4096;
 /// wait: one that keeps the last samples overwrites them, acknowledged or not.
 pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
 
+/// History of a volatile endpoint that does not announce it: as ROS 2 has it by default. With the specification's single sample
+/// a writer here would overwrite what a reader that is late by one message has not acknowledged: of 1 MB images from Fast DDS
+/// to Fast DDS at 20 Hz one in some hundred was lost where both processors had other work.
+const UNSAID_DEPTH: i32 = 10;
+
 /// Data representations by their numbers (XTypes 1.3, 7.6.3.1.1).
 const XCDR1: i16 = DDS_DATA_REPRESENTATION_XCDR1 as i16;
 const XCDR2: i16 = DDS_DATA_REPRESENTATION_XCDR2 as i16;
@@ -168,8 +173,8 @@ fn finite(ns: i64) -> Option<u64> {
 /// Reads the QoS of a discovered endpoint; a policy that its announcement omits has the default of the
 /// specification (DDS 1.4, 2.2.3). `None` if it cannot be carried: too many or too long partitions.
 ///
-/// Few vendors announce history. Where it is missing, that of the durability service is taken, and else
-/// the last sample.
+/// Few vendors announce history. Where it is missing, that of the durability service is taken for late joiners; for
+/// volatile endpoints [`UNSAID_DEPTH`].
 ///
 /// # Safety
 /// `qos` must be a valid QoS object.
@@ -191,18 +196,20 @@ pub(crate) unsafe fn discovered(kind: EndpointKind, qos: *const dds_qos_t) -> Op
     unsafe {
         dds_qget_reliability(qos, &mut reliability, blocking);
         dds_qget_durability(qos, &mut durability);
-        if !dds_qget_history(qos, &mut history, &mut depth)
-            && durability != dds_durability_kind_DDS_DURABILITY_VOLATILE
-        {
-            dds_qget_durability_service(
-                qos,
-                cleanup,
-                &mut history,
-                &mut depth,
-                max_samples,
-                max_instances,
-                max_per_instance,
-            );
+        if !dds_qget_history(qos, &mut history, &mut depth) {
+            if durability == dds_durability_kind_DDS_DURABILITY_VOLATILE {
+                depth = UNSAID_DEPTH;
+            } else {
+                dds_qget_durability_service(
+                    qos,
+                    cleanup,
+                    &mut history,
+                    &mut depth,
+                    max_samples,
+                    max_instances,
+                    max_per_instance,
+                );
+            }
         }
         dds_qget_deadline(qos, &mut deadline);
         dds_qget_lifespan(qos, &mut lifespan);
@@ -374,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_means_the_defaults_of_the_specification() {
+    fn silence_means_the_defaults_of_the_specification_and_of_ros_2() {
         let native = NativeQos::new().unwrap();
         // SAFETY: a valid object that outlives the calls.
         let (reader, writer) = unsafe {
@@ -385,7 +392,7 @@ mod tests {
         };
         assert_eq!(reader.reliability, Reliability::BestEffort);
         assert_eq!(writer.reliability, Reliability::Reliable);
-        assert_eq!(writer.history, History::KeepLast(1));
+        assert_eq!(writer.history, History::KeepLast(UNSAID_DEPTH as u32));
         assert_eq!((writer.durability, writer.lease_ns), (Durability::Volatile, None));
     }
 
