@@ -154,5 +154,7 @@ fn who_does_not_want_it_watched_asks() {
     fs::write(&file, unwatched(&["/b"])).unwrap();
     watched.node.reload(|_| {});
     watched.shares(&["/b"]);
+    // It is in the log a little later than in effect.
+    wait("the log", || watched.reloads("") > 0);
     assert_eq!(watched.reloads(""), 1);
 }
