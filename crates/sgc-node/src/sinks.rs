@@ -5,7 +5,7 @@
 //! by who received it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -418,13 +418,13 @@ pub(crate) struct Behind {
     recent: Option<Mutex<Recent>>,
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
-    /// Whether taking a short message never waits for anybody.
-    never_blocks: bool,
+    /// Whether a short message that is taken now waits for nobody, and overwrites none that a reader may lack.
+    is_free: Box<dyn Fn() -> bool + Send + Sync>,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), never_blocks: false }
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|| false) }
     }
 }
 
@@ -467,10 +467,13 @@ impl WriterQueue {
             History::KeepLast(n) if spec.qos.is_reliable() => Some(n),
             _ => None,
         });
-        let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
-        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, never_blocks };
+        let (room, of_room) = (burst.room.clone(), weak.clone());
+        let is_free =
+            Box::new(move || never_blocks && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer)));
+        let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
+        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
         let mut decompressor = Decompressor::default();
         let mut prepare = move |message: Message| {
             let kind = match message.head.kind {
@@ -524,7 +527,8 @@ impl WriterQueue {
         })
     }
 
-    /// The same with somebody else who takes the messages, one after the other, and hears what is behind each; it may block, unless `behind` says that it never does.
+    /// The same with somebody else who takes the messages, one after the other, and hears what is behind each. It may block,
+    /// except for a short message where `behind` says that nothing is in the way.
     pub(crate) fn spawn_with(
         thread_name: &str,
         behind: Behind,
@@ -567,9 +571,9 @@ impl WriterQueue {
     /// Who takes a message of so many bytes now: if that does not block, and nothing is ahead of it. Only for who queues, while
     /// nobody else does.
     fn at_once(&self, bytes: usize) -> Option<MutexGuard<'_, Take>> {
-        let may = self.behind.never_blocks && bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
+        let may = bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed())
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)())
     }
 
     /// The writer's.
@@ -666,33 +670,50 @@ impl WriterQueue {
 /// Keeps what comes at once, after a way was interrupted, from overwriting itself in a reliable writer that keeps the last
 /// samples, which never blocks. Its publisher said it in its own time, and its readers would have had it.
 struct Burst {
-    /// Samples that the writer keeps; `None` if it blocks by itself, or nobody acknowledges.
-    depth: Option<u32>,
-    unacknowledged: u32,
+    room: Arc<Room>,
     /// A reader that stands still is not waited for again before.
     not_before: Option<Instant>,
 }
 
+/// What a writer keeps, and how much of it may not have been acknowledged. Changed only by who may take messages.
+struct Room {
+    /// Samples that the writer keeps; `None` if it blocks by itself, or nobody acknowledges.
+    depth: Option<u32>,
+    unacknowledged: AtomicU32,
+}
+
+impl Room {
+    /// Whether a sample may be written without taking the place of one that somebody may lack; does not wait.
+    fn is_there(&self, writer: &impl RosWriter) -> bool {
+        let Some(depth) = self.depth else { return true };
+        if self.unacknowledged.load(Relaxed) >= depth {
+            if !writer.wait_acknowledged(Duration::ZERO) {
+                return false;
+            }
+            self.unacknowledged.store(0, Relaxed);
+        }
+        true
+    }
+}
+
 impl Burst {
     fn new(depth: Option<u32>) -> Self {
-        Self { depth, unacknowledged: 0, not_before: None }
+        Self { room: Arc::new(Room { depth, unacknowledged: AtomicU32::new(0) }), not_before: None }
     }
 
     /// Waits before a sample would take the place of one that somebody may lack. One that comes alone is written at once, as
     /// its publisher did.
     fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool) {
-        let Some(depth) = self.depth else { return };
-        if is_alone || self.not_before.is_some_and(|at| Instant::now() < at) {
-            // By the next that comes with others it will have been acknowledged, or waited for.
-            self.unacknowledged = self.unacknowledged.saturating_add(1).min(depth);
-            return;
-        }
-        if self.unacknowledged >= depth {
+        let Some(depth) = self.room.depth else { return };
+        let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
+        // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
+        let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
+        if waits && unacknowledged >= depth {
             let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
             self.not_before = (!acknowledged).then(|| Instant::now() + STALLED_READER_PAUSE);
-            self.unacknowledged = 0;
+            unacknowledged = 0;
         }
-        self.unacknowledged += 1;
+        self.room.unacknowledged.store(unacknowledged.saturating_add(1).min(depth), Relaxed);
     }
 }
 
@@ -755,6 +776,24 @@ mod tests {
         assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
     }
 
+    #[test]
+    fn there_is_room_while_what_was_written_is_acknowledged() {
+        let writer = Slow::default();
+        let mut burst = Burst::new(Some(10));
+        for _ in 0..35 {
+            assert!(burst.room.is_there(&writer));
+            burst.before_next(&writer, true);
+        }
+        assert_eq!(writer.waited.load(Relaxed), 3, "asked when as many were written as are kept");
+        writer.stands_still.store(true, Relaxed);
+        for _ in 0..5 {
+            assert!(burst.room.is_there(&writer));
+            burst.before_next(&writer, true);
+        }
+        assert!(!burst.room.is_there(&writer), "ten are under way");
+        assert!(Burst::new(None).room.is_there(&writer));
+    }
+
     /// What was written, and by which thread.
     type Written = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
 
@@ -762,7 +801,7 @@ mod tests {
     fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
         let taken = Arc::<Mutex<Vec<_>>>::default();
         let (note, gate) = (taken.clone(), gate.clone());
-        let behind = Behind { never_blocks: true, ..Behind::default() };
+        let behind = Behind { is_free: Box::new(|| true), ..Behind::default() };
         let (alive, _) = mpsc::channel(1);
         let take = move |message: Message, _| {
             drop(gate.lock().unwrap());
