@@ -1,7 +1,7 @@
 //! `sgc`: the command line of SGC, secure global connectivity for ROS 2.
 //!
 //! It parses arguments, reads and writes files, prints, and hands everything else to `sgc-node` and
-//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by [`demo`] and [`bench`], whose
+//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by [`demo`] and [`mod@bench`], whose
 //! programs are plain DDS participants.
 //!
 //! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
