@@ -592,6 +592,9 @@ fn plots(figures: &Figures, about: &About<'_>) -> Vec<Page> {
 /// More lines than this in one plot cannot be told apart.
 const LINES_MAX: usize = 10;
 
+/// Metrics that say how far to trust the others: they are in the tables.
+const NOT_DRAWN: [&str; 2] = ["samples", "lost"];
+
 /// A plot for each metric that was measured at several places. Where there are many systems, one with SGC's default
 /// transport beside the others, and one with SGC's transports alone.
 fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
@@ -610,6 +613,9 @@ fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
     let mut pages = Vec::new();
     for family in families(&here) {
         let metric = family.first();
+        if NOT_DRAWN.contains(&metric) {
+            continue;
+        }
         let (unit, factor, words) = measure(metric);
         for (suffix, names) in &choices {
             let series: Vec<_> = names
