@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 
+use crate::caller::Caller;
 use crate::dds::Message;
 use crate::node::{LONG, Node};
 use crate::ping::HEAD_BYTES;
@@ -53,106 +54,50 @@ struct Questions {
 
 /// Takes [`Order::Ask`].
 pub(crate) fn ask(args: &AskArgs) -> Result<()> {
-    let node = Node::start(&args.common, [args.back.clone()], [args.common.topic.clone()])?;
-    if !node.until_matched()? {
-        return Ok(());
-    }
-    let mut asker = Asker { node, seq: 0 };
-    while !asker.node.is_heard(asker.seq)? {
-        asker.seq += 1;
-        if matches!(asker.node.orders.next()?, Next::End) {
-            return Ok(());
-        }
-    }
-    say(&Event::Connected)?;
+    let Some(mut asker) = Caller::connect(&args.common, &args.back)? else { return Ok(()) };
     loop {
         match asker.node.orders.next()? {
             Next::End => return Ok(()),
             Next::Wait => drop(asker.node.waiter.wait(LONG)?),
             Next::Do(Order::Ask { size, answer, count, seconds, warm_up, patience_seconds, rate }) => {
                 let patience = Duration::try_from_secs_f64(patience_seconds)?;
-                say(&asker.questions(&Questions {
-                    size,
-                    answer,
-                    count,
-                    seconds,
-                    warm_up,
-                    patience,
-                    rate,
-                })?)?;
+                say(&questions(
+                    &mut asker,
+                    &Questions { size, answer, count, seconds, warm_up, patience, rate },
+                )?)?;
             }
             Next::Do(order) => bail!("{order:?} is not for ask"),
         }
     }
 }
 
-struct Asker {
-    node: Node,
-    seq: u64,
-}
-
-impl Asker {
-    fn questions(&mut self, plan: &Questions) -> Result<Event> {
-        let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
-        ensure!(
-            size >= HEAD_BYTES + ANSWER_BYTES,
-            "a request has {} bytes at least",
-            HEAD_BYTES + ANSWER_BYTES
-        );
-        ensure!((HEAD_BYTES..=ANSWER_MAX).contains(&answer), "no answer has {answer} bytes");
-        ensure!(rate.is_none_or(|rate| rate > 0.0), "no rate");
-        let mut data = vec![0x5a; size - HEAD_BYTES];
-        data[..ANSWER_BYTES].copy_from_slice(&u32::try_from(answer)?.to_le_bytes());
-        for _ in 0..warm_up {
-            self.question(&data, answer, patience)?;
-        }
-        let (mut round_trips_us, mut lost) = (Vec::new(), 0);
-        let (begun, begun_ns) = (Instant::now(), now_ns());
-        let mut tick = 0;
-        while round_trips_us.len() + lost < count && begun.elapsed().as_secs_f64() < seconds {
-            if let Some(rate) = rate {
-                // What comes while an answer is waited for is left out, as a camera's frames are; the next is fresh.
-                tick = tick.max((begun.elapsed().as_secs_f64() * rate).ceil() as u64);
-                let due = Duration::from_secs_f64(tick as f64 / rate);
-                std::thread::sleep(due.saturating_sub(begun.elapsed()));
-                tick += 1;
-            }
-            match self.question(&data, answer, patience)? {
-                Some(took) => round_trips_us.push(took.as_secs_f64() * 1e6),
-                None => lost += 1,
-            }
-        }
-        Ok(Event::Answered { size, round_trips_us, lost, begun_ns, ended_ns: now_ns() })
+fn questions(asker: &mut Caller, plan: &Questions) -> Result<Event> {
+    let &Questions { size, answer, count, seconds, warm_up, patience, rate } = plan;
+    ensure!(size >= HEAD_BYTES + ANSWER_BYTES, "a request has {} bytes at least", HEAD_BYTES + ANSWER_BYTES);
+    ensure!((HEAD_BYTES..=ANSWER_MAX).contains(&answer), "no answer has {answer} bytes");
+    ensure!(rate.is_none_or(|rate| rate > 0.0), "no rate");
+    let mut data = vec![0x5a; size - HEAD_BYTES];
+    data[..ANSWER_BYTES].copy_from_slice(&u32::try_from(answer)?.to_le_bytes());
+    for _ in 0..warm_up {
+        asker.round_trip(&data, answer - HEAD_BYTES, patience)?;
     }
-
-    /// How long the answer took, unless it took longer than that.
-    fn question(&mut self, data: &[u8], answer: usize, patience: Duration) -> Result<Option<Duration>> {
-        self.seq += 1;
-        let seq = self.seq;
-        let begun = Instant::now();
-        let message = Message { seq, stamp_ns: now_ns(), data };
-        while !self.node.writers[0].write(&message)? {
-            if begun.elapsed() > patience {
-                return Ok(None);
-            }
+    let (mut round_trips_us, mut lost) = (Vec::new(), 0);
+    let (begun, begun_ns) = (Instant::now(), now_ns());
+    let mut tick = 0;
+    while round_trips_us.len() + lost < count && begun.elapsed().as_secs_f64() < seconds {
+        if let Some(rate) = rate {
+            // What comes while an answer is waited for is left out, as a camera's frames are; the next is fresh.
+            tick = tick.max((begun.elapsed().as_secs_f64() * rate).ceil() as u64);
+            let due = Duration::from_secs_f64(tick as f64 / rate);
+            std::thread::sleep(due.saturating_sub(begun.elapsed()));
+            tick += 1;
         }
-        let mut came = None;
-        loop {
-            self.node.readers[0].take(|message| {
-                // Others are answers to requests that were given up.
-                if message.seq == seq {
-                    ensure!(message.data.len() + HEAD_BYTES == answer, "an answer of another length");
-                    came = Some(begun.elapsed());
-                }
-                Ok(())
-            })?;
-            if came.is_some() {
-                return Ok(came);
-            }
-            let Some(left) = patience.checked_sub(begun.elapsed()) else { return Ok(None) };
-            self.node.waiter.wait(left)?;
+        match asker.round_trip(&data, answer - HEAD_BYTES, patience)? {
+            Some(took) => round_trips_us.push(took.as_secs_f64() * 1e6),
+            None => lost += 1,
         }
     }
+    Ok(Event::Answered { size, round_trips_us, lost, begun_ns, ended_ns: now_ns() })
 }
 
 /// Takes no orders.

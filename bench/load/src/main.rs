@@ -6,6 +6,7 @@
 #![deny(unsafe_code)]
 
 mod ask;
+mod caller;
 #[allow(unsafe_code)]
 mod dds;
 mod flow;

@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 
-use crate::dds::Message;
+use crate::Common;
+use crate::caller::Caller;
 use crate::node::{LONG, Node};
 use crate::report::{Event, Next, Order, say};
-use crate::{Common, now_ns};
 
 /// What `seq` and `stamp_ns` take of a message's size, bytes.
 pub(crate) const HEAD_BYTES: usize = 16;
@@ -24,19 +24,7 @@ pub(crate) struct PingArgs {
 
 /// Takes [`Order::Measure`].
 pub(crate) fn ping(args: &PingArgs) -> Result<()> {
-    let node = Node::start(&args.common, [args.back.clone()], [args.common.topic.clone()])?;
-    if !node.until_matched()? {
-        return Ok(());
-    }
-    let mut ping = Ping { node, seq: 0 };
-    // Matched is what is near; whatever is in between may not be through yet, and forgets what nobody hears.
-    while !ping.node.is_heard(ping.seq)? {
-        ping.seq += 1;
-        if matches!(ping.node.orders.next()?, Next::End) {
-            return Ok(());
-        }
-    }
-    say(&Event::Connected)?;
+    let Some(mut ping) = Caller::connect(&args.common, &args.back)? else { return Ok(()) };
     loop {
         match ping.node.orders.next()? {
             Next::End => return Ok(()),
@@ -47,11 +35,11 @@ pub(crate) fn ping(args: &PingArgs) -> Result<()> {
                 ensure!(size >= HEAD_BYTES, "a message has at least {HEAD_BYTES} bytes");
                 let data = vec![0x5a; size - HEAD_BYTES];
                 for _ in 0..warm_up {
-                    ping.round_trip(&data, patience)?;
+                    ping.round_trip(&data, data.len(), patience)?;
                 }
                 let begun = Instant::now();
                 while round_trips_us.len() + lost < count && begun.elapsed().as_secs_f64() < seconds {
-                    match ping.round_trip(&data, patience)? {
+                    match ping.round_trip(&data, data.len(), patience)? {
                         Some(took) => round_trips_us.push(took.as_secs_f64() * 1e6),
                         None => lost += 1,
                     }
@@ -59,42 +47,6 @@ pub(crate) fn ping(args: &PingArgs) -> Result<()> {
                 say(&Event::Measured { size, round_trips_us, lost })?;
             }
             Next::Do(order) => bail!("{order:?} is not for ping"),
-        }
-    }
-}
-
-struct Ping {
-    node: Node,
-    seq: u64,
-}
-
-impl Ping {
-    /// How long it took, unless it took longer than that.
-    fn round_trip(&mut self, data: &[u8], patience: Duration) -> Result<Option<Duration>> {
-        self.seq += 1;
-        let seq = self.seq;
-        let begun = Instant::now();
-        let message = Message { seq, stamp_ns: now_ns(), data };
-        while !self.node.writers[0].write(&message)? {
-            if begun.elapsed() > patience {
-                return Ok(None);
-            }
-        }
-        let mut came = None;
-        loop {
-            self.node.readers[0].take(|message| {
-                // Others are answers to those that were given up.
-                if message.seq == seq {
-                    ensure!(message.data.len() == data.len(), "an answer of another length");
-                    came = Some(begun.elapsed());
-                }
-                Ok(())
-            })?;
-            if came.is_some() {
-                return Ok(came);
-            }
-            let Some(left) = patience.checked_sub(begun.elapsed()) else { return Ok(None) };
-            self.node.waiter.wait(left)?;
         }
     }
 }
