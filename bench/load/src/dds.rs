@@ -338,6 +338,8 @@ impl Bell {
 pub(crate) struct Waiter {
     set: Entity,
     bell: Entity,
+    /// Readers and writers, whose matches are waited for.
+    endpoints: Vec<dds_entity_t>,
     sources: usize,
 }
 
@@ -358,7 +360,7 @@ impl Waiter {
         // SAFETY: take numbers.
         let (set, bell) =
             unsafe { (dds_create_waitset(participant), dds_create_guardcondition(participant)) };
-        let mut waiter = Self { set: Entity::new(set)?, bell: Entity::new(bell)?, sources: 0 };
+        let mut waiter = Self { set: Entity::new(set)?, bell: Entity::new(bell)?, endpoints: Vec::new(), sources: 0 };
         waiter.attach(waiter.bell.0, OTHER)?;
         Ok(waiter)
     }
@@ -373,11 +375,13 @@ impl Waiter {
     /// Messages and matches of a reader.
     pub(crate) fn attach_reader(&mut self, reader: &Reader, number: usize) -> Result<()> {
         self.attach(reader.condition.0, dds_attach_t::try_from(number)?)?;
+        self.endpoints.push(reader.entity.0);
         self.attach(reader.entity.0, OTHER)
     }
 
     /// Matches of a writer.
     pub(crate) fn attach_writer(&mut self, writer: &Writer) -> Result<()> {
+        self.endpoints.push(writer.entity.0);
         self.attach(writer.entity.0, OTHER)
     }
 
@@ -396,6 +400,14 @@ impl Waiter {
         let mut rung = false;
         // SAFETY: takes a number and a valid place.
         check(unsafe { dds_take_guardcondition(self.bell.0, &mut rung) })?;
+        if woken.iter().take(count as usize).any(|&w| w == OTHER) {
+            for endpoint in &self.endpoints {
+                let mut status = 0;
+                // What is not taken ends the next wait at once, and every one after it.
+                // SAFETY: takes numbers and a valid place; 0 stands for every status.
+                check(unsafe { dds_take_status(*endpoint, &mut status, 0) })?;
+            }
+        }
         let readers = woken.iter().take(count as usize).filter_map(|&w| usize::try_from(w).ok());
         Ok(Woken { readers: readers.collect() })
     }
