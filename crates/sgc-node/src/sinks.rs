@@ -346,7 +346,7 @@ impl LocalSink {
         }
         let mut evicted = 0;
         let tapped = self.taps.is_any().then(|| Tapped::of_message(&message));
-        if let Some(mut take) = writer.at_once(bytes) {
+        if let Some(mut take) = writer.at_once(bytes, head.source_timestamp_ns) {
             take(message, Next::Nothing);
         } else if message.reliable {
             writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
@@ -419,12 +419,12 @@ pub(crate) struct Behind {
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
     /// Whether a short message that is taken now waits for nobody, and overwrites none that a reader may lack.
-    is_free: Box<dyn Fn() -> bool + Send + Sync>,
+    is_free: Box<dyn Fn(i64) -> bool + Send + Sync>,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|| false) }
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_| false) }
     }
 }
 
@@ -470,8 +470,9 @@ impl WriterQueue {
         // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
-        let is_free =
-            Box::new(move || never_blocks && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer)));
+        let is_free = Box::new(move |timestamp_ns| {
+            never_blocks && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, timestamp_ns))
+        });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
         let mut decompressor = Decompressor::default();
@@ -514,7 +515,7 @@ impl WriterQueue {
                     writer.flush()
                 };
             };
-            burst.before_next(&*writer, next == Next::Nothing);
+            burst.before_next(&*writer, next == Next::Nothing, timestamp_ns);
             let written = match next {
                 Next::AtOnce => writer.write_ahead(kind, timestamp_ns, payload),
                 Next::Nothing | Next::Later => writer.write(kind, timestamp_ns, payload),
@@ -568,12 +569,14 @@ impl WriterQueue {
         Ok(this)
     }
 
-    /// Who takes a message of so many bytes now: if that does not block, and nothing is ahead of it. Only for who queues, while
-    /// nobody else does.
-    fn at_once(&self, bytes: usize) -> Option<MutexGuard<'_, Take>> {
+    /// Who takes a message of so many bytes and that time now: if that does not block, and nothing is ahead of it. Only for who
+    /// queues, while nobody else does.
+    fn at_once(&self, bytes: usize, timestamp_ns: i64) -> Option<MutexGuard<'_, Take>> {
         let may = bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)())
+        take.filter(|_| {
+            self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(timestamp_ns)
+        })
     }
 
     /// The writer's.
@@ -680,30 +683,46 @@ struct Room {
     /// Samples that the writer keeps; `None` if it blocks by itself, or nobody acknowledges.
     depth: Option<u32>,
     unacknowledged: AtomicU32,
+    /// When a message was written last, and when it was published.
+    last: Mutex<Option<(Instant, i64)>>,
 }
 
 impl Room {
-    /// Whether a sample may be written without taking the place of one that somebody may lack; does not wait.
-    fn is_there(&self, writer: &impl RosWriter) -> bool {
+    /// Whether a message of this time may be written without taking the place of one that somebody may lack; does not wait.
+    fn is_there(&self, writer: &impl RosWriter, timestamp_ns: i64) -> bool {
         let Some(depth) = self.depth else { return true };
-        if self.unacknowledged.load(Relaxed) >= depth {
-            if !writer.wait_acknowledged(Duration::ZERO) {
-                return false;
-            }
-            self.unacknowledged.store(0, Relaxed);
+        if self.unacknowledged.load(Relaxed) < depth || self.is_in_its_time(timestamp_ns) {
+            return true;
         }
+        if !writer.wait_acknowledged(Duration::ZERO) {
+            return false;
+        }
+        self.unacknowledged.store(0, Relaxed);
         true
+    }
+
+    /// Whether it is about as long since the last message was written as its publisher let pass: then readers have the time
+    /// that the publisher would have given them, and acknowledge as seldom as they do.
+    fn is_in_its_time(&self, timestamp_ns: i64) -> bool {
+        let Some((written, published_ns)) = *self.last() else { return false };
+        let apart = timestamp_ns.checked_sub(published_ns).and_then(|ns| u64::try_from(ns).ok());
+        apart.is_some_and(|ns| ns > 0 && written.elapsed() >= Duration::from_nanos(ns / 2))
+    }
+
+    fn last(&self) -> MutexGuard<'_, Option<(Instant, i64)>> {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Burst {
     fn new(depth: Option<u32>) -> Self {
-        Self { room: Arc::new(Room { depth, unacknowledged: AtomicU32::new(0) }), not_before: None }
+        let room = Room { depth, unacknowledged: AtomicU32::new(0), last: Mutex::new(None) };
+        Self { room: Arc::new(room), not_before: None }
     }
 
     /// Waits before a sample would take the place of one that somebody may lack. One that comes alone is written at once, as
     /// its publisher did.
-    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool) {
+    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, timestamp_ns: i64) {
         let Some(depth) = self.room.depth else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
         // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
@@ -714,6 +733,7 @@ impl Burst {
             unacknowledged = 0;
         }
         self.room.unacknowledged.store(unacknowledged.saturating_add(1).min(depth), Relaxed);
+        *self.room.last() = Some((Instant::now(), timestamp_ns));
     }
 }
 
@@ -764,15 +784,15 @@ mod tests {
     fn a_burst_waits_for_its_readers_but_not_for_one_that_stands_still() {
         let writer = Slow::default();
         let mut burst = Burst::new(Some(10));
-        (0..100).for_each(|_| burst.before_next(&writer, true));
+        (0..100).for_each(|_| burst.before_next(&writer, true, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
-        (0..100).for_each(|_| burst.before_next(&writer, false));
+        (0..100).for_each(|_| burst.before_next(&writer, false, 0));
         assert_eq!(writer.waited.load(Relaxed), 10);
         writer.stands_still.store(true, Relaxed);
-        (0..1000).for_each(|_| burst.before_next(&writer, false));
+        (0..1000).for_each(|_| burst.before_next(&writer, false, 0));
         assert!(writer.waited.load(Relaxed) <= 12, "once in a while");
         let mut other = Burst::new(None);
-        (0..100).for_each(|_| other.before_next(&writer, false));
+        (0..100).for_each(|_| other.before_next(&writer, false, 0));
         assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
     }
 
@@ -781,17 +801,26 @@ mod tests {
         let writer = Slow::default();
         let mut burst = Burst::new(Some(10));
         for _ in 0..35 {
-            assert!(burst.room.is_there(&writer));
-            burst.before_next(&writer, true);
+            assert!(burst.room.is_there(&writer, 0));
+            burst.before_next(&writer, true, 0);
         }
         assert_eq!(writer.waited.load(Relaxed), 3, "asked when as many were written as are kept");
         writer.stands_still.store(true, Relaxed);
         for _ in 0..5 {
-            assert!(burst.room.is_there(&writer));
-            burst.before_next(&writer, true);
+            assert!(burst.room.is_there(&writer, 0));
+            burst.before_next(&writer, true, 0);
         }
-        assert!(!burst.room.is_there(&writer), "ten are under way");
-        assert!(Burst::new(None).room.is_there(&writer));
+        assert!(!burst.room.is_there(&writer, 0), "ten are under way");
+        assert!(Burst::new(None).room.is_there(&writer, 0));
+        // What comes as its publisher had it needs no more room than that had; what was held up on its way does.
+        let hour_ns = 3_600_000_000_000;
+        assert!(!burst.room.is_there(&writer, hour_ns) && !burst.room.is_there(&writer, -1));
+        let begun = Instant::now();
+        while !burst.room.is_there(&writer, 1_000_000) {
+            assert!(begun.elapsed() < Duration::from_secs(20));
+            thread::yield_now();
+        }
+        assert!(!burst.room.is_there(&writer, hour_ns));
     }
 
     /// What was written, and by which thread.
@@ -801,7 +830,7 @@ mod tests {
     fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
         let taken = Arc::<Mutex<Vec<_>>>::default();
         let (note, gate) = (taken.clone(), gate.clone());
-        let behind = Behind { is_free: Box::new(|| true), ..Behind::default() };
+        let behind = Behind { is_free: Box::new(|_| true), ..Behind::default() };
         let (alive, _) = mpsc::channel(1);
         let take = move |message: Message, _| {
             drop(gate.lock().unwrap());
@@ -821,7 +850,7 @@ mod tests {
     /// As a sink does.
     fn give(queue: &WriterQueue, message: Message) {
         let bytes = message.payload.len();
-        match queue.at_once(bytes) {
+        match queue.at_once(bytes, 1) {
             Some(mut take) => take(message, Next::Nothing),
             None => queue.queue.try_push(message, bytes, WRITER_BYTES_MAX).unwrap(),
         }
