@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use sgc_ros::graph::{GidBytes, GraphView, encode_nodes, graph_reader, graph_writer};
-use sgc_ros::{DiscoveryEvent, DiscoveryHandler, GraphNode, Guid, RosError, RosWriter, SampleKind};
+use sgc_ros::{DiscoveryEvent, DiscoveryHandler, GraphNode, Guid, RosError, RosWriter, Sample, SampleKind};
 
 use crate::network::Participant;
 use crate::reader::CycloneReader;
@@ -83,7 +83,7 @@ impl Listener {
         CycloneReader::new(
             participant,
             &graph_reader(),
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 listener.change(|view| match view.handle_message(sample.writer, &sample.payload) {
                     Ok(event) => event,
                     Err(error) => {

@@ -2,10 +2,11 @@
 
 use std::collections::HashMap;
 
-use cyclors::{dds_builtintopic_free_endpoint, dds_get_matched_publication_data, dds_instance_handle_t};
+use cyclors::{
+    dds_builtintopic_free_endpoint, dds_entity_t, dds_get_matched_publication_data, dds_instance_handle_t,
+};
 use sgc_ros::Guid;
 
-use crate::entity::Entity;
 use crate::{qos, user_data};
 
 /// Bound on the writers that one reader remembers.
@@ -24,13 +25,22 @@ pub(crate) struct KnownWriter {
 pub(crate) struct KnownWriters(HashMap<dds_instance_handle_t, KnownWriter>);
 
 impl KnownWriters {
+    /// Who a writer is that was asked for before.
+    pub(crate) fn known(&self, handle: dds_instance_handle_t) -> Option<KnownWriter> {
+        self.0.get(&handle).copied()
+    }
+
     /// Who a writer of `reader` is; `None` if it is gone already and was never asked for.
-    pub(crate) fn find(&mut self, reader: &Entity, handle: dds_instance_handle_t) -> Option<KnownWriter> {
-        if let Some(writer) = self.0.get(&handle) {
-            return Some(*writer);
+    pub(crate) fn find(
+        &mut self,
+        reader: dds_entity_t,
+        handle: dds_instance_handle_t,
+    ) -> Option<KnownWriter> {
+        if let Some(writer) = self.known(handle) {
+            return Some(writer);
         }
         // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
-        let data = unsafe { dds_get_matched_publication_data(reader.handle(), handle) };
+        let data = unsafe { dds_get_matched_publication_data(reader, handle) };
         // SAFETY: null or valid, see above.
         let endpoint = unsafe { data.as_ref() }?;
         let guid = Guid(endpoint.key.v);

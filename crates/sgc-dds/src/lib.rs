@@ -3,7 +3,8 @@
 //! It joins one DDS domain, tells which endpoints are there, and moves serialised samples in and out
 //! for types that are unknown at compile time. It decides nothing about what is shared with whom, knows
 //! no ROS name mangling, never looks inside a payload beyond its encapsulation header, and uses no
-//! tokio: every thread here is a plain thread that blocks in a DDS waitset.
+//! tokio: threads here are plain threads, which block until Cyclone or its listener has something for
+//! them.
 //!
 //! This is the only crate with `unsafe`: everything that Cyclone hands out is owned by a type of
 //! `entity` or `serdata`, whose `Drop` gives it back, and no raw pointer leaves the crate.
@@ -23,6 +24,7 @@ mod entity;
 mod graph;
 mod identified;
 pub mod identity;
+mod intake;
 mod keyed;
 mod known_writers;
 mod log;
@@ -39,6 +41,7 @@ mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
 pub use identified::unidentified_messages;
+pub use intake::WAITING_BYTES_MAX;
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
 pub use service::{CycloneClient, CycloneServer};

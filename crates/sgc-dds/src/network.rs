@@ -22,6 +22,7 @@ use crate::config::{
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, reason};
 use crate::graph::Announcer;
+use crate::intake::Pace;
 use crate::keyed;
 use crate::log;
 use crate::qos::NativeQos;
@@ -62,6 +63,7 @@ pub(crate) struct Participant {
     guid: Guid,
     domain_id: u32,
     tag: Option<String>,
+    pace: Pace,
 }
 
 impl CycloneNetwork {
@@ -88,6 +90,7 @@ impl CycloneNetwork {
             guid,
             domain_id: config.domain,
             tag: config.tag.clone(),
+            pace: Pace::new(),
         };
         let participant = Arc::new(participant);
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
@@ -180,6 +183,11 @@ impl Participant {
     /// True if the endpoint belongs to this participant.
     pub(crate) fn owns(&self, endpoint: &Guid) -> bool {
         self.guid.0[..12] == endpoint.0[..12]
+    }
+
+    /// How much its receiving threads handle themselves.
+    pub(crate) fn pace(&self) -> &Pace {
+        &self.pace
     }
 
     /// True if endpoints made by SGC are to be ignored.

@@ -149,7 +149,8 @@ impl Drop for NativeQos {
     }
 }
 
-fn history_of(kind: EndpointKind, history: History, keyless: bool) -> (dds_history_kind_t, i32) {
+/// What a history is to Cyclone, and how many samples it holds.
+pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) -> (dds_history_kind_t, i32) {
     let wanted = match history {
         History::KeepLast(n) => n.max(1),
         History::KeepAll => HISTORY_DEPTH_MAX,

@@ -2,28 +2,23 @@
 //! belong ([`crate::identified`]). What they say elsewhere, and which of both a client or server expects, is for
 //! [`crate::service`] to know.
 
-use std::mem::MaybeUninit;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
 use cyclors::{
-    DDS_ANY_STATE, DDS_RETCODE_TIMEOUT, dds_create_reader, dds_create_writer, dds_entity_t, dds_forwardcdr,
-    dds_get_entity_sertype, dds_sample_info_t, dds_takecdr, ddsi_serdata,
+    DDS_RETCODE_TIMEOUT, dds_create_writer, dds_entity_t, dds_forwardcdr, dds_get_entity_sertype,
+    ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError};
 
 use crate::entity::{Entity, check, reason};
 use crate::identified::{self, IdentifiedSample, Origin};
 use crate::identity::{Mapping, SampleIdentity};
+use crate::intake::{Arrival, Intake, Receiver, Taken};
 use crate::known_writers::KnownWriters;
 use crate::network::Participant;
 use crate::payload::{Frame, HEADER_BYTES};
-use crate::wait::{Stop, WaitSet, join};
-
-/// Messages taken at once.
-const BATCH: usize = 16;
 
 /// A message of a service, as it comes from the network.
 pub(crate) struct Message {
@@ -53,11 +48,8 @@ pub(crate) type MessageHandler = Box<dyn FnMut(Message) + Send>;
 /// entities. What SGC wrote, this process or another, does not reach the handler.
 #[derive(Debug)]
 pub(crate) struct RpcReader {
-    guid: Guid,
-    /// Of the reader, which lives as long as the thread does.
-    handle: dds_entity_t,
-    stop: Arc<Stop>,
-    thread: Option<thread::JoinHandle<()>>,
+    intake: Intake<Messages>,
+    ignores_tagged: bool,
 }
 
 impl RpcReader {
@@ -66,134 +58,71 @@ impl RpcReader {
         participant: &Arc<Participant>,
         spec: &EndpointSpec,
         more: &str,
-    ) -> Result<(Self, Service), String> {
-        let qos = participant.endpoint_qos(EndpointKind::Reader, spec, more)?;
-        let topic = identified::topic(participant, spec)?;
-        let group = participant.group(EndpointKind::Reader, spec)?;
-        let parent = group.as_ref().unwrap_or(participant.entity()).handle();
-        // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
-        let reader = Entity::new(unsafe {
-            dds_create_reader(parent, topic.handle(), qos.as_ptr(), std::ptr::null())
-        })?;
-        let (guid, handle) = (reader.guid()?, reader.handle());
-        let condition = reader.read_condition()?;
-        let stop = Stop::new(participant)?;
-        let wait_set = WaitSet::new(participant, Arc::clone(&stop), &[&condition])?;
-        let service = Service {
-            wait_set,
-            _condition: condition,
-            reader,
-            _group: group,
-            _topic: topic,
-            stop: Arc::clone(&stop),
-            participant: Arc::clone(participant),
-            writers: KnownWriters::default(),
-        };
-        Ok((Self { guid, handle, stop, thread: None }, service))
+    ) -> Result<Self, String> {
+        let intake = Intake::new(participant, spec, identified::topic(participant, spec)?, more)?;
+        Ok(Self { intake, ignores_tagged: participant.ignores_tagged() })
     }
 
     /// Hands messages over from now on.
-    pub(crate) fn start(&mut self, mut service: Service, mut handler: MessageHandler) -> Result<(), String> {
-        let thread = thread::Builder::new()
-            .name("sgc-dds-rpc".into())
-            .spawn(move || service.run(&mut handler))
-            .map_err(|e| e.to_string())?;
-        self.thread = Some(thread);
-        Ok(())
+    pub(crate) fn start(&mut self, handler: MessageHandler) -> Result<(), String> {
+        let (ignores_tagged, writers) = (self.ignores_tagged, KnownWriters::default());
+        self.intake.start("sgc-dds-rpc", Messages { ignores_tagged, writers, handler })
     }
 
     /// GUID of the reader, as others discover it.
     pub(crate) fn guid(&self) -> Guid {
-        self.guid
+        self.intake.guid()
     }
 
     /// The reader's handle, for calls into Cyclone while `self` lives.
     pub(crate) fn handle(&self) -> dds_entity_t {
-        self.handle
+        self.intake.handle()
     }
 }
 
-impl Drop for RpcReader {
-    fn drop(&mut self) {
-        self.stop.request();
-        if let Some(thread) = self.thread.take() {
-            join(thread);
-        }
-    }
+/// What a message says, and its packet of it.
+struct Content {
+    origin: Origin,
+    payload: Bytes,
 }
 
-/// What the thread owns. Fields drop in this order: children first.
-pub(crate) struct Service {
-    wait_set: WaitSet,
-    _condition: Entity,
-    reader: Entity,
-    _group: Option<Entity>,
-    _topic: Entity,
-    stop: Arc<Stop>,
-    participant: Arc<Participant>,
-    writers: KnownWriters,
-}
-
-impl Service {
-    fn run(&mut self, handler: &mut MessageHandler) {
-        while self.wait_set.wait() {
-            loop {
-                let batch = self.take().unwrap_or_else(|reason| {
-                    tracing::error!(reason, "taking the messages of a service failed");
-                    Vec::new()
-                });
-                if batch.is_empty() {
-                    break;
-                }
-                for (sample, info) in batch {
-                    if self.stop.is_requested() {
-                        return;
-                    }
-                    if let Some(message) = self.message(&sample, &info) {
-                        handler(message);
-                    }
-                }
-            }
-        }
-    }
-
-    fn take(&self) -> Result<Vec<(IdentifiedSample, dds_sample_info_t)>, String> {
-        let mut samples: [*mut ddsi_serdata; BATCH] = [std::ptr::null_mut(); BATCH];
-        let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
-        // SAFETY: both arrays have room for a batch; the samples' references become ours.
-        let taken = unsafe {
-            dds_takecdr(
-                self.reader.handle(),
-                samples.as_mut_ptr(),
-                BATCH as u32,
-                infos.as_mut_ptr().cast(),
-                DDS_ANY_STATE,
-            )
-        };
-        check(taken)?;
-        let both = samples.into_iter().zip(infos).take(taken as usize);
-        // SAFETY: Cyclone filled the first `taken` of both arrays and gave us a reference to each sample, whose type
-        // is that of this reader's topic.
-        Ok(both.map(|(s, info)| unsafe { (IdentifiedSample::from_raw(s), info.assume_init()) }).collect())
-    }
-
-    /// What the handler gets of what was taken, if anything.
-    fn message(&mut self, sample: &IdentifiedSample, info: &dds_sample_info_t) -> Option<Message> {
-        // Changes of instance state: Cyclone makes them up without a payload.
-        if !info.valid_data {
-            return None;
-        }
-        let writer = self.writers.find(&self.reader, info.publication_handle)?;
-        // Another proxy's client or server: what it has to say comes through SGC.
-        if writer.tagged && self.participant.ignores_tagged() {
-            return None;
-        }
-        let (origin, payload) = sample.read();
+impl Taken for Content {
+    unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
+        // SAFETY: a reference to a sample of `identified`, by contract and by the topic of this module's readers.
+        let (origin, payload) = unsafe { IdentifiedSample::from_raw(sample) }.read();
         let Some(origin) = origin.filter(|_| payload.len() >= HEADER_BYTES) else {
             tracing::debug!(bytes = payload.len(), "a message of a service without its headers is dropped");
             return None;
         };
-        Some(Message { writer: writer.guid, origin, payload })
+        Some(Self { origin, payload })
+    }
+
+    fn bytes(&self) -> usize {
+        self.payload.len()
+    }
+}
+
+/// Hands messages to the handler.
+struct Messages {
+    ignores_tagged: bool,
+    writers: KnownWriters,
+    handler: MessageHandler,
+}
+
+impl Receiver for Messages {
+    type Sample = Content;
+
+    fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Content>) {
+        let Some(writer) = self.writers.find(reader, arrival.writer) else { return };
+        // Another proxy's client or server: what it has to say comes through SGC.
+        if !(writer.tagged && self.ignores_tagged) {
+            let Content { origin, payload } = arrival.sample;
+            (self.handler)(Message { writer: writer.guid, origin, payload });
+        }
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        tracing::warn!(samples, "messages of a service came faster than they were passed on and are lost");
     }
 }
 

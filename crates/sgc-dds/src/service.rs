@@ -69,7 +69,7 @@ impl CycloneClient {
         let mut id: dds_instance_handle_t = 0;
         // SAFETY: the handle is checked by Cyclone, and `id` is a valid place for the result.
         check(unsafe { dds_get_instance_handle(writer.entity().handle(), &mut id) })?;
-        let (mut reader, service) = RpcReader::new(participant, &spec.reply, &user_data)?;
+        let mut reader = RpcReader::new(participant, &spec.reply, &user_data)?;
         let (reading, writing) = (reader.guid().0, writer.entity().guid()?.0);
         let last_in_body = Arc::new(AtomicI64::new(0));
         let in_body_until = Arc::clone(&last_in_body);
@@ -90,7 +90,7 @@ impl CycloneClient {
                 handler(RequestId { client: id_bytes(id), number, asker: None }, payload);
             }
         });
-        reader.start(service, on_message)?;
+        reader.start(on_message)?;
         let (ends, mixed) = (Ends::new(participant, reader, writer)?, AtomicBool::new(false));
         Ok(Self { ends, id, mixed, last_in_body })
     }
@@ -146,7 +146,7 @@ impl CycloneServer {
         let user_data = Ends::user_data("serviceid", participant);
         // The writer first: who sees a server's reader may ask at once.
         let writer = RpcWriter::new(participant, &spec.reply, &user_data)?;
-        let (mut reader, service) = RpcReader::new(participant, &spec.request, &user_data)?;
+        let mut reader = RpcReader::new(participant, &spec.request, &user_data)?;
         let on_message = Box::new(move |message: Message| {
             let asker = Some(message.writer);
             match request_of(message) {
@@ -154,7 +154,7 @@ impl CycloneServer {
                 None => tracing::debug!("a request without its header is dropped"),
             }
         });
-        reader.start(service, on_message)?;
+        reader.start(on_message)?;
         Ok(Self { ends: Ends::new(participant, reader, writer)? })
     }
 }

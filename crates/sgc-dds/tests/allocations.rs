@@ -2,12 +2,12 @@
 //! where it is written. What Cyclone takes itself, in C, is not counted.
 #![allow(clippy::unwrap_used)]
 
-use std::sync::mpsc::channel;
+use std::sync::mpsc::{Sender, channel};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
-use sgc_ros::{EndpointSpec, RosNetwork as _, RosWriter as _, SampleKind};
+use sgc_ros::{EndpointSpec, HandleSamples, RosNetwork as _, RosWriter as _, Sample, SampleKind};
 use sgc_testkit::{CountingAllocator, allocated_here, allocations};
 use sgc_wire::Qos;
 
@@ -25,6 +25,24 @@ fn open() -> CycloneNetwork {
     CycloneNetwork::open(&config).unwrap()
 }
 
+/// Tells how often the thread that receives and the reader's own have allocated so far; the channel's own blocks are in it.
+struct Tells {
+    /// The one that receives, when it was seen last: it is not while it rests.
+    receiving: usize,
+    tell: Sender<usize>,
+}
+
+impl HandleSamples for Tells {
+    fn handle(&mut self, _: Sample) {
+        let _ = self.tell.send(self.receiving + allocated_here().count);
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        self.receiving = allocated_here().count;
+        Err(sample)
+    }
+}
+
 #[test]
 fn a_sample_is_one_allocation_where_it_is_taken_and_none_where_it_is_written() {
     let spec = EndpointSpec {
@@ -36,11 +54,7 @@ fn a_sample_is_one_allocation_where_it_is_taken_and_none_where_it_is_written() {
     };
     let (near, far) = (open(), open());
     let (tell, told) = channel();
-    // So far, on the reader's thread; the channel's own blocks are in it.
-    let handler = move |_| {
-        let _ = tell.send(allocated_here().count);
-    };
-    let _reader = far.create_reader(&spec, Box::new(handler)).unwrap();
+    let _reader = far.create_reader(&spec, Box::new(Tells { receiving: 0, tell })).unwrap();
     let writer = near.create_writer(&spec).unwrap();
     let deadline = Instant::now() + PATIENCE;
     while writer.matched_readers() == 0 {

@@ -5,15 +5,17 @@
 
 #![allow(clippy::unwrap_used)]
 
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
 use sgc_ros::graph::{GidBytes, decode_nodes, encode_nodes, graph_reader, graph_writer};
 use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, RosError, RosNetwork,
-    RosWriter, Sample, SampleKind,
+    DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, HandleSamples, RosError,
+    RosNetwork, RosWriter, Sample, SampleKind,
 };
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations, RosNode};
 
@@ -75,7 +77,7 @@ fn read(network: &CycloneNetwork, spec: &EndpointSpec) -> (CycloneReader, Receiv
     let reader = network
         .create_reader(
             spec,
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 let _ = tx.send(sample);
             }),
         )
@@ -394,7 +396,7 @@ fn a_handler_that_blocks_delays_no_other_reader() {
     let stuck = sgc
         .create_reader(
             &shallow,
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 let _ = entered_tx.send(sample.payload);
                 let _ = gate.recv();
             }),
@@ -426,7 +428,7 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
     let _reader = sgc
         .create_reader(
             &spec("burst"),
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 let _ = seen_tx.send(sample.more);
                 let _ = gate.recv();
             }),
@@ -455,12 +457,121 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
     assert!(together);
 }
 
+/// What became of a sample.
+#[derive(Debug, PartialEq, Eq)]
+enum Handled {
+    AtOnce(Bytes),
+    OnItsThread(Bytes),
+    Overrun(u64),
+}
+
+/// Handles at once what it may, and waits at a gate otherwise.
+struct Choosy {
+    may: Arc<AtomicBool>,
+    gate: Receiver<()>,
+    handled: Sender<Handled>,
+}
+
+impl HandleSamples for Choosy {
+    fn handle(&mut self, sample: Sample) {
+        let _ = self.handled.send(Handled::OnItsThread(sample.payload));
+        let _ = self.gate.recv();
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        if !self.may.load(Relaxed) {
+            return Err(sample);
+        }
+        let _ = self.handled.send(Handled::AtOnce(sample.payload));
+        Ok(())
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        let _ = self.handled.send(Handled::Overrun(samples));
+    }
+}
+
+#[test]
+fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
+    let (ros, sgc) = (open(111, None), open(111, Some("arm-1")));
+    let may = Arc::new(AtomicBool::new(true));
+    let ((release, gate), (tell, handled)) = (channel(), channel());
+    let choosy = Choosy { may: may.clone(), gate, handled: tell };
+    let five = with(spec("prompt"), |qos| qos.history = History::KeepLast(5));
+    let _reader = sgc.create_reader(&five, Box::new(choosy)).unwrap();
+    let writer = writer(&ros, &with(spec("prompt"), |qos| qos.history = History::KeepAll), 1);
+    // Who the writer is has to be asked first, and after each the receiving thread rests a little.
+    let is_at_once = (0..1000).any(|i| {
+        let text = string_cdr(&i.to_string());
+        write(&writer, &text);
+        match next(&handled) {
+            Handled::AtOnce(payload) => {
+                assert_eq!(payload, padded(&text));
+                true
+            }
+            other => {
+                assert_eq!(other, Handled::OnItsThread(padded(&text).into()));
+                release.send(()).unwrap();
+                false
+            }
+        }
+    });
+    assert!(is_at_once, "a thousand were woken for");
+
+    // What the thread has is not overtaken, and what there is no room for is counted.
+    may.store(false, Relaxed);
+    write(&writer, &string_cdr("blocks"));
+    assert_eq!(next(&handled), Handled::OnItsThread(padded(&string_cdr("blocks")).into()));
+    may.store(true, Relaxed);
+    (0..20).for_each(|i| write(&writer, &string_cdr(&format!("behind {i}"))));
+    assert!(writer.wait_acknowledged(PATIENCE));
+    quiet(&handled);
+    (0..6).for_each(|_| release.send(()).unwrap());
+    assert_eq!(next(&handled), Handled::Overrun(15));
+    for i in 15..20 {
+        let text = string_cdr(&format!("behind {i}"));
+        assert_eq!(next(&handled), Handled::OnItsThread(padded(&text).into()));
+    }
+}
+
+#[test]
+fn a_reader_may_be_dropped_where_its_samples_are_received() {
+    /// Drops the reader at once.
+    struct Drops(Arc<Mutex<Option<CycloneReader>>>, Sender<bool>);
+
+    impl HandleSamples for Drops {
+        fn handle(&mut self, _: Sample) {
+            let _ = self.1.send(false);
+        }
+
+        fn handle_at_once(&mut self, _: Sample) -> Result<(), Sample> {
+            drop(self.0.lock().unwrap().take());
+            let _ = self.1.send(true);
+            Ok(())
+        }
+    }
+
+    let (ros, sgc) = (open(112, None), open(112, Some("arm-1")));
+    let slot = Arc::new(Mutex::new(None));
+    let (tell, handled) = channel();
+    let reader = sgc.create_reader(&spec("once"), Box::new(Drops(slot.clone(), tell))).unwrap();
+    *slot.lock().unwrap() = Some(reader);
+    let writer = writer(&ros, &spec("once"), 1);
+    let is_dropped = (0..1000).any(|_| {
+        write(&writer, &string_cdr("x"));
+        next(&handled)
+    });
+    assert!(is_dropped);
+    matched(&writer, 0);
+    assert_eq!(handled.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the thread has ended");
+}
+
 #[test]
 fn a_reader_may_be_dropped_by_its_own_handler() {
     let (ros, sgc) = (open(83, None), open(83, Some("arm-1")));
-    let slot = std::sync::Arc::new(std::sync::Mutex::new(None));
+    let slot = Arc::new(Mutex::new(None));
     let (done_tx, done) = channel();
-    let mine = std::sync::Arc::clone(&slot);
+    let mine = Arc::clone(&slot);
     let reader = sgc
         .create_reader(
             &spec("once"),

@@ -88,6 +88,19 @@ impl DataPlane {
         self.shard(name).load().contains_key(name)
     }
 
+    /// True if a short message under `name` finds room on all its ways: none is near its bounds, so that what others send at
+    /// the same moment does not fill it.
+    pub(crate) fn is_at_ease(&self, name: &Name) -> bool {
+        let tables = self.shard(name).load();
+        tables.get(name).is_none_or(|forward| {
+            forward.outs.iter().all(|(_, out)| match out {
+                Out::Link(flow, _) => flow.is_at_ease(),
+                // It writes to the local network, which may take its time.
+                Out::Local(_) => false,
+            })
+        })
+    }
+
     /// Sends a packet on its ways. Waits while a reliable one is full; the others of the same name wait with it.
     pub(crate) async fn forward(&self, ingress: LinkId, mut packet: Packet) {
         let Some(forward) = self.shard(&packet.header.name).load().get(&packet.header.name).cloned() else {
@@ -137,6 +150,16 @@ impl DataPlane {
         let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
         if self.drops.count_from(reason.key(), ingress) && suspicious {
             warn!(%ingress, ?reason, "a peer sends what it should not; dropped and counted from here on");
+        }
+    }
+
+    /// Counts several drops of `name` at this node itself.
+    pub(crate) fn count_here(&self, name: &Name, reason: DataDrop, several: u64) {
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.count_drops(reason, several);
+        }
+        if self.drops.add(reason.key(), several) {
+            debug!(name = %name.short(), ?reason, several, "dropped; counted from here on");
         }
     }
 

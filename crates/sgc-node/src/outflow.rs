@@ -156,6 +156,11 @@ impl OutFlow {
         (evicted > 0).then_some((DataDrop::Stale, evicted))
     }
 
+    /// True if it is far from pushing back.
+    pub(crate) fn is_at_ease(&self) -> bool {
+        self.queue.is_at_ease(OUTFLOW_RELIABLE_BYTES_MAX)
+    }
+
     /// Ends it: what is queued is still sent.
     pub(crate) fn close(&self) {
         self.queue.close();

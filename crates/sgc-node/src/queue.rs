@@ -133,6 +133,11 @@ impl<T> Queue<T> {
         self.items.is_empty()
     }
 
+    /// True while it is less than half full.
+    pub(crate) fn is_at_ease(&self, bytes_max: usize) -> bool {
+        self.items.len() < self.items.capacity() / 2 && self.bytes.load(Ordering::Acquire) < bytes_max / 2
+    }
+
     /// Bytes that wait.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {

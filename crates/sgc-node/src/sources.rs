@@ -8,13 +8,13 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
-use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use arc_swap::ArcSwap;
 use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
-use sgc_ros::{Guid, Sample, SampleKind, Shaping};
+use sgc_ros::{Guid, HandleSamples, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
 use sgc_transport::prompt::{self, AtHand};
 use sgc_wire::{
@@ -28,6 +28,23 @@ use crate::dataplane::DataPlane;
 use crate::shaper::Shaper;
 use crate::stats::DataDrop;
 use crate::tap::{Tapped, Taps};
+
+/// The local reader's end of a share.
+pub(crate) struct Publisher(pub Arc<LocalShare>);
+
+impl HandleSamples for Publisher {
+    fn handle(&mut self, sample: Sample) {
+        self.0.publish(sample);
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        self.0.publish_at_once(sample)
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        self.0.data.count_here(&self.0.name, DataDrop::Overrun, samples);
+    }
+}
 
 /// Samples that may wait for their writer to be discovered.
 const EARLY_SAMPLES_MAX: usize = 256;
@@ -117,6 +134,9 @@ struct Inbox {
     open: Vec<SourceSlot>,
 }
 
+/// Its writer has no source yet.
+struct NotListed;
+
 /// A shared topic's end at this node.
 pub(crate) struct LocalShare {
     name: Name,
@@ -127,6 +147,8 @@ pub(crate) struct LocalShare {
     inbox: Mutex<Inbox>,
     /// Whether anything is set of how much goes out, to be seen without the lock.
     is_shaped: AtomicBool,
+    /// Whether anything is set of how it goes out, compression included.
+    is_altered: AtomicBool,
     held: Mutex<Held>,
     compression: Compression,
     /// Told when it is closed, for who waits for his time.
@@ -174,6 +196,7 @@ impl LocalShare {
             map: ArcSwap::default(),
             inbox: Mutex::default(),
             is_shaped: AtomicBool::new(false),
+            is_altered: AtomicBool::new(false),
             held: Mutex::default(),
             compression: Compression::default(),
             ended: Condvar::new(),
@@ -200,6 +223,7 @@ impl LocalShare {
     pub(crate) fn set_shaping(&self, shaping: Shaping) {
         lock(&self.held).shaper.set(shaping);
         lock(&self.compression.encoding).0 = shaping.compression;
+        self.is_altered.store(shaping != Shaping::default(), SeqCst);
         let limits = Shaping { compression: PayloadEncoding::Plain, ..shaping };
         self.is_shaped.store(limits != Shaping::default(), SeqCst);
     }
@@ -224,6 +248,29 @@ impl LocalShare {
             None if ends_batch => self.flush(&mut lock(&self.inbox)),
             None => {}
         }
+    }
+
+    /// Publishes a sample if nothing has to be waited for, or gives it back; called on a thread that receives for others, too.
+    fn publish_at_once(&self, sample: Sample) -> Result<(), Sample> {
+        let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
+        if !is_short || self.is_altered.load(Relaxed) || !self.data.is_at_ease(&self.name) {
+            return Err(sample);
+        }
+        // Its tasks are run when the locks are free again.
+        let _at_hand = AtHand::begin(&self.runtime);
+        // Who has the locks may be pushed back.
+        let Ok(inbox) = self.inbox.try_lock() else { return Err(sample) };
+        let Ok(slot) = self.slot_of(sample.writer) else { return Err(sample) };
+        if !inbox.early.is_empty() || !inbox.open.is_empty() {
+            return Err(sample);
+        }
+        if let Some(slot) = slot {
+            let Ok(source) = slot.source.try_lock() else { return Err(sample) };
+            self.publish_of(&slot, Some(source), sample, false);
+        } else {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
+        }
+        Ok(())
     }
 
     /// A sample that may go now; others are held back until their time has come, or until there is a newer one. Waits
@@ -333,28 +380,12 @@ impl LocalShare {
     /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source
     /// may be left with packets that wait for others; then it is in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
-        if self.closed.load(Relaxed) {
-            return Ok(());
-        }
-        let slot = {
-            let map = self.map.load();
-            match sample.writer.and_then(|w| map.own.get(&w)) {
-                Some(slot) => Some(slot.clone()),
-                None if map.per_writer && sample.writer.is_some() => return Err(sample),
-                // Its writer was gone before anybody asked who it is.
-                None => map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned(),
-            }
-        };
-        match slot {
-            None => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
-            Some(slot) => {
-                let wanted = self.data.is_wanted(&self.name);
-                if !wanted && !slot.keeps_history && !slot.progress.recovers() {
-                    self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
-                    return Ok(());
-                }
-                self.seal_and_send(&slot, sample, more, wanted);
-                if more && open.iter().all(|o| o.id != slot.id) {
+        match self.slot_of(sample.writer) {
+            Err(NotListed) => return Err(sample),
+            Ok(None) => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            Ok(Some(slot)) => {
+                let is_open = self.publish_of(&slot, None, sample, more);
+                if is_open && open.iter().all(|o| o.id != slot.id) {
                     open.push(slot);
                 }
             }
@@ -362,7 +393,34 @@ impl LocalShare {
         Ok(())
     }
 
-    fn seal_and_send(&self, slot: &SourceSlot, sample: Sample, more: bool, wanted: bool) {
+    /// Which source publishes for a writer, if any does.
+    fn slot_of(&self, writer: Option<Guid>) -> Result<Option<SourceSlot>, NotListed> {
+        let map = self.map.load();
+        match writer.and_then(|w| map.own.get(&w)) {
+            Some(slot) => Ok(Some(slot.clone())),
+            None if map.per_writer && writer.is_some() => Err(NotListed),
+            // Its writer was gone before anybody asked who it is.
+            None => Ok(map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned()),
+        }
+    }
+
+    /// Publishes a sample of a source, which is locked already or is to be waited for. True if it may be left with packets
+    /// that wait for others, as it may with `more`.
+    fn publish_of(
+        &self,
+        slot: &SourceSlot,
+        source: Option<MutexGuard<'_, Source>>,
+        sample: Sample,
+        more: bool,
+    ) -> bool {
+        if self.closed.load(Relaxed) {
+            return false;
+        }
+        let wanted = self.data.is_wanted(&self.name);
+        if !wanted && !slot.keeps_history && !slot.progress.recovers() {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
+            return false;
+        }
         self.taps.offer(|| Tapped::of_sample(&sample));
         // What may never leave is not worth the time.
         let (encoding, payload) = match wanted || slot.keeps_history {
@@ -378,14 +436,17 @@ impl LocalShare {
             },
             source_timestamp_ns: sample.source_timestamp_ns,
         };
+        let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
             // Fragments leave as they are sealed: a large message is under way before its end is read.
-            lock(&slot.source).publish(&head, payload, more, self.emit())
+            source.publish(&head, payload, more, self.emit())
         } else {
             // For who joins later, or is on another way here.
-            lock(&slot.source).record(&head, payload)
+            source.record(&head, payload)
         };
+        drop(source);
         self.note_published(slot, result);
+        more
     }
 
     /// Publishes a message about a call: what is asked and what is answered have one source each. Nothing becomes of it
@@ -603,19 +664,20 @@ fn unix_ns() -> i64 {
     unix.as_nanos().try_into().unwrap_or(i64::MAX)
 }
 
-fn lock<T>(source: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+fn lock<T>(source: &Mutex<T>) -> MutexGuard<'_, T> {
     source.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
 mod tests {
     use sgc_endpoint::{RecoveryLimits, SourceConfig};
-    use sgc_router::FibEntry;
+    use sgc_router::{FibEntry, Tree};
     use sgc_trust::{MessageKey, Suite};
     use sgc_wire::{Class, SecretBytes};
 
     use super::*;
-    use crate::dataplane::Forward;
+    use crate::dataplane::{Forward, Out};
+    use crate::outflow::OutFlow;
 
     const KNOWN: Guid = Guid([1; 16]);
     const STRANGER: Guid = Guid([2; 16]);
@@ -688,6 +750,47 @@ mod tests {
             assert!(Instant::now() < end, "it does not come");
             std::thread::yield_now();
         }
+    }
+
+    #[test]
+    fn what_would_have_to_wait_is_given_back() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        let flow = OutFlow::idle();
+        let (link, out) = (LinkId(1), Out::Link(flow.clone(), Arc::default()));
+        let tree =
+            Tree { up: LinkId::LOCAL, down: [link].as_slice().into(), publishers: [].as_slice().into() };
+        let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
+        share.data.set(share.name, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
+        let mut publisher = Publisher(share.clone());
+        let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_ok();
+        assert!(is_taken(sample(KNOWN, false)));
+        assert_eq!((share.published(), flow.is_at_ease()), (1, true));
+        // Its source is not known yet, or somebody else sends with it, or more of it waits for a batch to end.
+        assert!(!is_taken(sample(STRANGER, false)));
+        {
+            let _replays = lock(&slot.source);
+            assert!(!is_taken(sample(KNOWN, false)));
+        }
+        share.publish(sample(KNOWN, true));
+        assert!(!is_taken(sample(KNOWN, false)));
+        share.publish(sample(KNOWN, false));
+        // It is long, or something is set of how it goes out.
+        let payload = Bytes::from(vec![0; AT_HAND_BYTES_MAX + 1]);
+        assert!(!is_taken(Sample { payload, ..sample(KNOWN, false) }));
+        share.set_shaping(Shaping { compression: PayloadEncoding::Lz4, ..Shaping::default() });
+        assert!(!is_taken(sample(KNOWN, false)));
+        share.set_shaping(Shaping::default());
+        assert!(is_taken(sample(KNOWN, false)));
+        // The link has much to do.
+        while flow.is_at_ease() {
+            share.publish(sample(KNOWN, false));
+        }
+        assert!(!is_taken(sample(KNOWN, false)));
+        // What came too fast is counted.
+        publisher.overrun(7);
+        assert_eq!(share.data.drops().snapshot()["overrun"], 7);
     }
 
     #[test]

@@ -75,11 +75,13 @@ pub(crate) enum DataDrop {
     TooOld,
     /// The publisher's history once more, after its node started anew.
     Repeated,
+    /// A local publisher writes faster than this node can send: newer ones took its place.
+    Overrun,
 }
 
 impl DataDrop {
     /// All, in the order of their numbers.
-    const ALL: [Self; 15] = [
+    const ALL: [Self; 17] = [
         Self::NoTree,
         Self::WrongWay,
         Self::HopLimit,
@@ -95,6 +97,8 @@ impl DataDrop {
         Self::TooLarge,
         Self::Thinned,
         Self::TooOld,
+        Self::Repeated,
+        Self::Overrun,
     ];
 
     /// A short, stable name for counters.
@@ -116,6 +120,7 @@ impl DataDrop {
             Self::Thinned => "thinned",
             Self::TooOld => "too_old",
             Self::Repeated => "repeated",
+            Self::Overrun => "overrun",
         }
     }
 }
@@ -188,7 +193,7 @@ mod tests {
         }
         let reasons = stats.reasons();
         assert_eq!(reasons.len(), DataDrop::ALL.len());
-        assert_eq!(reasons["too_old"], DataDrop::ALL.len() as u64);
+        assert_eq!(reasons["overrun"], DataDrop::ALL.len() as u64);
     }
 
     #[test]

@@ -344,7 +344,9 @@ fn an_action_is_carried_whole() {
         let topic = EndpointSpec { type_name, ..support::spec(&name, support::latched()) };
         let writer = robot.create_writer(&topic).unwrap();
         let (heard, samples) = channel();
-        let _reader = desk.create_reader(&topic, Box::new(move |s| drop(heard.send(s.payload)))).unwrap();
+        let _reader = desk
+            .create_reader(&topic, Box::new(move |s: sgc_ros::Sample| drop(heard.send(s.payload))))
+            .unwrap();
         sgc_ros::RosWriter::write(&writer, sgc_ros::SampleKind::Write, 1, body("status")).unwrap();
         assert_eq!(samples.recv_timeout(PATIENCE).unwrap(), body("status"));
     }

@@ -148,9 +148,31 @@ pub struct Sample {
     pub more: bool,
 }
 
-/// Receives the samples of one reader, on a thread of that reader alone: it may block, and while it
-/// does nothing but that reader waits.
-pub type SampleHandler = Box<dyn FnMut(Sample) + Send>;
+/// Receives the samples of one reader, one after the other. A closure that takes samples is one.
+pub trait HandleSamples: Send {
+    /// Handles a sample on a thread of that reader alone: it may block, and while it does nothing but that reader waits.
+    fn handle(&mut self, sample: Sample);
+
+    /// Handles a sample on a thread that receives for all readers of the network if that needs no waiting, or else gives
+    /// it back, to be handled on the reader's own. None is at hand behind it.
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        Err(sample)
+    }
+
+    /// So many samples gave way to newer ones, since they came faster than they were handled.
+    fn overrun(&mut self, samples: u64) {
+        let _ = samples;
+    }
+}
+
+impl<F: FnMut(Sample) + Send> HandleSamples for F {
+    fn handle(&mut self, sample: Sample) {
+        self(sample);
+    }
+}
+
+/// Handles the samples of a reader.
+pub type SampleHandler = Box<dyn HandleSamples>;
 
 /// Who asked a service, and the number of its request: the sample identity of RPC over DDS 1.0 (7.5.1.1.1).
 ///

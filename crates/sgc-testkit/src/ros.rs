@@ -194,7 +194,7 @@ impl FakeDomain {
             let mut handler = reader.lock().unwrap_or_else(PoisonError::into_inner);
             let last = missed.len().saturating_sub(1);
             for (n, sample) in missed.into_iter().enumerate() {
-                handler(Sample { more: n < last, ..sample });
+                handler.handle(Sample { more: n < last, ..sample });
             }
         }
         guid
@@ -280,7 +280,7 @@ impl RosNetwork for FakeRos {
         let client = requests.guid.0;
         let replies = self.create_reader(
             &spec.reply,
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 if let Some((id, payload)) = split(&sample.payload, None)
                     && id.client == client
                 {
@@ -295,7 +295,7 @@ impl RosNetwork for FakeRos {
         let replies = self.create_writer(&spec.reply)?;
         let requests = self.create_reader(
             &spec.request,
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 if let Some((id, payload)) = split(&sample.payload, sample.writer) {
                     handler(id, payload);
                 }
@@ -426,7 +426,10 @@ impl FakeWriter {
                 .collect()
         };
         for reader in readers {
-            (reader.lock().unwrap_or_else(PoisonError::into_inner))(sample.clone());
+            let mut reader = reader.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Err(sample) = reader.handle_at_once(sample.clone()) {
+                reader.handle(sample);
+            }
         }
     }
 }

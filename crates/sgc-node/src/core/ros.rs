@@ -5,9 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::{AskAgain, RecoveryLimits, Source, SourceConfig, Wish};
-use sgc_ros::{
-    Command, EndpointSpec, Guid, RosNetwork, Sample, SampleHandler, Shaping, TF_MESSAGE, service_qos,
-};
+use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
@@ -21,7 +19,7 @@ use super::{
 use crate::dataplane::{Forward, Out};
 use crate::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::sinks::{LocalSink, WriterQueue};
-use crate::sources::{LocalShare, SourceMap, SourceSlot};
+use crate::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
 
 /// Bytes of recovery kept of one publisher among many of a topic.
 const RECOVERY_BYTES_MIN: usize = 1 << 20;
@@ -218,21 +216,18 @@ impl<N: RosNetwork> Core<N> {
         self.readers.insert(name, (spec.clone(), None));
         let alive = self.alive.clone();
         let failures = self.ros_failures.clone();
-        tokio::task::spawn_blocking(move || {
-            let handler: SampleHandler = Box::new(move |sample: Sample| share.publish(sample));
-            match network.create_reader(&spec, handler) {
-                Ok(reader) => {
-                    let _ = events.blocking_send(CoreEvent::ReaderReady {
-                        name,
-                        spec,
-                        guid: network.reader_guid(&reader),
-                        reader: Box::new((reader, alive)),
-                    });
-                }
-                Err(why) => {
-                    failures.count("create_reader");
-                    error!("{why}");
-                }
+        tokio::task::spawn_blocking(move || match network.create_reader(&spec, Box::new(Publisher(share))) {
+            Ok(reader) => {
+                let _ = events.blocking_send(CoreEvent::ReaderReady {
+                    name,
+                    spec,
+                    guid: network.reader_guid(&reader),
+                    reader: Box::new((reader, alive)),
+                });
+            }
+            Err(why) => {
+                failures.count("create_reader");
+                error!("{why}");
             }
         });
     }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter};
-use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
 use sgc_wire::{History, Qos};
 
 use super::Event;
@@ -71,7 +71,7 @@ impl End {
         let writer = Arc::new(network.create_writer(&spec(&lane.ask(), History::KeepAll))?);
         let reader = network.create_reader(
             &spec(&lane.answer(), History::KeepLast(READER_DEPTH)),
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 let now = Instant::now();
                 if let Some(frame) = Frame::decode(&sample.payload) {
                     // Whoever listened is gone if this fails, and this reader soon as well.
@@ -93,7 +93,7 @@ impl End {
         let back = Arc::clone(&writer);
         let reader = network.create_reader(
             &spec(&lane.ask(), History::KeepLast(READER_DEPTH)),
-            Box::new(move |sample| {
+            Box::new(move |sample: Sample| {
                 let now = Instant::now();
                 let Some(frame) = Frame::decode(&sample.payload) else { return };
                 let answer = match frame.kind {

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use clap::Args;
 use rustix::time::{ClockId, clock_gettime};
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
-use sgc_ros::{RosError, RosNetwork, RosWriter, SampleKind};
+use sgc_ros::{RosError, RosNetwork, RosWriter, Sample, SampleKind};
 
 use super::messages::{self, Draft};
 use super::protocol::{PeerCommand, PeerEvent};
@@ -186,7 +186,7 @@ impl<R> Listener<R> {
             let mut arrived = false;
             network.create_reader(
                 &topic.reader(),
-                Box::new(move |sample| {
+                Box::new(move |sample: Sample| {
                     let now_ns = monotonic_ns();
                     let message = messages::decode(topic, &sample.payload);
                     let mut tracker = tracker.lock().unwrap_or_else(PoisonError::into_inner);

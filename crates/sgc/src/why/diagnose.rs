@@ -766,6 +766,10 @@ fn drop_reason(reason: &str) -> (&'static str, &'static str) {
         "thinned" => {
             ("more came than max_rate or max_bandwidth let on", "raise the limit if that is not meant")
         }
+        "overrun" => (
+            "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
+            "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
+        ),
         "too_old" => ("older than max_age", "raise max_age, or compare the clocks of the hosts"),
         _ => ("for another reason", "`sgc status` shows all drops"),
     }

@@ -1,0 +1,423 @@
+//! [`Intake`]: a DDS reader, what waits between it and who receives its samples, and the thread that hands them over.
+//!
+//! Cyclone calls a listener on the thread that received a sample, which all readers of a domain share, with the writer's
+//! lock held. The listener takes the sample; what a [`Receiver`] can do without waiting is done right there, since to wake
+//! another thread takes longer than all the rest. Everything else is queued, within bounds of its own, for the reader's
+//! thread, which may block for as long as it likes: no other reader waits, and nothing behind it is taken out of order.
+
+use std::cell::Cell;
+use std::collections::VecDeque;
+use std::ffi::c_void;
+use std::mem::MaybeUninit;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use cyclors::{
+    DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
+    dds_instance_handle_t, dds_lset_data_available, dds_sample_info_t, dds_takecdr, ddsi_serdata,
+};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid};
+
+use crate::entity::{Entity, reason};
+use crate::network::Participant;
+use crate::qos::history_of;
+
+/// Samples taken from Cyclone at once.
+const BATCH: usize = 16;
+
+/// Bytes of samples that may wait for one reader's thread; a single sample may be longer.
+pub const WAITING_BYTES_MAX: usize = 64 << 20;
+
+/// After handling a sample the receiving thread handles none for as long as that took, and for no less than this: what
+/// comes so fast is better handled by the reader's thread, several at a time.
+const REST_MIN: Duration = Duration::from_micros(20);
+
+thread_local! {
+    /// Whether this thread is in a listener.
+    static IS_LISTENING: Cell<bool> = const { Cell::new(false) };
+}
+
+/// What is made of a sample of Cyclone's.
+pub(crate) trait Taken: Send + Sized {
+    /// Takes over a reference; nothing if it is no sample that anybody could use.
+    ///
+    /// # Safety
+    /// The caller owns one reference to `sample`, which is of the type that `Self` is made of.
+    unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self>;
+
+    /// Length of the payload, bytes.
+    fn bytes(&self) -> usize;
+}
+
+/// A sample, and what its reader says of it.
+#[derive(Debug)]
+pub(crate) struct Arrival<S> {
+    pub(crate) sample: S,
+    /// Who wrote it, as the reader knows it.
+    pub(crate) writer: dds_instance_handle_t,
+    pub(crate) source_timestamp_ns: i64,
+}
+
+/// Receives what an intake takes, one sample after the other.
+pub(crate) trait Receiver: Send + 'static {
+    /// What the reader's topic is made of.
+    type Sample: Taken;
+
+    /// Receives a sample of this reader; may wait.
+    fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Self::Sample>);
+
+    /// Receives a sample if that needs neither waiting nor any call of Cyclone's, or gives it back.
+    fn receive_at_once(&mut self, arrival: Arrival<Self::Sample>) -> Result<(), Arrival<Self::Sample>> {
+        Err(arrival)
+    }
+
+    /// Nothing more is at hand.
+    fn rest(&mut self) {}
+
+    /// So many samples gave way to newer ones, since they came faster than they were received.
+    fn overrun(&mut self, samples: u64);
+}
+
+/// How much of the time the receiving threads of a network handle samples themselves: half of it, no more.
+#[derive(Debug)]
+pub(crate) struct Pace {
+    began: Instant,
+    rests_until_ns: AtomicU64,
+}
+
+impl Pace {
+    pub(crate) fn new() -> Self {
+        Self { began: Instant::now(), rests_until_ns: AtomicU64::new(0) }
+    }
+
+    fn now_ns(&self) -> u64 {
+        self.began.elapsed().as_nanos() as u64
+    }
+
+    /// When it is, if a sample may be handled.
+    fn begin(&self) -> Option<u64> {
+        let now_ns = self.now_ns();
+        (now_ns >= self.rests_until_ns.load(Ordering::Relaxed)).then_some(now_ns)
+    }
+
+    fn end(&self, began_ns: u64) {
+        let now_ns = self.now_ns();
+        let rest_ns = now_ns.saturating_sub(began_ns).max(REST_MIN.as_nanos() as u64);
+        self.rests_until_ns.store(now_ns.saturating_add(rest_ns), Ordering::Relaxed);
+    }
+}
+
+/// What waits.
+#[derive(Debug)]
+struct Queue<S> {
+    arrivals: VecDeque<Arrival<S>>,
+    bytes: usize,
+    /// Samples that may wait.
+    depth: usize,
+    overrun: u64,
+    /// Whether the thread sleeps.
+    is_waiting: bool,
+    is_stopped: bool,
+}
+
+impl<S: Taken> Queue<S> {
+    fn new(depth: usize) -> Self {
+        let arrivals = VecDeque::new();
+        Self { arrivals, bytes: 0, depth, overrun: 0, is_waiting: false, is_stopped: false }
+    }
+
+    /// Puts a sample behind the others; the oldest give way to what there is no room for.
+    fn push(&mut self, arrival: Arrival<S>) {
+        let bytes = arrival.sample.bytes();
+        while (self.arrivals.len() >= self.depth || self.bytes + bytes > WAITING_BYTES_MAX)
+            && self.pop().is_some()
+        {
+            self.overrun += 1;
+        }
+        self.bytes += bytes;
+        self.arrivals.push_back(arrival);
+    }
+
+    fn pop(&mut self) -> Option<Arrival<S>> {
+        let arrival = self.arrivals.pop_front()?;
+        self.bytes -= arrival.sample.bytes();
+        Some(arrival)
+    }
+}
+
+/// What the listener and the reader's thread share.
+struct Shared<R: Receiver> {
+    queue: Mutex<Queue<R::Sample>>,
+    filled: Condvar,
+    /// Locked by whoever handles samples, for as long as the order of samples is its own; always before the queue, or not
+    /// waited for. Nothing until it is started.
+    receiver: Mutex<Option<R>>,
+    participant: Arc<Participant>,
+}
+
+impl<R: Receiver> Shared<R> {
+    /// Takes what the reader has. In its listener.
+    fn take(&self, reader: dds_entity_t) {
+        let mut samples: [*mut ddsi_serdata; BATCH] = [std::ptr::null_mut(); BATCH];
+        let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
+        loop {
+            // SAFETY: both arrays have room for so many; the samples' references become ours.
+            let taken = unsafe {
+                dds_takecdr(
+                    reader,
+                    samples.as_mut_ptr(),
+                    BATCH as u32,
+                    infos.as_mut_ptr().cast(),
+                    DDS_ANY_STATE,
+                )
+            };
+            let Ok(taken) = usize::try_from(taken) else {
+                tracing::error!(reason = reason(taken), "taking samples failed");
+                return;
+            };
+            for (sample, info) in samples.iter().zip(&infos).take(taken) {
+                // SAFETY: Cyclone filled the first `taken` of both arrays and gave us a reference to each sample, whose
+                // type is that of this reader's topic.
+                let (sample, info) = unsafe { (R::Sample::from_raw(*sample), info.assume_init_ref()) };
+                // Changes of instance state: Cyclone makes them up without a payload.
+                if let Some(sample) = sample.filter(|_| info.valid_data) {
+                    let (writer, source_timestamp_ns) = (info.publication_handle, info.source_timestamp);
+                    self.arrive(Arrival { sample, writer, source_timestamp_ns });
+                }
+            }
+            if taken < BATCH {
+                return;
+            }
+        }
+    }
+
+    /// Has a sample received at once, or queues it.
+    fn arrive(&self, arrival: Arrival<R::Sample>) {
+        let mut queue = lock(&self.queue);
+        let mut arrival = Some(arrival);
+        if queue.arrivals.is_empty()
+            && !queue.is_stopped
+            && let Some(began) = self.participant.pace().begin()
+            && let Ok(mut receiver) = self.receiver.try_lock()
+            && let Some(receiver) = receiver.as_mut()
+        {
+            drop(queue);
+            arrival = arrival.and_then(|a| receiver.receive_at_once(a).err());
+            self.participant.pace().end(began);
+            // Cyclone calls one listener of a reader at a time, so nothing has come in between.
+            queue = lock(&self.queue);
+        }
+        let Some(arrival) = arrival.filter(|_| !queue.is_stopped) else { return };
+        queue.push(arrival);
+        if std::mem::take(&mut queue.is_waiting) {
+            drop(queue);
+            self.filled.notify_one();
+        }
+    }
+
+    /// Hands over what waits, and waits for more, until it is stopped. On the reader's thread.
+    fn serve(&self, reader: dds_entity_t) {
+        loop {
+            if let Some(receiver) = lock(&self.receiver).as_mut() {
+                loop {
+                    let (next, overrun, is_stopped) = {
+                        let mut queue = lock(&self.queue);
+                        let next = queue.pop();
+                        (next, std::mem::take(&mut queue.overrun), queue.is_stopped)
+                    };
+                    if overrun > 0 {
+                        receiver.overrun(overrun);
+                    }
+                    match next {
+                        Some(arrival) if !is_stopped => receiver.receive(reader, arrival),
+                        _ => break,
+                    }
+                }
+                receiver.rest();
+            }
+            let mut queue = lock(&self.queue);
+            while queue.arrivals.is_empty() && !queue.is_stopped {
+                queue.is_waiting = true;
+                queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            }
+            queue.is_waiting = false;
+            if queue.is_stopped {
+                return;
+            }
+        }
+    }
+
+    fn stop(&self) {
+        lock(&self.queue).is_stopped = true;
+        self.filled.notify_one();
+    }
+}
+
+/// Cyclone's own, and what they are called with. They drop in this order: children first, and what the listener uses when
+/// nothing calls it any more.
+struct Entities<R: Receiver> {
+    reader: Entity,
+    _group: Option<Entity>,
+    _topic: Entity,
+    shared: Arc<Shared<R>>,
+}
+
+impl<R: Receiver> Entities<R> {
+    /// Hands samples over until it is stopped; with all of it, or it would go field by field.
+    fn serve(self) {
+        self.shared.serve(self.reader.handle());
+    }
+}
+
+/// A reader and its thread. Dropping it ends the thread, waits for a receiver that is at work, and deletes the entities.
+pub(crate) struct Intake<R: Receiver> {
+    guid: Guid,
+    handle: dds_entity_t,
+    shared: Arc<Shared<R>>,
+    /// The thread's, once there is one.
+    entities: Option<Entities<R>>,
+    thread: Option<thread::JoinHandle<()>>,
+}
+
+impl<R: Receiver> Intake<R> {
+    /// A reader of `topic`, which is made of `R::Sample`; `user_data` is added to its USER_DATA. What it takes waits until
+    /// it is started.
+    pub(crate) fn new(
+        participant: &Arc<Participant>,
+        spec: &EndpointSpec,
+        topic: Entity,
+        user_data: &str,
+    ) -> Result<Self, String> {
+        let qos = participant.endpoint_qos(EndpointKind::Reader, spec, user_data)?;
+        let group = participant.group(EndpointKind::Reader, spec)?;
+        let parent = group.as_ref().unwrap_or(participant.entity()).handle();
+        let (_, depth) = history_of(EndpointKind::Reader, spec.qos.history, spec.keyless);
+        let shared = Arc::new(Shared {
+            queue: Mutex::new(Queue::new(usize::try_from(depth).unwrap_or(1))),
+            filled: Condvar::new(),
+            receiver: Mutex::new(None),
+            participant: Arc::clone(participant),
+        });
+        let arg = Arc::as_ptr(&shared).cast_mut().cast::<c_void>();
+        // SAFETY: the listener is copied by the call that makes the reader, as is the QoS, and deleted once. `arg` outlives
+        // the reader, whose deletion waits for its listener: see `Entities`.
+        let reader = unsafe {
+            let listener = dds_create_listener(arg);
+            dds_lset_data_available(listener, Some(arrived::<R>));
+            let reader = dds_create_reader(parent, topic.handle(), qos.as_ptr(), listener);
+            dds_delete_listener(listener);
+            Entity::new(reader)?
+        };
+        let (guid, handle) = (reader.guid()?, reader.handle());
+        let entities = Entities { reader, _group: group, _topic: topic, shared: Arc::clone(&shared) };
+        Ok(Self { guid, handle, shared, entities: Some(entities), thread: None })
+    }
+
+    /// Has samples received from now on, by a thread of this name unless it is at once.
+    pub(crate) fn start(&mut self, name: &str, receiver: R) -> Result<(), String> {
+        let Some(entities) = self.entities.take() else { return Err("it is started".into()) };
+        *lock(&self.shared.receiver) = Some(receiver);
+        let thread = thread::Builder::new()
+            .name(name.into())
+            .spawn(move || entities.serve())
+            .map_err(|e| e.to_string())?;
+        self.thread = Some(thread);
+        Ok(())
+    }
+
+    /// GUID of the reader, as others discover it.
+    pub(crate) fn guid(&self) -> Guid {
+        self.guid
+    }
+
+    /// The reader's handle, for calls into Cyclone while `self` lives.
+    pub(crate) fn handle(&self) -> dds_entity_t {
+        self.handle
+    }
+}
+
+impl<R: Receiver> Drop for Intake<R> {
+    fn drop(&mut self) {
+        self.shared.stop();
+        // The thread waits for the listener, so a listener that drops its own reader does not wait for the thread.
+        if let Some(thread) = self.thread.take()
+            && !IS_LISTENING.get()
+        {
+            crate::wait::join(thread);
+        }
+    }
+}
+
+impl<R: Receiver> std::fmt::Debug for Intake<R> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Intake").field("guid", &self.guid).finish_non_exhaustive()
+    }
+}
+
+/// The listener.
+unsafe extern "C" fn arrived<R: Receiver>(reader: dds_entity_t, arg: *mut c_void) {
+    // SAFETY: what the listener was made with, which lives until the reader is deleted.
+    let shared = unsafe { &*arg.cast::<Shared<R>>() };
+    IS_LISTENING.set(true);
+    shared.take(reader);
+    IS_LISTENING.set(false);
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    impl Taken for usize {
+        unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
+            Some(sample as Self)
+        }
+
+        fn bytes(&self) -> usize {
+            *self
+        }
+    }
+
+    /// The bytes of what waits of so many samples, and how many gave way.
+    fn waits(depth: usize, all: impl IntoIterator<Item = usize>) -> (Vec<usize>, u64) {
+        let mut queue = Queue::new(depth);
+        for bytes in all {
+            queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });
+            assert!(queue.bytes <= WAITING_BYTES_MAX.max(bytes));
+        }
+        let waits = std::iter::from_fn(|| queue.pop()).map(|a| a.sample).collect();
+        assert_eq!(queue.bytes, 0);
+        (waits, queue.overrun)
+    }
+
+    #[test]
+    fn what_waits_has_a_bound_in_samples_and_one_in_bytes() {
+        assert_eq!(waits(3, 10..15), (vec![12, 13, 14], 2));
+        const HALF: usize = WAITING_BYTES_MAX / 2;
+        assert_eq!(waits(9, [5, HALF, HALF]), (vec![HALF, HALF], 1));
+        assert_eq!(waits(9, [5, 7, WAITING_BYTES_MAX + 1]), (vec![WAITING_BYTES_MAX + 1], 2));
+        assert_eq!(waits(9, [WAITING_BYTES_MAX + 1, 6]), (vec![6], 1));
+    }
+
+    #[test]
+    fn receiving_threads_rest_for_as_long_as_they_worked() {
+        let pace = Pace::new();
+        let began = pace.begin().expect("nothing was handled yet");
+        pace.end(began.saturating_sub(1_000_000_000));
+        assert!(pace.begin().is_none());
+        let pace = Pace::new();
+        let began = pace.begin().expect("nothing was handled yet");
+        pace.end(began);
+        let end = Instant::now() + Duration::from_secs(30);
+        while pace.begin().is_none() {
+            assert!(Instant::now() < end, "it rests for longer than it has to");
+            std::hint::spin_loop();
+        }
+        assert!(pace.now_ns() >= began + REST_MIN.as_nanos() as u64);
+    }
+}
