@@ -8,7 +8,7 @@ use anyhow::Result;
 use super::flow::{Flow, FlowSpec, Order};
 use super::lab::{Lab, PathKind, Side};
 use super::system::{Running, Sgc, System, Topic};
-use super::tally::Tally;
+use super::tally::{Round, Tally};
 use super::{Compare, Figures};
 
 const TOPIC: &str = "/bench/fan";
@@ -25,31 +25,19 @@ const WARM_UP_SECONDS: f64 = 0.3;
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    let kind = PathKind::Bare;
-    if !compare.wants_path(&kind) {
-        return Ok(());
-    }
-    let mut tally = Tally::new("fan-out");
-    for round in 0..compare.rounds(&kind) {
+    Round::all(compare, figures, "fan-out", |round| {
         for system in compare.systems() {
-            let name = system.name();
-            compare.note(&format!("fan-out, round {round}: {name}"));
             for sinks in SINKS {
-                if let Err(error) = measure(compare, &**system, sinks, &mut tally) {
-                    figures.leave_out(&format!("fan-out {name} to {sinks}"), format!("{error:#}"));
-                }
+                let what = format!("{} to {sinks}", system.name());
+                round.measure(&what, |tally| measure(compare, &**system, sinks, tally));
             }
         }
         let name = format!("sgc-quic-{NODES_SUITE}");
         for nodes in NODES.into_iter().filter(|_| compare.wants(&name)) {
             let name = format!("{name}-nodes");
-            compare.note(&format!("fan-out, round {round}: {name}, {nodes}"));
-            if let Err(error) = measure_nodes(compare, &name, nodes, &mut tally) {
-                figures.leave_out(&format!("fan-out {name} to {nodes}"), format!("{error:#}"));
-            }
+            round.measure(&format!("{name} to {nodes}"), |tally| measure_nodes(compare, &name, nodes, tally));
         }
-    }
-    tally.write(figures);
+    });
     Ok(())
 }
 

@@ -5,43 +5,27 @@ use std::collections::BTreeMap;
 
 use anyhow::Result;
 
-use super::flow::{Flow, FlowSpec, Order};
-use super::lab::{Lab, PathKind, Side};
-use super::round_trip;
-use super::system::{Sgc, System as _, Topic};
-use super::tally::Tally;
-use super::{Compare, Figures};
+use super::lab::PathKind;
+use super::system::Sgc;
+use super::tally::{Round, Tally};
+use super::{Compare, Figures, round_trip, throughput};
 
-const TOPIC: &str = "/bench/hops";
 /// Routers in a row; without one the right proxy is dialled, which is where counting begins.
 const ROUTERS: std::ops::RangeInclusive<usize> = 0..=5;
 const SUITES: [&str; 2] = ["group", "standard"];
 const BYTES: usize = 1000;
-const RUN_SECONDS: f64 = 2.0;
-const WARM_UP_SECONDS: f64 = 0.3;
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    let kind = PathKind::Bare;
-    if !compare.wants_path(&kind) {
-        return Ok(());
-    }
-    let mut tally = Tally::new("multi-hop");
-    for round in 0..compare.rounds(&kind) {
+    Round::all(compare, figures, "multi-hop", |round| {
         for suite in SUITES {
             let name = format!("sgc-quic-{suite}");
-            if !compare.wants(&name) {
-                continue;
-            }
-            for routers in ROUTERS {
-                compare.note(&format!("multi-hop, round {round}: {name} over {routers}"));
-                if let Err(error) = measure(compare, suite, routers, &name, &mut tally) {
-                    figures.leave_out(&format!("multi-hop {name} over {routers}"), format!("{error:#}"));
-                }
+            for routers in ROUTERS.filter(|_| compare.wants(&name)) {
+                let what = format!("{name} over {routers}");
+                round.measure(&what, |tally| measure(compare, suite, routers, &name, tally));
             }
         }
-    }
-    tally.write(figures);
+    });
     Ok(())
 }
 
@@ -62,14 +46,7 @@ fn measure(
         tally.add(name, kind.name(), routers as u64, "p99_us", spread.p99);
         tally.add(name, kind.name(), routers as u64, "max_us", spread.max);
     }
-    let lab = Lab::new(kind, compare.load())?;
-    let running = system.start(&lab, &[Topic { name: TOPIC, towards: Side::Right, reliable: true }])?;
-    let spec = FlowSpec { topic: TOPIC, from: Side::Left, readers: 1, reliable: true, depth: 0 };
-    let mut flow = Flow::start(&lab, &running, &spec)?;
-    let part = if compare.is_quick() { 0.2 } else { 1.0 };
-    let order = |seconds: f64| Order { size: BYTES, count: u32::MAX, seconds: seconds * part, rate: None };
-    flow.run(&running, &order(WARM_UP_SECONDS))?;
-    let outcome = flow.run(&running, &order(RUN_SECONDS))?;
+    let (outcome, _) = throughput::one_way(compare, &system, BYTES)?;
     let mut add = |metric, value| tally.add(name, kind.name(), routers as u64, metric, value);
     add("per_second", outcome.arrived() / outcome.seconds);
     add("lost", outcome.lost());

@@ -2,7 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use super::Figures;
+use anyhow::Result;
+
+use super::lab::PathKind;
+use super::{Compare, Figures};
 use crate::report::median;
 
 /// Figures by where they belong, in each round.
@@ -35,6 +38,42 @@ impl Tally {
     pub(crate) fn write(self, figures: &mut Figures) {
         for ((system, path, at, metric), values) in self.rounds {
             figures.push(self.table, &system, path, at as f64, metric, median(values));
+        }
+    }
+}
+
+/// A round of a table over the bare path.
+pub(crate) struct Round<'a> {
+    compare: &'a Compare,
+    figures: &'a mut Figures,
+    tally: Tally,
+    number: usize,
+}
+
+impl Round<'_> {
+    /// Measures a table over the bare path, if that is asked for: as many rounds as there are to be.
+    pub(crate) fn all(
+        compare: &Compare,
+        figures: &mut Figures,
+        table: &'static str,
+        mut run: impl FnMut(&mut Round<'_>),
+    ) {
+        if compare.wants_path(&PathKind::Bare) {
+            let mut round = Round { compare, figures, tally: Tally::new(table), number: 0 };
+            for number in 0..compare.rounds(&PathKind::Bare) {
+                round.number = number;
+                run(&mut round);
+            }
+            round.tally.write(round.figures);
+        }
+    }
+
+    /// Measures one thing of it; what fails is left out.
+    pub(crate) fn measure(&mut self, what: &str, measure: impl FnOnce(&mut Tally) -> Result<()>) {
+        let table = self.tally.table;
+        self.compare.note(&format!("{table}, round {}: {what}", self.number));
+        if let Err(error) = measure(&mut self.tally) {
+            self.figures.leave_out(&format!("{table} {what}"), format!("{error:#}"));
         }
     }
 }

@@ -5,10 +5,10 @@
 
 use anyhow::Result;
 
-use super::flow::{Flow, FlowSpec, Order};
+use super::flow::{Flow, FlowSpec, Order, Outcome};
 use super::lab::{Lab, PathKind, Side};
 use super::system::{System, Topic};
-use super::tally::Tally;
+use super::tally::{Round, Tally};
 use super::{Compare, Figures};
 
 const TOPIC: &str = "/bench/flow";
@@ -22,44 +22,38 @@ const RUN_BYTES_MAX: usize = 2 << 30;
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    let kind = PathKind::Bare;
-    if !compare.wants_path(&kind) {
-        return Ok(());
-    }
-    let mut tally = Tally::new("throughput");
-    for round in 0..compare.rounds(&kind) {
+    Round::all(compare, figures, "throughput", |round| {
         for system in compare.systems() {
-            let name = system.name();
-            compare.note(&format!("throughput, round {round}: {name}"));
-            if let Err(error) = measure(compare, &**system, &mut tally) {
-                figures.leave_out(&format!("throughput {name}"), format!("{error:#}"));
-            }
+            round.measure(&system.name(), |tally| measure(compare, &**system, tally));
         }
-    }
-    tally.write(figures);
+    });
     Ok(())
 }
 
 fn measure(compare: &Compare, system: &dyn System, tally: &mut Tally) -> Result<()> {
     let (kind, name) = (PathKind::Bare, system.name());
     for size in SIZES {
-        // Anew for each size, so that memory is that of the size.
-        let lab = Lab::new(kind, compare.load())?;
-        let topics = [Topic { name: TOPIC, towards: Side::Right, reliable: true }];
-        let running = system.start(&lab, &topics)?;
-        let spec = FlowSpec { topic: TOPIC, from: Side::Left, readers: 1, reliable: true, depth: 0 };
-        let mut flow = Flow::start(&lab, &running, &spec)?;
-        let count = u32::try_from(RUN_BYTES_MAX / size).unwrap_or(u32::MAX);
-        let part = if compare.is_quick() { 0.2 } else { 1.0 };
-        let order = |seconds: f64| Order { size, count, seconds: seconds * part, rate: None };
-        flow.run(&running, &order(WARM_UP_SECONDS))?;
-        let outcome = flow.run(&running, &order(RUN_SECONDS))?;
+        let (outcome, rss_bytes) = one_way(compare, system, size)?;
         let mut add = |metric, value| tally.add(&name, kind.name(), size as u64, metric, value);
         add("per_second", outcome.arrived() / outcome.seconds);
         add("lost", outcome.lost());
         add("cpu_us_per_message", outcome.cpu_seconds * 1e6 / outcome.arrived());
         add("load_cpu_us_per_message", outcome.load_cpu_seconds * 1e6 / outcome.arrived());
-        add("rss_bytes", running.rss_bytes().1 as f64);
+        add("rss_bytes", rss_bytes as f64);
     }
     Ok(())
+}
+
+/// A run over the bare path through a system that is started anew, so that its memory, bytes, is that of the size.
+pub(crate) fn one_way(compare: &Compare, system: &dyn System, size: usize) -> Result<(Outcome, u64)> {
+    let lab = Lab::new(PathKind::Bare, compare.load())?;
+    let running = system.start(&lab, &[Topic { name: TOPIC, towards: Side::Right, reliable: true }])?;
+    let spec = FlowSpec { topic: TOPIC, from: Side::Left, readers: 1, reliable: true, depth: 0 };
+    let mut flow = Flow::start(&lab, &running, &spec)?;
+    let count = u32::try_from(RUN_BYTES_MAX / size).unwrap_or(u32::MAX);
+    let part = if compare.is_quick() { 0.2 } else { 1.0 };
+    let order = |seconds: f64| Order { size, count, seconds: seconds * part, rate: None };
+    flow.run(&running, &order(WARM_UP_SECONDS))?;
+    let outcome = flow.run(&running, &order(RUN_SECONDS))?;
+    Ok((outcome, running.rss_bytes().1))
 }

@@ -243,6 +243,19 @@ fn a_topic_shared_again_within_the_same_moment_is_advertised_after_its_withdrawa
     assert!(adverts.last().is_some_and(|a| !a.1), "{adverts:?}");
 }
 
+/// An owner says that it has a name.
+fn advertise(bench: &mut Bench, owner: &Identity, blind: sgc_wire::Blind) {
+    let body = AdvertBody {
+        chain: owner.chain_bytes(),
+        seq: 1,
+        issued_at: bench.clock.now().unix,
+        lease_ms: 60_000,
+        withdraw: false,
+        blinds: vec![blind],
+    };
+    bench.frame(Control::Advert { cost: 1, signed: owner.sign_advert(&body) });
+}
+
 /// A joiner that was granted `/a` of the robot, with what is needed to go on answering it.
 fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let mut bench = Bench::new("desk", Limits::default());
@@ -254,15 +267,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     bench.endpoint.join(bench.clock.now(), name, arm.node_id(), Wish::Subscribe { describe: false });
     bench.drain();
     assert!(matches!(&bench.sent[..], [Control::Interest { names }] if *names == [name]), "{:?}", bench.sent);
-    let body = AdvertBody {
-        chain: arm.chain_bytes(),
-        seq: 1,
-        issued_at: bench.clock.now().unix,
-        lease_ms: 60_000,
-        withdraw: false,
-        blinds: vec![blind],
-    };
-    bench.frame(Control::Advert { cost: 1, signed: arm.sign_advert(&body) });
+    advertise(&mut bench, &arm, blind);
     let [Control::Join { signed }] = &bench.sent[..] else { panic!("{:?}", bench.sent) };
     let JoinBody { sink, reply_key, .. } = JoinBody::from_slice(&signed.body).expect("as it was signed");
     let frame = grant(&arm, name, sink, &reply_key, 1, 7);
@@ -336,15 +341,7 @@ fn a_name_of_another_owner_than_expected_is_not_asked_for() {
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
     bench.endpoint.join(bench.clock.now(), name, other.node_id(), Wish::Subscribe { describe: false });
     bench.drain();
-    let body = AdvertBody {
-        chain: arm.chain_bytes(),
-        seq: 1,
-        issued_at: bench.clock.now().unix,
-        lease_ms: 60_000,
-        withdraw: false,
-        blinds: vec![blind],
-    };
-    bench.frame(Control::Advert { cost: 1, signed: arm.sign_advert(&body) });
+    advertise(&mut bench, &arm, blind);
     assert!(bench.sent.is_empty());
     assert_eq!(bench.endpoint.join_status(&name), Some(JoinStatus::Waiting));
 }

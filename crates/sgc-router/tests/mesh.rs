@@ -168,6 +168,16 @@ impl Bench {
         self.advert(1, 10, &[A]);
     }
 
+    /// A proxy behind link 4 has a granted branch over router 1.
+    fn with_branch() -> Self {
+        let mut bench = Self::new();
+        bench.with_proxies();
+        bench.with_owner_behind(5000, 9000);
+        bench.join(4, 1, &A);
+        bench.grant(1, 1, &A);
+        bench
+    }
+
     fn link_down(&mut self, link: u32) {
         self.sent.clear();
         self.router.handle_link_down(self.clock.now(), LinkId(link));
@@ -523,11 +533,7 @@ fn a_branch_stays_on_its_way_until_its_sink_has_found_the_better_one() {
 
 #[test]
 fn a_link_is_never_fed_from_an_older_way_again() {
-    let mut bench = Bench::new();
-    bench.with_proxies();
-    bench.with_owner_behind(5000, 9000);
-    bench.join(4, 1, &A);
-    bench.grant(1, 1, &A);
+    let mut bench = Bench::with_branch();
     bench.says(2, 2, &[(0, 1000), (4, 100)], false);
     bench.join(4, 2, &A);
     bench.grant(2, 2, &A);
@@ -538,11 +544,7 @@ fn a_link_is_never_fed_from_an_older_way_again() {
 
 #[test]
 fn a_sink_that_does_not_find_the_better_way_is_cut_in_the_end() {
-    let mut bench = Bench::new();
-    bench.with_proxies();
-    bench.with_owner_behind(5000, 9000);
-    bench.join(4, 1, &A);
-    bench.grant(1, 1, &A);
+    let mut bench = Bench::with_branch();
     bench.says(2, 2, &[(0, 1000), (4, 100)], false);
     bench.sent.clear();
     bench.pass(Duration::from_secs(11));
@@ -553,11 +555,7 @@ fn a_sink_that_does_not_find_the_better_way_is_cut_in_the_end() {
 
 #[test]
 fn a_branch_is_cut_with_its_link_and_one_that_waits_when_the_way_changes() {
-    let mut bench = Bench::new();
-    bench.with_proxies();
-    bench.with_owner_behind(5000, 9000);
-    bench.join(4, 1, &A);
-    bench.grant(1, 1, &A);
+    let mut bench = Bench::with_branch();
     bench.link_down(1);
     assert!(bench.told().contains(&(4, "route lost")));
     assert_eq!(bench.entry, None);

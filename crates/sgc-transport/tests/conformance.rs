@@ -1,6 +1,7 @@
 //! What every transport does for its users, over loopback: one suite, run for each scheme.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
+#[macro_use]
 mod support;
 
 use std::sync::Arc;
@@ -11,17 +12,6 @@ use sgc_transport::*;
 use sgc_trust::{CertError, Identity};
 use sgc_wire::{Class, DecodeError, Label, Name, UnixMillis};
 use support::*;
-
-/// Makes a test of each function for each transport.
-macro_rules! each_transport {
-    ($tests:tt: $($scheme:ident)*) => { $(mod $scheme { each_transport!(@ $scheme $tests); })* };
-    (@ $scheme:ident [$($test:ident)*]) => { $(
-        #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-        async fn $test() {
-            super::$test(stringify!($scheme)).await;
-        }
-    )* };
-}
 
 each_transport! {
     [

@@ -3,6 +3,7 @@
 
 #[path = "support/relay.rs"]
 mod relay;
+#[macro_use]
 mod support;
 
 use std::net::SocketAddr;
@@ -13,16 +14,6 @@ use relay::Relay;
 use sgc_transport::*;
 use sgc_wire::Class;
 use support::*;
-
-macro_rules! each_transport {
-    ($tests:tt: $($scheme:ident)*) => { $(mod $scheme { each_transport!(@ $scheme $tests); })* };
-    (@ $scheme:ident [$($test:ident)*]) => { $(
-        #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-        async fn $test() {
-            super::$test(stringify!($scheme)).await;
-        }
-    )* };
-}
 
 each_transport! {
     [

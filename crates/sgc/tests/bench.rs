@@ -3,12 +3,10 @@
 
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code, reason = "there are no programs that are not ours here")]
 mod support;
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, channel};
@@ -16,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
-use support::{command, ip, say};
+use sgc_testkit::netsim::Namespace;
 use tempfile::TempDir;
 
 /// Longest wait for an event, far beyond what any takes.
@@ -26,22 +24,13 @@ static LABS: AtomicU32 = AtomicU32::new(0);
 /// Two fleets' identities, and a network that is nobody else's if there may be one.
 struct Lab {
     dir: TempDir,
-    namespace: Option<String>,
+    namespace: Option<Namespace>,
 }
 
 impl Lab {
     fn new() -> Self {
-        let namespace = format!("sgcb-{}-{}", std::process::id(), LABS.fetch_add(1, Ordering::Relaxed));
-        let made = ip(&["netns", "add", &namespace])
-            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "up"]))
-            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "multicast", "on"]));
-        let namespace = match made {
-            Ok(()) => Some(namespace),
-            Err(why) => {
-                say(&format!("NO NETWORK NAMESPACES ({why}): using this host's network"));
-                None
-            }
-        };
+        let name = format!("sgcb-{}-{}", std::process::id(), LABS.fetch_add(1, Ordering::Relaxed));
+        let namespace = support::own_network(name);
         let lab = Self { dir: tempfile::tempdir().unwrap(), namespace };
         fs::create_dir(lab.tmp()).unwrap();
         for args in [
@@ -64,8 +53,7 @@ impl Lab {
     }
 
     fn sgc(&self, args: &[&str]) -> Command {
-        let program = Path::new(env!("CARGO_BIN_EXE_sgc"));
-        let mut command = command(self.namespace.as_deref(), self.dir.path(), program);
+        let mut command = support::sgc(self.namespace.as_ref(), self.dir.path());
         command.args(args).env("TMPDIR", self.tmp()).env("ROS_DOMAIN_ID", "3");
         command
     }
@@ -79,14 +67,6 @@ impl Lab {
         let args = [&["bench", "run", "--identity", identity][..], args].concat();
         let child = self.sgc(&args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         end_of(child)
-    }
-}
-
-impl Drop for Lab {
-    fn drop(&mut self) {
-        if let Some(namespace) = &self.namespace {
-            let _ = ip(&["netns", "delete", namespace]);
-        }
     }
 }
 

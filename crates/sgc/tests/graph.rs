@@ -3,18 +3,15 @@
 
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code)]
 mod support;
 
 use std::fs;
-use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use serde_json::Value;
-use support::{Peer, command, eventually, ip};
+use sgc_testkit::netsim::Namespace;
+use support::{Peer, Running, eventually};
 
 /// ROS domains: the robot's and the desk's.
 const ROBOT: &str = "81";
@@ -26,24 +23,19 @@ static TURN: Mutex<()> = Mutex::new(());
 struct Lab {
     dir: tempfile::TempDir,
     /// Where nothing but this test is; none where none can be made.
-    namespace: Option<String>,
-    nodes: Vec<(&'static str, Child)>,
+    namespace: Option<Namespace>,
+    nodes: Vec<(&'static str, Running)>,
     _turn: MutexGuard<'static, ()>,
 }
 
 impl Lab {
     fn new(ros: &str) -> Self {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-        let namespace = format!("sgcg-{}", std::process::id());
-        let made = ip(&["netns", "add", &namespace])
-            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "up"]));
-        let namespace = made.is_ok().then_some(namespace);
+        let made = Namespace::create(format!("sgcg-{}", std::process::id()));
+        let namespace = support::namespaces(made, "using this host's network");
         let dir = tempfile::tempdir().unwrap();
         let mut lab = Self { dir, namespace, nodes: Vec::new(), _turn: turn };
-        for args in [&["fleet", "create", "lab"][..], &["fleet", "enroll", "robot", "--may-route"]] {
-            assert!(lab.sgc().args(args).status().unwrap().success());
-        }
-        assert!(lab.sgc().args(["fleet", "enroll", "desk"]).status().unwrap().success());
+        support::enroll(lab.dir.path(), ["robot --may-route", "desk"]);
         let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
         let port = socket.local_addr().unwrap().port();
         drop(socket);
@@ -67,38 +59,21 @@ impl Lab {
         lab
     }
 
-    fn sgc(&self) -> Command {
-        let mut sgc =
-            command(self.namespace.as_deref(), self.dir.path(), Path::new(env!("CARGO_BIN_EXE_sgc")));
-        sgc.stdout(Stdio::null());
-        sgc
-    }
-
     fn start(&mut self, name: &'static str) {
-        let log = fs::File::options().create(true).append(true).open(self.dir.path().join("log")).unwrap();
-        let mut sgc = self.sgc();
-        sgc.args(["run", "--print-ready", "-c", &format!("{name}.toml")]);
-        let mut child = sgc.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        assert!(line.contains("ready"), "{name}: {}", self.log());
-        self.nodes.push((name, child));
+        let mut command = support::sgc(self.namespace.as_ref(), self.dir.path());
+        command.args(["run", "-c", &format!("{name}.toml")]);
+        self.nodes.push((name, Running::start(command, &self.dir.path().join("log"))));
     }
 
     /// SIGTERM, and its end.
     fn stop(&mut self, name: &str) {
         let index = self.nodes.iter().position(|(known, _)| *known == name).unwrap();
-        let (_, mut child) = self.nodes.remove(index);
-        kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
-        child.wait().unwrap();
-    }
-
-    fn log(&self) -> String {
-        fs::read_to_string(self.dir.path().join("log")).unwrap_or_default()
+        self.nodes.remove(index).1.end(Signal::TERM);
     }
 
     fn peer(&self, domain: &str, args: &[&str]) -> Peer {
-        let mut peer = command(self.namespace.as_deref(), self.dir.path(), &Peer::program("cyclone"));
+        let program = Peer::program("cyclone");
+        let mut peer = support::command(self.namespace.as_ref(), self.dir.path(), &program);
         let (role, args) = args.split_first().unwrap();
         peer.args([role, "--localhost", "--domain", domain, "--timeout", "150"]).args(args);
         Peer::start(peer)
@@ -113,15 +88,12 @@ impl Lab {
 
 impl Drop for Lab {
     fn drop(&mut self) {
-        for (_, child) in &mut self.nodes {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
+        self.nodes.clear();
         if std::thread::panicking() {
-            support::say(&self.log());
-        }
-        if let Some(namespace) = &self.namespace {
-            let _ = ip(&["netns", "delete", namespace]);
+            support::say_log(
+                "both nodes",
+                &fs::read_to_string(self.dir.path().join("log")).unwrap_or_default(),
+            );
         }
     }
 }

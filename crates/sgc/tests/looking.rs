@@ -3,16 +3,15 @@
 
 #![allow(clippy::unwrap_used)]
 
-#[allow(dead_code, reason = "nobody waits for its peers here")]
 mod support;
 
 use std::fs;
-use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::path::PathBuf;
+use std::process::Output;
 
 use serde_json::Value;
-use support::{Peer, eventually, ip, say};
+use sgc_testkit::netsim::Namespace;
+use support::{Peer, Running, eventually, say, say_log};
 use tempfile::TempDir;
 
 /// Two domains of one network stand for two networks.
@@ -21,42 +20,20 @@ const DOMAINS: [(&str, &str); 2] = [("robot", "93"), ("desk", "94")];
 struct Lab {
     dir: TempDir,
     /// None where namespaces cannot be made.
-    namespace: Option<String>,
-    nodes: Vec<Child>,
+    namespace: Option<Namespace>,
+    nodes: Vec<Running>,
 }
 
 impl Lab {
     fn new() -> Self {
-        let namespace = format!("sgcl-{}", std::process::id());
-        let made = ip(&["netns", "add", &namespace])
-            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "up"]))
-            .and_then(|()| ip(&["-n", &namespace, "link", "set", "lo", "multicast", "on"]));
-        let namespace = match made {
-            Ok(()) => Some(namespace),
-            Err(why) => {
-                say(&format!("NO NETWORK NAMESPACES ({why}): using this host's network"));
-                None
-            }
-        };
-        let lab = Self { dir: tempfile::tempdir().unwrap(), namespace, nodes: Vec::new() };
-        for args in [
-            &["fleet", "create", "lab"][..],
-            &["fleet", "enroll", "robot"],
-            &["fleet", "enroll", "cloud", "--router"],
-            &["fleet", "enroll", "desk"],
-        ] {
-            let output = lab.sgc(args);
-            assert!(output.status.success(), "{output:?}");
-        }
-        lab
-    }
-
-    fn command(&self, program: &Path) -> Command {
-        support::command(self.namespace.as_deref(), self.dir.path(), program)
+        let namespace = support::own_network(format!("sgcl-{}", std::process::id()));
+        let dir = tempfile::tempdir().unwrap();
+        support::enroll(dir.path(), ["robot", "cloud --router", "desk"]);
+        Self { dir, namespace, nodes: Vec::new() }
     }
 
     fn sgc(&self, args: &[&str]) -> Output {
-        self.command(Path::new(env!("CARGO_BIN_EXE_sgc"))).args(args).output().unwrap()
+        support::sgc(self.namespace.as_ref(), self.dir.path()).args(args).output().unwrap()
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -67,17 +44,10 @@ impl Lab {
     fn start(&mut self, node: &str, config: &str) -> Vec<String> {
         let text = format!("identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\n{config}");
         fs::write(self.path(&format!("{node}.toml")), text).unwrap();
-        let log = fs::File::create(self.path(&format!("{node}.log"))).unwrap();
-        let mut command = self.command(Path::new(env!("CARGO_BIN_EXE_sgc")));
-        command.args(["run", "--print-ready", "-c", &format!("{node}.toml")]);
-        let mut child = command.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        self.nodes.push(child);
-        assert!(line.contains("ready"), "{node}: {line} {}", self.log(node));
-        let ready: Value = serde_json::from_str(&line).unwrap();
-        let listen = ready["ready"].as_array().unwrap_or_else(|| panic!("{line}"));
-        listen.iter().map(|url| url.as_str().unwrap().to_owned()).collect()
+        let mut command = support::sgc(self.namespace.as_ref(), self.dir.path());
+        command.args(["run", "-c", &format!("{node}.toml")]);
+        self.nodes.push(Running::start(command, &self.path(&format!("{node}.log"))));
+        self.nodes.last().unwrap().addresses.clone()
     }
 
     fn log(&self, node: &str) -> String {
@@ -93,7 +63,8 @@ impl Lab {
 
     fn peer(&self, node: &str, role: &str, args: &[&str]) -> Peer {
         let domain = DOMAINS.iter().find(|(name, _)| *name == node).unwrap().1;
-        let mut command = self.command(&Peer::program("cyclone"));
+        let program = Peer::program("cyclone");
+        let mut command = support::command(self.namespace.as_ref(), self.dir.path(), &program);
         command.args([role, "--localhost", "--domain", domain, "--timeout", "150", "--topic", "/chatter"]);
         command.args(args);
         Peer::start(command)
@@ -101,10 +72,8 @@ impl Lab {
 
     /// A server of `/add_two_ints`.
     fn server(&self, node: &str) -> Peer {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
         let domain = DOMAINS.iter().find(|(name, _)| *name == node).unwrap().1;
-        let mut command = self.command(&root.join(".venv/bin/python"));
-        command.arg("-B").arg(root.join("tests/peers/py/services.py"));
+        let mut command = support::python(self.namespace.as_ref(), self.dir.path(), "services.py");
         command.args(["server", "--localhost", "--domain", domain, "--timeout", "150"]);
         Peer::start(command)
     }
@@ -142,17 +111,9 @@ impl Lab {
 
 impl Drop for Lab {
     fn drop(&mut self) {
-        for child in &mut self.nodes {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
+        self.nodes.clear();
         if std::thread::panicking() {
-            for node in ["robot", "cloud", "desk"] {
-                say(&format!("--- {node} ---\n{}", self.log(node)));
-            }
-        }
-        if let Some(namespace) = &self.namespace {
-            let _ = ip(&["netns", "delete", namespace]);
+            ["robot", "cloud", "desk"].into_iter().for_each(|node| say_log(node, &self.log(node)));
         }
     }
 }

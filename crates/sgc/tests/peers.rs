@@ -1,260 +1,36 @@
 //! The whole thing between programs that are not ours: Cyclone DDS in Python and Fast DDS in C++, in networks that
 //! share nothing but an `sgc` router (`tests/peers/README.md`).
 //!
-//! Three network namespaces stand for a robot's network, the cloud and an operator's desk; both networks reach the cloud
-//! and nothing routes between them. DDS stays on the loopback interface of each. Where namespaces cannot be made the
-//! tests say so and use two ROS domains of this host instead.
+//! Three network namespaces stand for a robot's network, the cloud and an operator's desk (`support/lab.rs`).
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "support/lab.rs"]
+mod lab;
 mod support;
 
 use std::fs;
-use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process};
+use lab::{Lab, Plan, Site, robot_to_desk};
+use rustix::process::Signal;
 use serde_json::Value;
-use support::{Peer, eventually, ip, say};
-use tempfile::TempDir;
+use support::{Peer, eventually, say};
 
-/// One lab at a time: each fills both processors.
-static TURN: Mutex<()> = Mutex::new(());
-static LABS: AtomicU32 = AtomicU32::new(0);
-
-/// What the names of services begin with here.
-const SERVICES: &str = "/srv/";
+const PLAN: Plan = Plan { name: "sgct", domains: ["91", "92"], peer_life: "120" };
 
 /// How long a client waits for its calls, some tens at most.
 const CALLS_WAIT: Duration = Duration::from_secs(20);
 
 fn service(kind: &str, server: &str, client: &str) -> String {
-    format!("{SERVICES}{kind}_{server}_{client}")
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-enum Site {
-    Robot,
-    Cloud,
-    Desk,
-}
-
-const SITES: [Site; 3] = [Site::Robot, Site::Cloud, Site::Desk];
-
-impl Site {
-    fn name(self) -> &'static str {
-        ["robot", "cloud", "desk"][self as usize]
-    }
-
-    /// Its ROS domain: the same in both networks if those are apart by themselves.
-    fn domain(self, apart: bool) -> &'static str {
-        match (apart, self) {
-            (true, _) => "0",
-            (false, Self::Robot) => "91",
-            (false, _) => "92",
-        }
-    }
-}
-
-struct Lab {
-    dir: TempDir,
-    number: u32,
-    /// False where the kernel or the user cannot make namespaces.
-    apart: bool,
-    nodes: [Option<Child>; 3],
-    _turn: MutexGuard<'static, ()>,
+    format!("/srv/{kind}_{server}_{client}")
 }
 
 impl Lab {
-    /// A fleet, and a node at each site; the robot shares `topics` with the desk.
-    fn new(topics: &[&str]) -> Self {
-        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
-        let number = std::process::id() * 16 % 100_000 + LABS.fetch_add(1, Ordering::Relaxed);
-        let dir = tempfile::tempdir().unwrap();
-        let mut lab = Self { dir, number, apart: false, nodes: [None, None, None], _turn: turn };
-        lab.apart = match lab.make_namespaces() {
-            Ok(()) => true,
-            Err(why) => {
-                say(&format!("NO NETWORK NAMESPACES ({why}): using two ROS domains of this host instead"));
-                lab.remove_namespaces();
-                false
-            }
-        };
-        for args in [
-            &["fleet", "create", "lab"][..],
-            &["fleet", "enroll", "robot"],
-            &["fleet", "enroll", "cloud", "--router"],
-            &["fleet", "enroll", "desk"],
-        ] {
-            let output = lab.sgc(None, args).output().unwrap();
-            assert!(output.status.success(), "{output:?}");
-        }
-        lab.write_configs(topics, "");
-        SITES.into_iter().for_each(|site| lab.start(site));
-        lab
-    }
-
-    fn make_namespaces(&self) -> Result<(), String> {
-        for site in SITES {
-            ip(&["netns", "add", &self.namespace(site)])?;
-            ip(&["-n", &self.namespace(site), "link", "set", "lo", "up"])?;
-        }
-        for (net, site) in [(1, Site::Robot), (2, Site::Desk)] {
-            let (here, cloud) = (self.namespace(site), self.namespace(Site::Cloud));
-            let (near, far) = (format!("sg{}n{net}", self.number), format!("sg{}f{net}", self.number));
-            ip(&[
-                "link", "add", &near, "netns", &here, "type", "veth", "peer", "name", &far, "netns", &cloud,
-            ])?;
-            ip(&["-n", &here, "address", "add", &format!("10.91.{net}.2/24"), "dev", &near])?;
-            ip(&["-n", &cloud, "address", "add", &format!("10.91.{net}.1/24"), "dev", &far])?;
-            ip(&["-n", &here, "link", "set", &near, "up"])?;
-            ip(&["-n", &cloud, "link", "set", &far, "up"])?;
-        }
-        Ok(())
-    }
-
-    fn remove_namespaces(&self) {
-        for site in SITES {
-            let _ = ip(&["netns", "delete", &self.namespace(site)]);
-        }
-    }
-
-    fn namespace(&self, site: Site) -> String {
-        format!("sgct-{}-{}", self.number, site.name())
-    }
-
-    fn cloud_address(&self, from: Site) -> String {
-        let port = 20_000 + self.number % 20_000;
-        match (self.apart, from) {
-            (false, _) => format!("127.0.0.1:{port}"),
-            (true, Site::Robot) => format!("10.91.1.1:{port}"),
-            (true, Site::Desk) => format!("10.91.2.1:{port}"),
-            (true, Site::Cloud) => format!("0.0.0.0:{port}"),
-        }
-    }
-
-    fn write_configs(&self, topics: &[&str], use_extra: &str) {
-        for site in SITES {
-            let address = self.cloud_address(site);
-            let mut text =
-                format!("identity = \"{0}.identity\"\n[admin]\nsocket = \"{0}.sock\"\n", site.name());
-            if site == Site::Cloud {
-                text += &format!("[router]\nlisten = [\"quic://{address}\"]\n");
-            } else {
-                let domain = site.domain(self.apart);
-                text += &format!("[node]\nrouters = [\"quic://{address}\"]\n");
-                text += &format!(
-                    "[ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n"
-                );
-            }
-            for topic in topics {
-                let kind = if topic.starts_with(SERVICES) { "service" } else { "topic" };
-                match site {
-                    Site::Robot => text += &format!("[[share]]\n{kind} = \"{topic}\"\nto = [\"desk\"]\n"),
-                    Site::Desk => {
-                        text += &format!("[[use]]\nfrom = \"robot\"\n{kind} = \"{topic}\"\n{use_extra}");
-                    }
-                    Site::Cloud => {}
-                }
-            }
-            fs::write(self.path(site, "toml"), text).unwrap();
-        }
-    }
-
-    /// Lets the robot share, and the desk use, what this says of both; with both nodes started anew.
-    fn also(&mut self, tables: &str) {
-        for (site, head) in
-            [(Site::Robot, "[[share]]\nto = [\"desk\"]\n"), (Site::Desk, "[[use]]\nfrom = \"robot\"\n")]
-        {
-            let mut text = fs::read_to_string(self.path(site, "toml")).unwrap();
-            tables.lines().for_each(|table| text += &format!("{head}{table}\n"));
-            fs::write(self.path(site, "toml"), text).unwrap();
-            self.kill(site);
-            self.start(site);
-        }
-    }
-
     /// A server or a client, in rmw_cyclonedds' mapping (`tests/peers/README.md`).
     fn service_peer(&self, site: Site, role: &str, args: &[&str]) -> Peer {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-        let mut command = self.command(Some(site), &root.join(".venv/bin/python"));
-        command.arg("-B").arg(root.join("tests/peers/py/services.py"));
-        command.args([role, "--localhost", "--domain", site.domain(self.apart), "--timeout", "170"]);
-        command.args(args);
-        Peer::start(command)
-    }
-
-    fn path(&self, site: Site, kind: &str) -> PathBuf {
-        self.dir.path().join(format!("{}.{kind}", site.name()))
-    }
-
-    /// A command at a site, or on this host where none is given or there are no namespaces.
-    fn command(&self, site: Option<Site>, program: &Path) -> Command {
-        let namespace = site.filter(|_| self.apart).map(|site| self.namespace(site));
-        support::command(namespace.as_deref(), self.dir.path(), program)
-    }
-
-    fn sgc(&self, site: Option<Site>, args: &[&str]) -> Command {
-        let mut command = self.command(site, Path::new(env!("CARGO_BIN_EXE_sgc")));
-        command.args(args);
-        command
-    }
-
-    fn start(&mut self, site: Site) {
-        let log = fs::File::options().create(true).append(true).open(self.path(site, "log")).unwrap();
-        let config = self.path(site, "toml");
-        let mut command = self.sgc(Some(site), &["run", "--print-ready", "-c", config.to_str().unwrap()]);
-        let mut child = command.stdout(Stdio::piped()).stderr(log).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        assert!(line.contains("ready"), "{}: {}", site.name(), self.log(site));
-        self.nodes[site as usize] = Some(child);
-    }
-
-    /// SIGKILL, and its end.
-    fn kill(&mut self, site: Site) {
-        let mut child = self.nodes[site as usize].take().unwrap();
-        child.kill().unwrap();
-        child.wait().unwrap();
-    }
-
-    /// SIGTERM, and its end.
-    fn terminate(&mut self, site: Site) -> ExitStatus {
-        let mut child = self.nodes[site as usize].take().unwrap();
-        kill_process(Pid::from_child(&child), Signal::TERM).unwrap();
-        let mut ended = None;
-        eventually("the node ends", || {
-            ended = child.try_wait().unwrap();
-            ended.is_some()
-        });
-        ended.unwrap()
-    }
-
-    fn pid(&self, site: Site) -> u32 {
-        self.nodes[site as usize].as_ref().unwrap().id()
-    }
-
-    fn log(&self, site: Site) -> String {
-        fs::read_to_string(self.path(site, "log")).unwrap_or_default()
-    }
-
-    fn status(&self, site: Site) -> Value {
-        let socket = self.path(site, "sock");
-        let output =
-            self.sgc(None, &["status", "--json", "--socket", socket.to_str().unwrap()]).output().unwrap();
-        serde_json::from_slice(&output.stdout).unwrap_or(Value::Null)
-    }
-
-    fn peer(&self, site: Site, vendor: &str, role: &str, args: &[&str]) -> Peer {
-        let mut command = self.command(Some(site), &Peer::program(vendor));
-        command
-            .args([role, "--localhost", "--domain", site.domain(self.apart), "--timeout", "120"])
-            .args(args);
-        Peer::start(command)
+        let common = [role, "--localhost", "--domain", self.domain(site), "--timeout", "170"];
+        self.python(site, "services.py", &[&common, args].concat())
     }
 
     /// [`Self::try_to_carry`]. Seen once: the Fast DDS peer counted as intact a message with a number
@@ -369,30 +145,9 @@ impl Lab {
     }
 }
 
-impl Drop for Lab {
-    fn drop(&mut self) {
-        if std::thread::panicking() {
-            for site in SITES {
-                let status = self.status(site);
-                say(&format!("--- {}: {} {}", site.name(), status["routes"], status["drops"]));
-            }
-        }
-        for child in self.nodes.iter_mut().flatten() {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
-        if std::thread::panicking() {
-            SITES.into_iter().for_each(|s| say(&format!("--- {} ---\n{}", s.name(), self.log(s))));
-        }
-        if self.apart {
-            self.remove_namespaces();
-        }
-    }
-}
-
 #[test]
 fn every_vendor_reaches_every_vendor_through_a_router() {
-    let lab = Lab::new(&["/string", "/image", "/custom"]);
+    let lab = Lab::with_topics(PLAN, ["/string", "/image", "/custom"]);
     for from in ["cyclone", "fastdds"] {
         for to in ["cyclone", "fastdds"] {
             lab.carries(from, to, "string", &[], 30, 20);
@@ -419,14 +174,14 @@ fn every_vendor_calls_services_of_every_vendor_through_a_router() {
     // A service of its own for each, so that no client meets a server that is on its way out.
     let mut names: Vec<_> = pairs().map(|(server, client)| service("add", server, client)).collect();
     names.push(service("blob", "fastdds", "fastdds"));
-    let lab = Lab::new(&names.iter().map(String::as_str).collect::<Vec<_>>());
+    let lab = Lab::new(PLAN, robot_to_desk("service", &names));
     pairs().for_each(|(server, client)| lab.calls(server, client, "add", &[], 30));
     lab.calls("fastdds", "fastdds", "blob", &["--size", "50001"], 10);
 }
 
 #[test]
 fn late_subscribers_and_a_late_node_get_the_latched_message_once() {
-    let mut lab = Lab::new(&["/string"]);
+    let mut lab = Lab::with_topics(PLAN, ["/string"]);
     lab.kill(Site::Desk);
     let latched = ["--type", "string", "--topic", "/string", "--transient-local", "--depth", "1"];
     for vendor in ["cyclone", "fastdds"] {
@@ -453,7 +208,7 @@ fn late_subscribers_and_a_late_node_get_the_latched_message_once() {
 
 #[test]
 fn the_flow_resumes_after_every_kill_and_restart_without_a_duplicate() {
-    let mut lab = Lab::new(&["/string"]);
+    let mut lab = Lab::with_topics(PLAN, ["/string"]);
     let common = ["--type", "string", "--topic", "/string"];
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
     listener.wait("ready", |e| e["event"] == "ready");
@@ -487,7 +242,7 @@ fn the_flow_resumes_after_every_kill_and_restart_without_a_duplicate() {
 
 #[test]
 fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_once() {
-    let mut lab = Lab::new(&["/string"]);
+    let mut lab = Lab::with_topics(PLAN, ["/string"]);
     let common = ["--type", "string", "--topic", "/string"];
     // Cyclone, because Fast DDS notices the end of a Cyclone writer only when its lease is over, also without us.
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
@@ -512,7 +267,7 @@ fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_on
     );
     listener.wait("its messages", |e| e["event"] == "received" && e["seq"].as_u64() >= Some(3010));
     let begun = Instant::now();
-    let status = lab.terminate(Site::Robot);
+    let status = lab.end(Site::Robot, Signal::TERM);
     assert!(status.success(), "{status}: {}", lab.log(Site::Robot));
     listener.wait("the end", |e| e["event"] == "matched" && e["count"] == 0);
     assert!(begun.elapsed() < Duration::from_secs(9), "not withdrawn, but lost and held for ten seconds");
@@ -525,12 +280,8 @@ fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_on
 
 #[test]
 fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
-    let lab = Lab::new(&["/string"]);
-    let resident = || {
-        let status = fs::read_to_string(format!("/proc/{}/status", lab.pid(Site::Cloud))).unwrap();
-        let line = status.lines().find(|l| l.starts_with("VmRSS")).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
-    };
+    let lab = Lab::with_topics(PLAN, ["/string"]);
+    let resident = || lab.node(Site::Cloud).held().resident_kb;
     lab.carries("cyclone", "fastdds", "string", &[], 20, 10);
     let before = resident();
     for args in [&["fleet", "create", "evil"][..], &["fleet", "enroll", "mallory", "--fleet", "evil.fleet"]] {
@@ -540,12 +291,12 @@ fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
     let args = ["run", "--identity", "mallory.identity", "--router", &url, "--use", "robot:/string"];
     let mut command = lab.sgc(Some(Site::Desk), &args);
     command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF");
-    let log = fs::File::create(lab.dir.path().join("mallory.log")).unwrap();
+    let log = fs::File::create(lab.dir().join("mallory.log")).unwrap();
     let mut mallory = command.stderr(log).spawn().unwrap();
     let refused = |kind: &str| lab.status(Site::Cloud)["refused"][kind].as_u64().unwrap_or(0);
     eventually("the other fleet is counted", || refused("other_ca") > 0);
     assert!(lab.log(Site::Cloud).contains("is refused"), "{}", lab.log(Site::Cloud));
-    let told = || fs::read_to_string(lab.dir.path().join("mallory.log")).unwrap();
+    let told = || fs::read_to_string(lab.dir().join("mallory.log")).unwrap();
     eventually("the other fleet is told", || {
         told().contains("of another fleet") || told().contains("different fleets")
     });
@@ -559,8 +310,8 @@ fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
          for n in range(20000):\n b=random.randbytes(random.choice([1,20,60,1200,1400]))\n\
          \x20if n%3==0: b=bytes([0xc3,0,0,0,1,8])+b\n s.sendto(b,({host:?},{port}))\n"
     );
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../.venv/bin/python");
-    let mut python = lab.command(Some(Site::Robot), &python);
+    let python = support::repository(".venv/bin/python");
+    let mut python = support::command(lab.namespace(Site::Robot), lab.dir(), &python);
     assert!(python.args(["-c", &script]).status().unwrap().success());
     lab.carries("fastdds", "cyclone", "string", &[], 20, 10);
     let after = resident();
@@ -569,10 +320,9 @@ fn another_fleet_and_garbage_are_refused_counted_and_harm_nobody() {
 
 #[test]
 fn types_that_do_not_agree_and_topics_that_never_appear_are_named() {
-    let mut lab = Lab::new(&["/string", "/never"]);
-    lab.write_configs(&["/string", "/never"], "type = \"sensor_msgs/msg/Image\"\n");
-    lab.kill(Site::Desk);
-    lab.start(Site::Desk);
+    let [robot, desk] = robot_to_desk("topic", ["/string", "/never"]);
+    let desk = desk.replace("[[use]]\n", "[[use]]\ntype = \"sensor_msgs/msg/Image\"\n");
+    let lab = Lab::new(PLAN, [robot, desk]);
     let _talker = lab.peer(Site::Robot, "cyclone", "pub", &["--type", "string", "--topic", "/string"]);
     eventually("the mismatch is said", || {
         let log = lab.log(Site::Desk);
@@ -594,19 +344,13 @@ fn types_that_do_not_agree_and_topics_that_never_appear_are_named() {
 
 #[test]
 fn two_nodes_on_one_network_make_no_loop() {
-    let mut lab = Lab::new(&["/string"]);
+    let mut lab = Lab::with_topics(PLAN, ["/string"]);
     // The desk's node moves into the robot's network.
     lab.kill(Site::Desk);
-    let text = fs::read_to_string(lab.path(Site::Desk, "toml")).unwrap();
-    let domain = |site: Site| format!("domain_id = {}", site.domain(lab.apart));
-    let text = text
-        .replace(&lab.cloud_address(Site::Desk), &lab.cloud_address(Site::Robot))
-        .replace(&domain(Site::Desk), &domain(Site::Robot));
-    fs::write(lab.path(Site::Desk, "toml"), text).unwrap();
-    let config = lab.path(Site::Desk, "toml");
-    let log = fs::File::create(lab.path(Site::Desk, "log")).unwrap();
-    let mut command = lab.sgc(Some(Site::Robot), &["run", "-c", config.to_str().unwrap()]);
-    lab.nodes[Site::Desk as usize] = Some(command.stderr(log).spawn().unwrap());
+    lab.reconfigure(Site::Desk, &lab.cloud_address(Site::Desk), &lab.cloud_address(Site::Robot));
+    let domain = |site| format!("domain_id = {}", lab.domain(site));
+    lab.reconfigure(Site::Desk, &domain(Site::Desk), &domain(Site::Robot));
+    lab.start_at(Site::Desk, Site::Robot);
     let common = ["--type", "string", "--topic", "/string"];
     let mut listener = lab.peer(
         Site::Robot,
@@ -637,8 +381,7 @@ fn two_nodes_on_one_network_make_no_loop() {
 
 #[test]
 fn services_of_a_far_network_are_called_as_if_they_were_near() {
-    let mut lab = Lab::new(&[]);
-    lab.also("service = \"/add_two_ints\"");
+    let mut lab = Lab::new(PLAN, robot_to_desk("service", ["/add_two_ints"]));
     let answered = |client: &mut Peer, n: u64| {
         let answer = client.wait(&format!("answer {n}"), |e| e["event"] == "answer" && e["n"] == n);
         assert_eq!(answer["right"], true, "{answer}");
@@ -684,8 +427,7 @@ fn services_of_a_far_network_are_called_as_if_they_were_near() {
 
 #[test]
 fn an_action_of_a_far_network_reports_and_ends_and_can_be_cancelled() {
-    let mut lab = Lab::new(&[]);
-    lab.also("action = \"/fibonacci\"");
+    let lab = Lab::new(PLAN, robot_to_desk("action", ["/fibonacci"]));
     let name = ["--name", "/fibonacci"];
     let mut server =
         lab.service_peer(Site::Robot, "action-server", &[&name[..], &["--step", "0.1"]].concat());
@@ -709,7 +451,7 @@ fn an_action_of_a_far_network_reports_and_ends_and_can_be_cancelled() {
 
 #[test]
 fn the_router_never_holds_what_it_carries() {
-    let lab = Lab::new(&["/string"]);
+    let lab = Lab::with_topics(PLAN, ["/string"]);
     let common = ["--type", "string", "--topic", "/string"];
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());
     let publish = [&common[..], &["--rate", "50", "--size", "4000"]].concat();
@@ -722,13 +464,17 @@ fn the_router_never_holds_what_it_carries() {
     let words: [&[u8]; 4] = [b" fill=", b"std_msgs", b"rt/string", b"dds_::String_"];
     for word in words {
         assert!(
-            holds(lab.pid(Site::Robot), word),
+            holds(lab.node(Site::Robot).pid(), word),
             "{:?} not even in the robot's node",
             String::from_utf8_lossy(word)
         );
     }
     for word in words.into_iter().chain([&b"robot.identity"[..], b"\"desk\""]) {
-        assert!(!holds(lab.pid(Site::Cloud), word), "the router holds {:?}", String::from_utf8_lossy(word));
+        assert!(
+            !holds(lab.node(Site::Cloud).pid(), word),
+            "the router holds {:?}",
+            String::from_utf8_lossy(word)
+        );
     }
     talker.end();
     listener.end();

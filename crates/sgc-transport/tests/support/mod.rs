@@ -19,6 +19,18 @@ use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::{Class, HOP_LIMIT, Name, Packet, PacketHeader, Payload, SourceId, UnixMillis};
 use tokio::sync::mpsc;
 
+/// Makes a test of each function for each transport.
+#[allow(unused_macros)]
+macro_rules! each_transport {
+    ($tests:tt: $($scheme:ident)*) => { $(mod $scheme { each_transport!(@ $scheme $tests); })* };
+    (@ $scheme:ident [$($test:ident)*]) => { $(
+        #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+        async fn $test() {
+            super::$test(stringify!($scheme)).await;
+        }
+    )* };
+}
+
 pub const MINUTE: u64 = 60_000;
 
 pub fn now() -> UnixMillis {

@@ -7,8 +7,9 @@
 use std::fs;
 use std::time::{Duration, Instant};
 
-use crate::lab::{Lab, Site, environment, held};
+use crate::lab::{Lab, Site};
 use crate::support::{eventually, say};
+use crate::{PLAN, environment, python};
 
 const NODES: u64 = 20;
 const SHARED: u64 = 10;
@@ -38,13 +39,11 @@ fn carried(lab: &Lab) -> u64 {
 fn a_busy_network_costs_little_and_its_silence_next_to_nothing() {
     let (nodes, shared) = (environment("SGC_GRAPH_NODES", NODES), environment("SGC_GRAPH_SHARED", SHARED));
     let seconds = environment("SGC_GRAPH_SECONDS", SECONDS);
-    let topics: Vec<_> = (0..shared).map(|n| format!("/shared/n{n}")).collect();
-    let topics: Vec<_> = topics.iter().map(String::as_str).collect();
-    let (robot, desk) = Lab::topics(&topics);
-    let lab = Lab::new(&robot, &desk);
-    let pid = lab.pid(Site::Robot);
-    let (before, begun, idle) = (held(pid), Instant::now(), busy(pid));
-    let mut many = lab.python(Site::Robot, "busy.py", &[&nodes.to_string(), &shared.to_string()]);
+    let lab = Lab::with_topics(PLAN, (0..shared).map(|n| format!("/shared/n{n}")));
+    let node = lab.node(Site::Robot);
+    let pid = node.pid();
+    let (before, begun, idle) = (node.held(), Instant::now(), busy(pid));
+    let mut many = python(&lab, Site::Robot, "busy.py", &[&nodes.to_string(), &shared.to_string()]);
     let made = many.wait("all endpoints", |e| e["event"] == "ready")["endpoints"].as_u64().unwrap();
     let made_after = begun.elapsed();
     let granted = || {
@@ -65,7 +64,7 @@ fn a_busy_network_costs_little_and_its_silence_next_to_nothing() {
     std::thread::sleep(Duration::from_secs(seconds));
     let lasted = since.elapsed();
     let (cpu, bytes) = (busy(pid) - cpu, carried(&lab) - bytes);
-    let after = held(pid);
+    let after = node.held();
     let per_second = bytes as f64 / lasted.as_secs_f64();
     let endpoint_kb = (after.resident_kb - before.resident_kb) / made;
     say(&format!(

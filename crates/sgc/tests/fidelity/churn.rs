@@ -10,8 +10,10 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::lab::{Lab, Observer, SITES, Site, environment, held};
+use crate::lab::{Lab, SITES, Site, robot_to_desk, share, uses};
+use crate::observer::Observer;
 use crate::support::{PATIENCE, Peer, eventually, say};
+use crate::{PLAN, environment};
 
 const SEED: u64 = 6;
 const STEPS: u32 = 20;
@@ -168,11 +170,10 @@ fn nothing_is_left_of_what_came_and_went() {
     let seed = environment("SGC_CHURN_SEED", SEED);
     let steps = environment("SGC_CHURN_STEPS", STEPS.into());
     let mut rng = Rng(seed);
-    let share = |topic: &str, to: &str| format!("[[share]]\ntopic = \"{topic}\"\nto = [\"{to}\"]\n");
-    let uses = |topic: &str, from: &str| format!("[[use]]\nfrom = \"{from}\"\ntopic = \"{topic}\"\n");
-    let robot = share("/string", "desk") + &share("/latched", "desk") + &uses("/command", "desk");
-    let desk = uses("/string", "robot") + &uses("/latched", "robot") + &share("/command", "robot");
-    let mut lab = Lab::new(&robot, &desk);
+    let [mut robot, mut desk] = robot_to_desk("topic", ["/string", "/latched"]);
+    robot += &uses("topic", "/command", "desk");
+    desk += &share("topic", "/command", "robot");
+    let mut lab = Lab::new(PLAN, [robot, desk]);
     let mut apps = vec![
         App::new(Site::Robot, "cyclone", "pub", "/string", false),
         App::new(Site::Robot, "fastdds", "pub", "/latched", true),
@@ -181,13 +182,13 @@ fn nothing_is_left_of_what_came_and_went() {
         App::new(Site::Desk, "cyclone", "sub", "/latched", true),
         App::new(Site::Desk, "fastdds", "pub", "/command", false),
     ];
-    let mut observers = [Site::Robot, Site::Desk].map(|site| lab.observer(site));
+    let mut observers = [Site::Robot, Site::Desk].map(|site| Observer::start(&lab, site));
     apps.iter_mut().for_each(|app| app.start(&lab));
     assert_flows(&mut apps);
     let look = |observers: &mut [Observer; 2]| observers.each_mut().map(|o| o.endpoints());
     let (endpoints, known) = (look(&mut observers), routes(&lab));
     say(&format!("churn: seed {seed}, {steps} steps, endpoints {endpoints:?}"));
-    let begun = SITES.map(|site| held(lab.pid(site)));
+    let begun = SITES.map(|site| lab.node(site).held());
     for step in 0..steps {
         let signal = if rng.below(2) == 0 { Signal::KILL } else { Signal::TERM };
         // Programs more often than nodes, so that these live through many of them.
@@ -236,7 +237,7 @@ fn nothing_is_left_of_what_came_and_went() {
         );
     }
     for (site, before) in SITES.into_iter().zip(&begun) {
-        let after = held(lab.pid(site));
+        let after = lab.node(site).held();
         say(&format!("churn: {} held {before:?}, then {after:?}", site.name()));
         assert!(
             after.resident_kb < before.resident_kb + RESIDENT_MORE_KB_MAX,

@@ -1,6 +1,8 @@
 //! What is not shared does not cross, in either direction, discovery included, whatever the other side asks for.
 
-use crate::lab::{Lab, Site};
+use crate::PLAN;
+use crate::lab::{self, Lab, Site};
+use crate::observer::Observer;
 use crate::support::{Peer, eventually};
 
 fn talker(lab: &Lab, site: Site, topic: &str) -> Peer {
@@ -11,15 +13,15 @@ fn talker(lab: &Lab, site: Site, topic: &str) -> Peer {
 #[test]
 fn a_network_shows_what_is_used_and_nothing_else() {
     // To this desk, to somebody else, and to nobody; one of which the desk has no use for.
-    let share = |topic: &str, to: &str| format!("[[share]]\ntopic = \"{topic}\"\nto = [\"{to}\"]\n");
+    let share = |topic: &str, to: &str| lab::share("topic", topic, to);
     let robot = share("/used", "desk") + &share("/unused", "desk") + &share("/others", "somebody");
     // The desk asks for all of them, and wants to publish on what it may only hear.
-    let uses = |topic: &str| format!("[[use]]\nfrom = \"robot\"\ntopic = \"{topic}\"\n");
+    let uses = |topic: &str| lab::uses("topic", topic, "robot");
     let publish = |topic: &str| uses(topic) + "publish = true\n";
     let desk =
         uses("/used") + &uses("/others") + &uses("/secret") + &publish("/unused") + &publish("/command");
-    let lab = Lab::new(&robot, &desk);
-    let mut observers = [Site::Robot, Site::Desk].map(|site| lab.observer(site));
+    let lab = Lab::new(PLAN, [robot, desk]);
+    let mut observers = [Site::Robot, Site::Desk].map(|site| Observer::start(&lab, site));
     let _robots = ["/used", "/unused", "/others", "/secret"].map(|topic| talker(&lab, Site::Robot, topic));
     let _desks = ["/unused", "/command", "/private"].map(|topic| talker(&lab, Site::Desk, topic));
     let heard = ["--type", "string", "--topic", "/used", "--verbose"];

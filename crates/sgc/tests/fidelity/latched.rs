@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use rustix::process::Signal;
-
+use crate::PLAN;
 use crate::lab::{Lab, Site};
 use crate::support::{Peer, eventually};
 
@@ -54,8 +53,7 @@ fn heard_nothing_else(mut listener: Peer, expected: usize) {
 
 #[test]
 fn five_nodes_and_two_vendors_latch_on_one_topic() {
-    let (robot, desk) = Lab::topics(&["/tf_static"]);
-    let mut lab = Lab::new(&robot, &desk);
+    let mut lab = Lab::with_topics(PLAN, ["/tf_static"]);
     let mut talkers: Vec<_> = ["cyclone", "fastdds", "cyclone", "fastdds", "cyclone"]
         .into_iter()
         .enumerate()
@@ -65,13 +63,15 @@ fn five_nodes_and_two_vendors_latch_on_one_topic() {
     let mut early = listener(&lab, "cyclone");
     hears(&mut early, (0..5).map(last));
     // The node of those who publish is killed and comes back: who heard it does not hear it again, who is late does.
-    lab.end(Site::Robot, Signal::KILL);
+    lab.kill(Site::Robot);
     lab.start(Site::Robot);
-    eventually("the history is known again", || lab.drops(Site::Desk, "repeated") >= 5);
+    eventually("the history is known again", || {
+        lab.status(Site::Desk)["drops"]["repeated"].as_u64() >= Some(5)
+    });
     let mut late = listener(&lab, "fastdds");
     hears(&mut late, (0..5).map(last));
     // So it is with a router.
-    lab.end(Site::Cloud, Signal::KILL);
+    lab.kill(Site::Cloud);
     // One publisher ends while it is away, and what it latched with it; another takes its place.
     let mut gone = talkers.remove(2);
     gone.end();
@@ -90,9 +90,8 @@ fn five_nodes_and_two_vendors_latch_on_one_topic() {
 
 #[test]
 fn histories_are_as_deep_as_their_publishers() {
-    let (robot, desk) = Lab::topics(&["/tf_static"]);
-    let mut lab = Lab::new(&robot, &desk);
-    lab.end(Site::Desk, Signal::KILL);
+    let mut lab = Lab::with_topics(PLAN, ["/tf_static"]);
+    lab.kill(Site::Desk);
     let _deep = talker(&lab, "cyclone", "40", "0", "60");
     let _map = talker(&lab, "cyclone", "1", "1000", "10");
     let _all = talker(&lab, "cyclone", "0", "2000", "30");

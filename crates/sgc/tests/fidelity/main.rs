@@ -6,9 +6,27 @@
 mod busy;
 mod churn;
 mod isolation;
+#[path = "../support/lab.rs"]
 mod lab;
 mod latched;
+mod observer;
 mod policies;
 mod stall;
 #[path = "../support/mod.rs"]
 mod support;
+
+use lab::{Lab, Plan, Site};
+use support::Peer;
+
+/// Peers live for as long as the longest of these tests.
+const PLAN: Plan = Plan { name: "sgcfi", domains: ["93", "94"], peer_life: "3000" };
+
+/// A Python program of `tests/peers/py`, whose first argument is its domain.
+fn python(lab: &Lab, site: Site, program: &str, args: &[&str]) -> Peer {
+    lab.python(site, program, &[&[lab.domain(site)], args].concat())
+}
+
+/// A number from the environment, for longer runs.
+fn environment(key: &str, otherwise: u64) -> u64 {
+    std::env::var(key).ok().and_then(|v| v.parse().ok()).unwrap_or(otherwise)
+}

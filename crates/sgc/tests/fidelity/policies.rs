@@ -2,19 +2,19 @@
 //! partition.
 
 use crate::lab::{Lab, Site};
+use crate::{PLAN, python};
 
 #[test]
 fn a_publisher_that_falls_silent_is_missed_on_the_far_side() {
-    let (robot, desk) = Lab::topics(&["/pulse"]);
-    let lab = Lab::new(&robot, &desk);
+    let lab = Lab::with_topics(PLAN, ["/pulse"]);
     let policies = ["/pulse", "1500", "2500", "left"];
-    let mut sub = lab.python(Site::Desk, "policies.py", &[&["sub"][..], &policies].concat());
+    let mut sub = python(&lab, Site::Desk, "policies.py", &[&["sub"][..], &policies].concat());
     // Another partition, another deadline: it must not be heard, and it is said why.
-    let mut elsewhere = lab.python(Site::Desk, "policies.py", &["sub", "/pulse", "1000", "2500", "right"]);
+    let mut elsewhere = python(&lab, Site::Desk, "policies.py", &["sub", "/pulse", "1000", "2500", "right"]);
     for peer in [&mut sub, &mut elsewhere] {
         peer.wait("ready", |e| e["event"] == "ready");
     }
-    let mut talker = lab.python(Site::Robot, "policies.py", &[&["pub"][..], &policies].concat());
+    let mut talker = python(&lab, Site::Robot, "policies.py", &[&["pub"][..], &policies].concat());
     for _ in 0..2 {
         sub.wait("a publisher that lives", |e| e["event"] == "liveliness" && e["alive"] == 1);
         for _ in 0..10 {

@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 
-use crate::lab::{Lab, SITES, Site, environment, held};
+use crate::lab::{Lab, SITES, Site};
 use crate::support::{PATIENCE, Peer, say};
+use crate::{PLAN, environment};
 
 const SECONDS: u64 = 6;
 const NODE_SECONDS_MAX: u64 = 8;
@@ -36,8 +37,7 @@ struct Stall {
 
 impl Stall {
     fn new() -> Self {
-        let (robot, desk) = Lab::topics(&["/image", "/string"]);
-        let lab = Lab::new(&robot, &desk);
+        let lab = Lab::with_topics(PLAN, ["/image", "/string"]);
         let of = |kind: &'static str, topic: &'static str| {
             ["--type", kind, "--topic", topic, "--verbose", "--large"]
         };
@@ -57,7 +57,7 @@ impl Stall {
                 peer.wait("what flows", |e| e["event"] == "received");
             }
         }
-        let before = SITES.map(|site| held(lab.pid(site)).resident_kb);
+        let before = SITES.map(|site| lab.node(site).held().resident_kb);
         Self { lab, camera, state, images, states, before }
     }
 
@@ -68,7 +68,7 @@ impl Stall {
         let mut most = [0; 3];
         while Instant::now() < end {
             for (n, site) in SITES.into_iter().enumerate() {
-                let more = held(self.lab.pid(site)).resident_kb.saturating_sub(self.before[n]);
+                let more = self.lab.node(site).held().resident_kb.saturating_sub(self.before[n]);
                 assert!(more < RESIDENT_MORE_KB_MAX, "{} holds {more} kB more than before", site.name());
                 most[n] = most[n].max(more);
             }
@@ -120,11 +120,11 @@ fn a_subscriber_of_images_that_stands_still_harms_nobody_and_goes_on_with_what_i
 #[test]
 fn a_node_that_stands_still_harms_nobody_and_goes_on_with_what_is_new() {
     let mut stall = Stall::new();
-    stall.lab.signal(Site::Desk, Signal::STOP);
+    stall.lab.node(Site::Desk).signal(Signal::STOP);
     let most = stall.endures(environment("SGC_STALL_SECONDS", SECONDS).min(NODE_SECONDS_MAX));
-    stall.lab.signal(Site::Desk, Signal::CONT);
+    stall.lab.node(Site::Desk).signal(Signal::CONT);
     stall.is_fresh();
-    let after = SITES.map(|site| held(stall.lab.pid(site)).resident_kb);
+    let after = SITES.map(|site| stall.lab.node(site).held().resident_kb);
     say(&format!(
         "stall of a node: robot, cloud and desk held {most:?} kB more at most, {after:?} kB at the end"
     ));

@@ -2,35 +2,33 @@
 //! here is ended here, by its process id, and namespaces go with the lab, also when a test panics.
 
 use std::fs;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use serde_json::Value;
+use sgc_testkit::netsim::{self, Namespace, NetsimError};
 use tempfile::TempDir;
 
 use crate::graph::{Edge, End, Fault, Graph, NODES, Node};
-use crate::support::{self, Peer, ip, say};
+use crate::support::{self, Peer, Running, say_log};
 
 const PORT: u16 = 7447;
 /// Namespaces are `PREFIX-PID-NODE`, so that those of a run that was killed can be told and removed.
 const PREFIX: &str = "sgcring";
 /// How long a node may take to answer what it is asked.
 const STATUS_MAX: Duration = Duration::from_secs(2);
-/// Lines of each log that are shown when a test fails.
-const LOG_LINES: usize = 40;
 
 pub(crate) struct Lab {
     dir: PathBuf,
     /// How many seconds a peer lives at most, should nobody end it.
     peer_life: String,
     _temporary: Option<TempDir>,
-    /// False where the kernel or the user cannot make namespaces.
-    pub(crate) apart: bool,
-    nodes: [Option<Child>; NODES.len()],
+    nodes: [Option<Running>; NODES.len()],
+    /// None where the kernel or the user cannot make them.
+    namespaces: Option<[Namespace; NODES.len()]>,
 }
 
 impl Lab {
@@ -43,67 +41,29 @@ impl Lab {
             None => temporary.as_ref().unwrap().path().to_owned(),
         };
         fs::create_dir_all(&dir).unwrap();
+        remove_abandoned();
         let mut lab = Self {
             dir: dir.canonicalize().unwrap(),
             peer_life: peer_life.as_secs().to_string(),
             _temporary: temporary,
-            apart: false,
             nodes: [const { None }; NODES.len()],
+            namespaces: support::namespaces(make_namespaces(), "one host, and no link is cut"),
         };
-        remove_abandoned();
-        lab.apart = match lab.make_namespaces() {
-            Ok(()) => true,
-            Err(why) => {
-                say(&format!("NO NETWORK NAMESPACES ({why}): one host, and no link is cut"));
-                lab.remove_namespaces();
-                false
-            }
-        };
-        lab.good(&["fleet", "create", "lab"]);
-        for node in NODES {
-            let enroll = ["fleet", "enroll", node.name(), "--router"];
-            lab.good(&enroll[..if node.is_router() { 4 } else { 3 }]);
-            lab.write_config(node, topics);
-        }
+        let members =
+            NODES.map(|node| format!("{}{}", node.name(), if node.is_router() { " --router" } else { "" }));
+        support::enroll(&lab.dir, members.iter().map(String::as_str));
+        NODES.into_iter().for_each(|node| lab.write_config(node, topics));
         NODES.into_iter().for_each(|node| lab.start(node));
         lab
     }
 
-    fn make_namespaces(&self) -> Result<(), String> {
-        for node in NODES {
-            ip(&["netns", "add", &namespace(node)])?;
-            ip(&["-n", &namespace(node), "link", "set", "lo", "up"])?;
-        }
-        for edge in Edge::all() {
-            let [dialling, listening] =
-                [End::Dialling, End::Listening].map(|end| (namespace(edge.end(end)), interface(edge, end)));
-            ip(&[
-                "link",
-                "add",
-                &dialling.1,
-                "netns",
-                &dialling.0,
-                "type",
-                "veth",
-                "peer",
-                "name",
-                &listening.1,
-                "netns",
-                &listening.0,
-            ])?;
-            for (end, (namespace, interface)) in [(End::Dialling, dialling), (End::Listening, listening)] {
-                let address = format!("{}/24", address(edge, end));
-                ip(&["-n", &namespace, "address", "add", &address, "dev", &interface])?;
-                ip(&["-n", &namespace, "link", "set", &interface, "up"])?;
-            }
-        }
-        Ok(())
+    /// False where networks are not apart, since there are no namespaces.
+    pub(crate) fn is_apart(&self) -> bool {
+        self.namespaces.is_some()
     }
 
-    fn remove_namespaces(&self) {
-        for node in NODES {
-            let _ = ip(&["netns", "delete", &namespace(node)]);
-        }
+    fn namespace(&self, node: Node) -> Option<&Namespace> {
+        self.namespaces.as_ref().map(|namespaces| &namespaces[node.0])
     }
 
     fn write_config(&self, node: Node, topics: &[&str]) {
@@ -135,7 +95,7 @@ impl Lab {
     }
 
     fn listens_at(&self, router: Node) -> String {
-        if self.apart {
+        if self.is_apart() {
             format!("0.0.0.0:{PORT}")
         } else {
             let base = 20_000 + std::process::id() % 2000 * 8;
@@ -144,7 +104,7 @@ impl Lab {
     }
 
     fn url(&self, edge: Edge) -> String {
-        if self.apart {
+        if self.is_apart() {
             format!("quic://{}:{PORT}", address(edge, End::Listening))
         } else {
             format!("quic://{}", self.listens_at(edge.end(End::Listening)))
@@ -153,39 +113,22 @@ impl Lab {
 
     /// The ROS domain at a proxy: the same everywhere if networks are apart by themselves.
     fn domain(&self, proxy: Node) -> String {
-        if self.apart { "0".to_owned() } else { (85 + proxy.0).to_string() }
+        if self.is_apart() { "0".to_owned() } else { (85 + proxy.0).to_string() }
     }
 
     pub(crate) fn path(&self, node: Node, kind: &str) -> PathBuf {
         self.dir.join(format!("{}.{kind}", node.name()))
     }
 
-    fn command(&self, node: Option<Node>, program: &Path) -> Command {
-        let namespace = node.filter(|_| self.apart).map(namespace);
-        support::command(namespace.as_deref(), &self.dir, program)
-    }
-
-    fn good(&self, args: &[&str]) {
-        let output = self.command(None, sgc()).args(args).output().unwrap();
-        assert!(output.status.success(), "{output:?}");
-    }
-
     fn start(&mut self, node: Node) {
-        let log = fs::File::options().create(true).append(true).open(self.path(node, "log")).unwrap();
-        let mut command = self.command(Some(node), sgc());
-        command.args(["run", "--print-ready", "--until-stdin-closes", "-c"]).arg(self.path(node, "toml"));
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).spawn().unwrap();
-        let stdout = child.stdout.take().unwrap();
-        // Kept before anything can fail, so that it is ended.
-        self.nodes[node.0] = Some(child);
-        let mut line = String::new();
-        BufReader::new(stdout).read_line(&mut line).unwrap();
-        assert!(line.contains("ready"), "{node:?}: {}", self.log(node));
+        let mut command = support::sgc(self.namespace(node), &self.dir);
+        command.args(["run", "-c"]).arg(self.path(node, "toml"));
+        self.nodes[node.0] = Some(Running::start(command, &self.path(node, "log")));
     }
 
     /// A peer in a proxy's network.
     pub(crate) fn peer(&self, proxy: Node, vendor: &str, role: &str, args: &[&str]) -> Peer {
-        let mut command = self.command(Some(proxy), &Peer::program(vendor));
+        let mut command = support::command(self.namespace(proxy), &self.dir, &Peer::program(vendor));
         command.args([role, "--localhost", "--domain", &self.domain(proxy), "--timeout", &self.peer_life]);
         command.args(args);
         Peer::start(command)
@@ -197,9 +140,7 @@ impl Lab {
                 ends.iter().for_each(|end| self.set_interface(*edge, *end, "down"));
             }
             Fault::Kill { router, .. } => {
-                let mut child = self.nodes[router.0].take().unwrap();
-                child.kill().unwrap();
-                child.wait().unwrap();
+                self.nodes[router.0].take().unwrap().end(Signal::KILL);
             }
             Fault::Stop { .. } | Fault::Isolate { cut: false, .. } => {
                 fault.routers().into_iter().for_each(|router| self.signal(router, Signal::STOP));
@@ -231,17 +172,17 @@ impl Lab {
     }
 
     fn set_interface(&self, edge: Edge, end: End, state: &str) {
-        ip(&["-n", &namespace(edge.end(end)), "link", "set", &interface(edge, end), state]).unwrap();
+        let namespace = self.namespace(edge.end(end)).unwrap();
+        namespace.ip(&["link", "set", &interface(edge), state]).unwrap();
     }
 
     fn signal(&self, node: Node, signal: Signal) {
-        kill_process(Pid::from_child(self.nodes[node.0].as_ref().unwrap()), signal).unwrap();
+        self.nodes[node.0].as_ref().unwrap().signal(signal);
     }
 
     /// Nodes that ended by themselves since they were asked last.
     pub(crate) fn fallen(&mut self) -> Vec<Node> {
-        let fallen =
-            |child: &mut Option<Child>| child.as_mut().is_some_and(|c| c.try_wait().unwrap().is_some());
+        let fallen = |node: &mut Option<Running>| node.as_mut().is_some_and(|n| n.try_end().is_some());
         NODES.into_iter().filter(|node| fallen(&mut self.nodes[node.0])).collect()
     }
 
@@ -270,7 +211,7 @@ impl Lab {
             let dialled = links(dialling).iter().any(|link| link["url"] == url.as_str());
             // Without namespaces nothing tells who a link that was accepted is from.
             let remote = format!("{}:", address(edge, End::Dialling));
-            let accepted = !self.apart
+            let accepted = !self.is_apart()
                 || links(listening)
                     .iter()
                     .any(|link| link["remote"].as_str().is_some_and(|r| r.starts_with(&remote)));
@@ -281,7 +222,7 @@ impl Lab {
 
     /// Resident memory of a node in kB; nothing if it is not running.
     pub(crate) fn resident(&self, node: Node) -> Option<u64> {
-        let pid = self.nodes[node.0].as_ref()?.id();
+        let pid = self.nodes[node.0].as_ref()?.pid();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
         let line = status.lines().find(|line| line.starts_with("VmRSS"))?;
         line.split_whitespace().nth(1)?.parse().ok()
@@ -299,35 +240,31 @@ impl Lab {
 
 impl Drop for Lab {
     fn drop(&mut self) {
-        for child in self.nodes.iter_mut().flatten() {
-            let _ = child.kill();
-            let _ = child.wait();
-        }
+        self.nodes = [const { None }; NODES.len()];
         if std::thread::panicking() {
-            for node in NODES {
-                let log = self.log(node);
-                let lines: Vec<_> = log.lines().collect();
-                let tail = &lines[lines.len().saturating_sub(LOG_LINES)..];
-                say(&format!("--- {node:?}, last of {} lines ---\n{}", lines.len(), tail.join("\n")));
-            }
-        }
-        if self.apart {
-            self.remove_namespaces();
+            NODES.into_iter().for_each(|node| say_log(node.name(), &self.log(node)));
         }
     }
 }
 
-fn sgc() -> &'static Path {
-    Path::new(env!("CARGO_BIN_EXE_sgc"))
+fn make_namespaces() -> Result<[Namespace; NODES.len()], NetsimError> {
+    let mut made = Vec::new();
+    for node in NODES {
+        made.push(Namespace::create(format!("{PREFIX}-{}-{}", std::process::id(), node.name()))?);
+    }
+    for edge in Edge::all() {
+        let interface = interface(edge);
+        let [dialling, listening] =
+            [End::Dialling, End::Listening].map(|end| format!("{}/24", address(edge, end)));
+        let [near, far] = [End::Dialling, End::Listening].map(|end| &made[edge.end(end).0]);
+        near.veth((&interface, &[&dialling]), far, (&interface, &[&listening]))?;
+    }
+    Ok(made.try_into().unwrap())
 }
 
-fn namespace(node: Node) -> String {
-    format!("{PREFIX}-{}-{}", std::process::id(), node.name())
-}
-
-/// At most 15 characters, and no other's while it is being moved to its namespace.
-fn interface(edge: Edge, end: End) -> String {
-    format!("sg{}e{}{}", std::process::id() % 1_000_000, edge.0, if end == End::Dialling { "d" } else { "l" })
+/// The same at both ends, which are not in one namespace.
+fn interface(edge: Edge) -> String {
+    format!("edge{}", edge.0)
 }
 
 fn address(edge: Edge, end: End) -> String {
@@ -336,12 +273,12 @@ fn address(edge: Edge, end: End) -> String {
 
 /// Namespaces of runs whose process is gone without having removed them: killed, or ended from the terminal.
 fn remove_abandoned() {
-    let Ok(output) = Command::new("ip").args(["netns", "list"]).output() else { return };
-    for line in String::from_utf8_lossy(&output.stdout).lines() {
+    let Ok(list) = netsim::ip(&["netns", "list"]) else { return };
+    for line in list.lines() {
         let name = line.split_whitespace().next().unwrap_or_default();
         let pid = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').nth(1));
         if pid.is_some_and(|pid| pid.parse::<u32>().is_ok() && !Path::new("/proc").join(pid).exists()) {
-            let _ = ip(&["netns", "delete", name]);
+            let _ = netsim::ip(&["netns", "delete", name]);
         }
     }
 }

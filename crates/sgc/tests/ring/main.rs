@@ -200,7 +200,7 @@ impl Run {
     }
 
     fn chaos(&mut self, seed: u64, time: Duration) {
-        let mut chaos = Chaos::new(seed, self.lab.apart);
+        let mut chaos = Chaos::new(seed, self.lab.is_apart());
         self.begun = Instant::now();
         loop {
             let (after, act) = chaos.next();

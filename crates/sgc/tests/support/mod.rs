@@ -1,49 +1,84 @@
-//! What the tests with network namespaces and programs that are not ours have in common: commands in a namespace, and
-//! the peers of `tests/peers/README.md`.
+//! What the tests with network namespaces and programs that are not ours have in common: namespaces, commands in them, nodes
+//! as processes, and the peers of `tests/peers/README.md`.
 
+#![allow(dead_code, reason = "each test program uses a part")]
+
+use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use sgc_testkit::netsim::{Namespace, NetsimError};
 
 /// Longest wait for an event, far beyond what any takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// Lines of each log that are shown when a test fails.
+const LOG_LINES: usize = 40;
 
 /// To the terminal, past the test harness, which shows nothing of a test that passes.
 pub(crate) fn say(text: &str) {
     let _ = writeln!(std::io::stderr(), "{text}");
 }
 
-/// Runs `ip` of iproute2; what it complained of.
-pub(crate) fn ip(args: &[&str]) -> Result<(), String> {
-    let output = Command::new("ip").args(args).output().map_err(|e| format!("ip: {e}"))?;
-    if output.status.success() {
-        Ok(())
-    } else {
-        Err(String::from_utf8_lossy(&output.stderr).trim().to_owned())
-    }
+/// Says how a log ends.
+pub(crate) fn say_log(whose: &str, log: &str) {
+    let lines: Vec<_> = log.lines().collect();
+    let tail = &lines[lines.len().saturating_sub(LOG_LINES)..];
+    say(&format!("--- {whose}, last of {} lines ---\n{}", lines.len(), tail.join("\n")));
+}
+
+/// Namespaces, or nothing where the kernel or the user cannot make them; which is said, and what is used `instead`.
+pub(crate) fn namespaces<T>(made: Result<T, NetsimError>, instead: &str) -> Option<T> {
+    made.inspect_err(|why| say(&format!("NO NETWORK NAMESPACES ({why}): {instead}"))).ok()
+}
+
+/// A network of the test's own, its loopback interface with multicast, or nothing, as [`namespaces`] says.
+pub(crate) fn own_network(name: String) -> Option<Namespace> {
+    let made = Namespace::create(name);
+    let made = made.and_then(|own| own.ip(&["link", "set", "lo", "multicast", "on"]).map(|_| own));
+    namespaces(made, "using this host's network")
+}
+
+/// A file of this repository.
+pub(crate) fn repository(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap().join(file)
 }
 
 /// A command in a namespace, or on this host, in a directory and with nothing of our environment but `PATH` and
 /// `SGC_LOG`. Its process is the program's own: `ip` replaces itself by it.
-pub(crate) fn command(namespace: Option<&str>, dir: &Path, program: &Path) -> Command {
-    let mut command = match namespace {
-        Some(namespace) => {
-            let mut command = Command::new("ip");
-            command.args(["netns", "exec", namespace]).arg(program);
-            command
-        }
-        None => Command::new(program),
-    };
+pub(crate) fn command(namespace: Option<&Namespace>, dir: &Path, program: &Path) -> Command {
+    let mut command = namespace.map_or_else(|| Command::new(program), |namespace| namespace.command(program));
     let path = std::env::var_os("PATH").unwrap();
     command.env_clear().env("PATH", path).env("XDG_RUNTIME_DIR", dir);
     command.envs(std::env::var_os("SGC_LOG").map(|level| ("SGC_LOG", level)));
     command.current_dir(dir).stdin(Stdio::null());
     command
+}
+
+/// The same of the program that is tested.
+pub(crate) fn sgc(namespace: Option<&Namespace>, dir: &Path) -> Command {
+    command(namespace, dir, Path::new(env!("CARGO_BIN_EXE_sgc")))
+}
+
+/// The same of a Python program of `tests/peers/py`.
+pub(crate) fn python(namespace: Option<&Namespace>, dir: &Path, program: &str) -> Command {
+    let mut command = command(namespace, dir, &repository(".venv/bin/python"));
+    command.arg("-B").arg(repository("tests/peers/py").join(program));
+    command
+}
+
+/// The files of the fleet `lab` in a directory, and of its members: each a name, and what enrolling it takes besides.
+pub(crate) fn enroll<'a>(dir: &Path, members: impl IntoIterator<Item = &'a str>) {
+    let good = |command: &str| {
+        let output = sgc(None, dir).args(command.split_whitespace()).output().unwrap();
+        assert!(output.status.success(), "{command}: {output:?}");
+    };
+    good("fleet create lab");
+    members.into_iter().for_each(|member| good(&format!("fleet enroll {member}")));
 }
 
 /// Waits for what will be so within [`PATIENCE`].
@@ -55,6 +90,83 @@ pub(crate) fn eventually(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
+/// A node as a process of its own, which is ended with this.
+pub(crate) struct Running {
+    child: Child,
+    /// What it listens on.
+    pub(crate) addresses: Vec<String>,
+}
+
+impl Running {
+    /// Starts one and waits until it is up; its log is appended to a file.
+    pub(crate) fn start(mut command: Command, log: &Path) -> Self {
+        let file = fs::File::options().create(true).append(true).open(log).unwrap();
+        command.args(["--print-ready", "--until-stdin-closes"]);
+        let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(file).spawn().unwrap();
+        let mut node = Self { child, addresses: Vec::new() };
+        let mut line = String::new();
+        BufReader::new(node.child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let said: Value = serde_json::from_str(&line).unwrap_or_default();
+        let Some(addresses) = said["ready"].as_array() else {
+            panic!("{line} {}", fs::read_to_string(log).unwrap_or_default());
+        };
+        node.addresses = addresses.iter().map(|address| address.as_str().unwrap().to_owned()).collect();
+        node
+    }
+
+    /// SIGKILL or SIGTERM, and what it ended with.
+    pub(crate) fn end(mut self, signal: Signal) -> ExitStatus {
+        self.signal(signal);
+        let mut ended = None;
+        eventually("the node ends", || {
+            ended = self.try_end();
+            ended.is_some()
+        });
+        ended.unwrap()
+    }
+
+    /// What it ended with, if it did.
+    pub(crate) fn try_end(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().unwrap()
+    }
+
+    /// A signal to a node that goes on living.
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// What it has of the system now.
+    pub(crate) fn held(&self) -> Held {
+        let pid = self.pid();
+        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        let number = |key: &str| {
+            let line = status.lines().find(|l| l.starts_with(key)).unwrap();
+            line.split_whitespace().nth(1).unwrap().parse().unwrap()
+        };
+        let fds = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count();
+        Held { resident_kb: number("VmRSS:"), fds, threads: number("Threads:") as usize }
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// What a process has of the system.
+#[derive(Debug)]
+pub(crate) struct Held {
+    pub(crate) resident_kb: u64,
+    pub(crate) fds: usize,
+    pub(crate) threads: usize,
+}
+
 /// A program that is not ours.
 pub(crate) struct Peer {
     child: Child,
@@ -64,10 +176,9 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
-    /// The program of a vendor, `"cyclone"` or `"fastdds"`.
+    /// The program of a vendor, `"cyclone"`, `"fastdds"` or `"rustdds"`.
     pub(crate) fn program(vendor: &str) -> PathBuf {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap();
-        let program = root.join(".peers").join(vendor);
+        let program = repository(".peers").join(vendor);
         assert!(program.exists(), "{} is missing: run `make peers`", program.display());
         program
     }

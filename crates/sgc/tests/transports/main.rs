@@ -14,7 +14,6 @@ mod flow;
 mod lab;
 mod node;
 mod real;
-#[allow(dead_code, reason = "namespaces are made in another way here")]
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -1,16 +1,12 @@
 //! The program and the applications of others, rather than nodes and networks in this process.
 
-use std::fs::File;
-use std::io::{BufRead, BufReader};
-use std::process::{Child, Stdio};
-use std::sync::Arc;
 use std::thread::sleep;
 
 use serde_json::Value;
 use sgc_testkit::netsim::Namespace;
 
 use crate::lab::{Lab, Lan, Nat, RANGES, schemes};
-use crate::support::{self, Peer, eventually};
+use crate::support::{self, Peer, Running, eventually};
 use crate::{CALM, can_run, is_long, turn};
 
 /// How many seconds a peer lives at most.
@@ -18,42 +14,17 @@ const PEER_LIFE: &str = "180";
 /// How many seconds the publisher stays, so that what was lost can be asked for.
 const HOLD: &str = "60";
 
-/// `sgc run` until it is dropped.
-struct Program {
-    child: Child,
+fn run(lab: &Lab, namespace: &Namespace, node: &str) -> Running {
+    let mut command = support::sgc(Some(namespace), lab.dir());
+    command.args(["run", "-c"]).arg(lab.path(&format!("{node}.toml")));
+    Running::start(command, &lab.path(&format!("{node}.log")))
 }
 
-impl Program {
-    fn start(lab: &Lab, namespace: &Arc<Namespace>, node: &str) -> Self {
-        let program = std::path::Path::new(env!("CARGO_BIN_EXE_sgc"));
-        let mut command = support::command(Some(namespace.name()), lab.dir(), program);
-        command.args(["run", "--print-ready", "--until-stdin-closes", "-c"]);
-        command.arg(lab.path(&format!("{node}.toml")));
-        let log = File::create(lab.path(&format!("{node}.log"))).unwrap();
-        let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).spawn().unwrap();
-        let mut program = Self { child };
-        let mut line = String::new();
-        BufReader::new(program.child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let log = std::fs::read_to_string(lab.path(&format!("{node}.log"))).unwrap();
-        assert!(line.contains("ready"), "{node}: {log}");
-        program
-    }
-}
-
-impl Drop for Program {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn peer(lab: &Lab, namespace: &Arc<Namespace>, role: &str, vendor: &str, args: &[&str]) -> Peer {
-    let mut command = support::command(Some(namespace.name()), lab.dir(), &Peer::program(vendor));
+fn peer(lab: &Lab, namespace: &Namespace, role: &str, vendor: &str, args: &[&str]) -> Peer {
+    let mut command = support::command(Some(namespace), lab.dir(), &Peer::program(vendor));
     command.args([role, "--localhost", "--domain", "0", "--timeout", PEER_LIFE, "--depth", "0"]);
-    Peer::start({
-        command.args(args);
-        command
-    })
+    command.args(args);
+    Peer::start(command)
 }
 
 /// Both ends behind NATs, one of which forgets; in the short run over the first transport alone.
@@ -76,9 +47,9 @@ fn programs_of_others_lose_nothing_when_a_nat_forgets() {
         lab.router_config();
         lab.write_config("robot", &[&url], &format!("{ros}[[share]]\n{topic}to = [\"desk\"]\n"));
         lab.write_config("desk", &[&url], &format!("{ros}[[use]]\n{topic}from = \"robot\"\n"));
-        let _cloud = Program::start(&lab, &lab.cloud, "cloud");
-        let _robot = Program::start(&lab, &lab.robot, "robot");
-        let _desk = Program::start(&lab, &lab.desk, "desk");
+        let _cloud = run(&lab, &lab.cloud, "cloud");
+        let _robot = run(&lab, &lab.robot, "robot");
+        let _desk = run(&lab, &lab.desk, "desk");
 
         let mut listener = peer(&lab, &lab.desk, "sub", "fastdds", &["--verbose"]);
         let control = ["--wait-go", "--wait-stop", "--hold", HOLD, "--rate", "50", "--verbose"];

@@ -7,6 +7,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "../support/lab.rs"]
 mod lab;
 #[path = "../support/mod.rs"]
 mod support;
@@ -14,9 +15,12 @@ mod support;
 use std::collections::BTreeMap;
 use std::fmt;
 
-use lab::{Lab, Site};
+use lab::{Lab, Plan, Site, robot_to_desk};
 use serde_json::Value;
-use support::{eventually, say};
+use sgc_testkit::netsim::Namespace;
+use support::{Peer, eventually, say};
+
+const PLAN: Plan = Plan { name: "sgcv", domains: ["93", "94"], peer_life: "60" };
 
 const VENDORS: [&str; 3] = ["cyclone", "fastdds", "rustdds"];
 /// The small ones first: those of a pair of vendors run at one time.
@@ -119,7 +123,6 @@ impl Case {
         ];
         options.push(if self.reliable { "--reliable" } else { "--best-effort" }.into());
         options.extend(self.latched.then(|| "--transient-local".into()));
-        options.extend(["--timeout".to_owned(), "60".into()]);
         options
     }
 
@@ -218,7 +221,7 @@ fn every_vendor_reaches_every_vendor_with_every_type_and_quality() {
     cases.retain(|case| (all || case.is_in_the_short_run()) && case.to_string().contains(&only));
     let far = if asked == "direct" { Site::Robot } else { Site::Desk };
     let shared: Vec<String> = cases.iter().filter(|_| asked != "direct").map(Case::topic).collect();
-    let lab = Lab::new(&shared);
+    let lab = Lab::with_topics(PLAN, &shared);
 
     let mut outcomes = BTreeMap::new();
     let mut failures = Vec::new();
@@ -276,7 +279,7 @@ fn table(outcomes: &BTreeMap<Case, Outcome>) -> String {
 
 #[test]
 fn xcdr2_stays_xcdr2_and_a_reader_that_cannot_take_it_is_named() {
-    let lab = Lab::new(&["/two".to_owned()]);
+    let lab = Lab::with_topics(PLAN, ["/two"]);
     let same = ["--type", "custom", "--topic", "/two"];
     let listen = [&same[..], &["--xcdr2", "--count", "20", "--linger", "0.7"]].concat();
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &listen);
@@ -302,20 +305,45 @@ fn xcdr2_stays_xcdr2_and_a_reader_that_cannot_take_it_is_named() {
     talker.summary();
 }
 
+/// Another host of the robot's network, on a wire that carries no multicast.
+fn hall_beside(robot: &Namespace) -> Namespace {
+    let hall = Namespace::create(format!("{}-hall", robot.name())).unwrap();
+    hall.veth(("robot", &["10.92.3.2/24"]), robot, ("hall", &["10.92.3.1/24"])).unwrap();
+    hall.ip(&["link", "set", "robot", "multicast", "off"]).unwrap();
+    robot.ip(&["link", "set", "hall", "multicast", "off"]).unwrap();
+    hall
+}
+
+/// A peer in the hall, with all that its DDS does by default but shared memory, and what a Cyclone there is configured to.
+fn peer_in_the_hall(lab: &Lab, hall: &Namespace, vendor: &str, args: &[&str]) -> Peer {
+    let mut command = support::command(Some(hall), lab.dir(), &Peer::program(vendor));
+    // As rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, ROS_STATIC_PEERS=10.92.3.1.
+    command.env(
+        "CYCLONEDDS_URI",
+        "<CycloneDDS><Domain Id=\"any\"><General><AllowMulticast>false</AllowMulticast></General><Discovery>\
+         <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>\
+         <Peers><Peer address=\"10.92.3.1\"/><Peer address=\"localhost\"/></Peers></Discovery></Domain></CycloneDDS>",
+    );
+    command.args(["pub", "--udp-only", "--domain", lab.domain(Site::Robot)]).args(args);
+    Peer::start(command)
+}
+
 #[test]
 fn nodes_on_another_host_are_found_by_static_peers_where_no_multicast_passes() {
     let topics: Vec<String> = VENDORS.iter().map(|vendor| format!("/{vendor}")).collect();
-    let mut lab = Lab::silent(&topics, "10.92.3.2");
-    if !lab.apart {
+    let mut lab = Lab::silent(PLAN, robot_to_desk("topic", &topics));
+    let Some(robot) = lab.namespace(Site::Robot) else {
         say("left out: it needs network namespaces");
         return;
-    }
+    };
+    let hall = hall_beside(robot);
+    lab.reconfigure(Site::Robot, "static_peers = []", "static_peers = [\"10.92.3.2\"]");
     // They are there first: the node asks its peers when it starts, and then every 30 s.
     let mut talkers: Vec<_> = VENDORS
         .into_iter()
         .zip(&topics)
         .map(|(vendor, topic)| {
-            let mut talker = lab.peer_in_the_hall(vendor, &["--topic", topic, "--rate", "20"]);
+            let mut talker = peer_in_the_hall(&lab, &hall, vendor, &["--topic", topic, "--rate", "20"]);
             talker.wait("ready", |event| event["event"] == "ready");
             talker
         })
@@ -331,12 +359,12 @@ fn nodes_on_another_host_are_found_by_static_peers_where_no_multicast_passes() {
         assert_eq!(got, [Some(0); 3], "{vendor}: {heard}");
         assert!(heard["received"].as_u64() >= Some(20), "{vendor}: {heard}");
     }
-    talkers.iter_mut().for_each(support::Peer::end);
+    talkers.iter_mut().for_each(Peer::end);
 }
 
 #[test]
 fn fast_dds_as_shipped_reaches_its_own_host_by_shared_memory_and_the_desk_through_us() {
-    let lab = Lab::new(&["/shared".to_owned()]);
+    let lab = Lab::with_topics(PLAN, ["/shared"]);
     let same = ["--type", "image", "--topic", "/shared"];
     let count = [&same[..], &["--count", "10", "--linger", "0.7"]].concat();
     let talk = [&same[..], &["--size", "1000000", "--rate", "10", "--wait-matched", "2"]].concat();

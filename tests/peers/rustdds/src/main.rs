@@ -102,16 +102,8 @@ fn qos(options: &Options) -> QosProfile {
         })
 }
 
-fn run<M: Message>(options: &Options) -> Result<u8, String> {
-    let deadline = Instant::now() + options.timeout;
-    let (sender, events) = channel();
-    let mut signals = signal_hook::iterator::Signals::new([2, 15]).map_err(|e| e.to_string())?;
-    let signal_sender = sender.clone();
-    std::thread::spawn(move || {
-        for _ in signals.forever() {
-            let _ = signal_sender.send(Event::Signal);
-        }
-    });
+/// A node, for as long as something is done with it.
+fn with_node(options: &Options, act: impl FnOnce(Node) -> Result<u8, String>) -> Result<u8, String> {
     let mut participant = DomainParticipantBuilder::new(options.domain);
     if options.localhost {
         participant = participant.with_only_networks([std::net::Ipv4Addr::LOCALHOST]);
@@ -124,23 +116,37 @@ fn run<M: Message>(options: &Options) -> Result<u8, String> {
     let mut node = context.new_node(name, node_options).map_err(|e| format!("{e:?}"))?;
     let spinner = node.spinner().map_err(|e| e.to_string())?;
     let spinning = std::thread::spawn(move || block_on(spinner.spin()));
-    let changes = node.status_receiver().ok_or("no spinner")?;
-    let change_sender = sender.clone();
-    std::thread::spawn(move || {
-        while block_on(changes.recv()).is_ok() {
-            let _ = change_sender.send(Event::Graph);
-        }
-    });
-    let mut peer = Peer { options, node, events, matched: 0, signalled: false, deadline };
-    let code = match options.role {
-        Role::Pub => peer.publish::<M>(sender)?,
-        _ => peer.subscribe::<M>(sender)?,
-    };
+    let code = act(node)?;
     // The participant says farewell when the last who holds it is gone, and the spinner does until it has ended.
-    drop(peer);
     let _ = spinning.join();
     drop(context);
     Ok(code)
+}
+
+fn run<M: Message>(options: &Options) -> Result<u8, String> {
+    let deadline = Instant::now() + options.timeout;
+    let (sender, events) = channel();
+    let mut signals = signal_hook::iterator::Signals::new([2, 15]).map_err(|e| e.to_string())?;
+    let signal_sender = sender.clone();
+    std::thread::spawn(move || {
+        for _ in signals.forever() {
+            let _ = signal_sender.send(Event::Signal);
+        }
+    });
+    with_node(options, |node| {
+        let changes = node.status_receiver().ok_or("no spinner")?;
+        let change_sender = sender.clone();
+        std::thread::spawn(move || {
+            while block_on(changes.recv()).is_ok() {
+                let _ = change_sender.send(Event::Graph);
+            }
+        });
+        let mut peer = Peer { options, node, events, matched: 0, signalled: false, deadline };
+        match options.role {
+            Role::Pub => peer.publish::<M>(sender),
+            _ => peer.subscribe::<M>(sender),
+        }
+    })
 }
 
 struct Peer<'a> {

@@ -6,14 +6,13 @@ use std::time::{Duration, Instant};
 
 use futures::executor::block_on;
 use futures::future::{Either, select};
-use ros2_client::qos::{Durability, History, QosProfile, Reliability, WhenFull};
-use ros2_client::{Context, Message, Name, NodeName, NodeOptions, ServiceMapping, ServiceTypeName};
-use rustdds::DomainParticipantBuilder;
+use ros2_client::service::{Client, Server};
+use ros2_client::{Message, Name, Node, ServiceMapping, ServiceTypeName};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::options::{Options, Role};
-use crate::{INCOMPLETE, WRONG, emit};
+use crate::{INCOMPLETE, WRONG, emit, qos, with_node};
 
 /// `example_interfaces/srv/AddTwoInts`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -44,107 +43,95 @@ const SETTLE: Duration = Duration::from_secs(1);
 
 pub fn run(options: &Options) -> Result<u8, String> {
     let deadline = Instant::now() + options.timeout;
-    let mut participant = DomainParticipantBuilder::new(options.domain);
-    if options.localhost {
-        participant = participant.with_only_networks([std::net::Ipv4Addr::LOCALHOST]);
-    }
-    let participant = participant.build().map_err(|e| e.to_string())?;
-    let context = Context::from_domain_participant(participant).map_err(|e| e.to_string())?;
-    let name =
-        NodeName::new("/", &format!("rustdds_peer_{}", std::process::id())).map_err(|e| e.to_string())?;
-    let node_options = NodeOptions::new().enable_rosout(false).start_parameter_services(false);
-    let mut node = context.new_node(name, node_options).map_err(|e| format!("{e:?}"))?;
-    let spinner = node.spinner().map_err(|e| e.to_string())?;
-    let spinning = std::thread::spawn(move || block_on(spinner.spin()));
-    let (service, kind) =
-        (Name::parse(&options.topic), ServiceTypeName::new("example_interfaces", "AddTwoInts"));
-    let service = service.map_err(|e| e.to_string())?;
-    let qos = QosProfile::publisher_default()
-        .reliability(Reliability::Reliable { when_full: WhenFull::Wait(Duration::from_secs(10)) })
-        .durability(Durability::Volatile)
-        .history(History::KeepLast { depth: options.depth });
-    let mapping = ServiceMapping::Enhanced;
-    let code = match options.role {
+    let name = Name::parse(&options.topic).map_err(|e| e.to_string())?;
+    let kind = ServiceTypeName::new("example_interfaces", "AddTwoInts");
+    let (mapping, qos) = (ServiceMapping::Enhanced, qos(options));
+    with_node(options, |mut node| match options.role {
         Role::Client => {
-            let client = node
-                .create_client::<Request, Response>(mapping, &service, &kind, qos.clone(), qos)
-                .map_err(|e| e.to_string())?;
-            emit("ready", json!({}));
-            let (mut sent, mut answered, mut wrong, mut foreign) = (0, 0, 0, 0);
-            let mut latency_us = Vec::new();
-            if within(deadline, client.wait_for_service(&node)).is_some() {
-                emit("matched", json!({ "count": 1 }));
-                std::thread::sleep(SETTLE);
-                while sent < options.count {
-                    let begun = Instant::now();
-                    let request = ask(options.start + sent);
-                    let right = answer(&request);
-                    let Some(id) = within(deadline, client.async_send_request(request)) else { break };
-                    let id = id.map_err(|e| e.to_string())?;
-                    sent += 1;
-                    let response = loop {
-                        match within(deadline, client.async_receive_response(id)) {
-                            None => break None,
-                            Some(Ok(response)) => break Some(response),
-                            // What it cannot read.
-                            Some(Err(_)) => foreign += 1,
-                        }
-                    };
-                    let Some(response) = response else { break };
-                    answered += 1;
-                    latency_us.push(begun.elapsed().as_micros() as u64);
-                    wrong += u64::from(response != right);
-                    if options.verbose || response != right {
-                        emit("reply", json!({ "seq": options.start + sent - 1, "ok": response == right }));
-                    }
-                    if options.rate > 0.0 {
-                        let due = begun + Duration::from_secs_f64(1.0 / options.rate);
-                        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-                    }
-                }
-            }
-            latency_us.sort_unstable();
-            let p50 = latency_us.get(latency_us.len() / 2).copied().unwrap_or(0);
-            emit(
-                "summary",
-                json!({ "role": "client", "sent": sent, "answered": answered, "wrong": wrong,
-                        "foreign": foreign, "p50_us": p50 }),
-            );
-            match (wrong, answered >= options.count) {
-                (0, true) => 0,
-                (0, false) => INCOMPLETE,
-                _ => WRONG,
-            }
+            let client = node.create_client(mapping, &name, &kind, qos.clone(), qos);
+            call(options, &node, &client.map_err(|e| e.to_string())?, deadline)
         }
         _ => {
-            let server = node
-                .create_server::<Request, Response>(mapping, &service, &kind, qos.clone(), qos)
-                .map_err(|e| e.to_string())?;
-            emit("ready", json!({}));
-            let mut served = 0;
-            while options.count == 0 || served < options.count {
-                match within(deadline, server.async_receive_request()) {
-                    None => break,
-                    Some(Err(error)) => emit("unreadable", json!({ "error": format!("{error:?}") })),
-                    Some(Ok((id, request))) => {
-                        let response = answer(&request);
-                        block_on(server.async_send_response(id, response)).map_err(|e| e.to_string())?;
-                        served += 1;
-                        if options.verbose {
-                            emit("served", json!({ "count": served }));
-                        }
-                    }
+            let server = node.create_server(mapping, &name, &kind, qos.clone(), qos);
+            serve(options, &server.map_err(|e| e.to_string())?, deadline)
+        }
+    })
+}
+
+fn call(
+    options: &Options,
+    node: &Node,
+    client: &Client<Request, Response>,
+    deadline: Instant,
+) -> Result<u8, String> {
+    emit("ready", json!({}));
+    let (mut sent, mut answered, mut wrong, mut foreign) = (0, 0, 0, 0);
+    let mut latency_us = Vec::new();
+    if within(deadline, client.wait_for_service(node)).is_some() {
+        emit("matched", json!({ "count": 1 }));
+        std::thread::sleep(SETTLE);
+        while sent < options.count {
+            let begun = Instant::now();
+            let request = ask(options.start + sent);
+            let right = answer(&request);
+            let Some(id) = within(deadline, client.async_send_request(request)) else { break };
+            let id = id.map_err(|e| e.to_string())?;
+            sent += 1;
+            let response = loop {
+                match within(deadline, client.async_receive_response(id)) {
+                    None => break None,
+                    Some(Ok(response)) => break Some(response),
+                    // What it cannot read.
+                    Some(Err(_)) => foreign += 1,
+                }
+            };
+            let Some(response) = response else { break };
+            answered += 1;
+            latency_us.push(begun.elapsed().as_micros() as u64);
+            wrong += u64::from(response != right);
+            if options.verbose || response != right {
+                emit("reply", json!({ "seq": options.start + sent - 1, "ok": response == right }));
+            }
+            if options.rate > 0.0 {
+                let due = begun + Duration::from_secs_f64(1.0 / options.rate);
+                std::thread::sleep(due.saturating_duration_since(Instant::now()));
+            }
+        }
+    }
+    latency_us.sort_unstable();
+    let p50 = latency_us.get(latency_us.len() / 2).copied().unwrap_or(0);
+    emit(
+        "summary",
+        json!({ "role": "client", "sent": sent, "answered": answered, "wrong": wrong,
+                "foreign": foreign, "p50_us": p50 }),
+    );
+    Ok(match (wrong, answered >= options.count) {
+        (0, true) => 0,
+        (0, false) => INCOMPLETE,
+        _ => WRONG,
+    })
+}
+
+fn serve(options: &Options, server: &Server<Request, Response>, deadline: Instant) -> Result<u8, String> {
+    emit("ready", json!({}));
+    let mut served = 0;
+    while options.count == 0 || served < options.count {
+        match within(deadline, server.async_receive_request()) {
+            None => break,
+            Some(Err(error)) => emit("unreadable", json!({ "error": format!("{error:?}") })),
+            Some(Ok((id, request))) => {
+                let response = answer(&request);
+                block_on(server.async_send_response(id, response)).map_err(|e| e.to_string())?;
+                served += 1;
+                if options.verbose {
+                    emit("served", json!({ "count": served }));
                 }
             }
-            std::thread::sleep(SETTLE);
-            emit("summary", json!({ "role": "server", "served": served, "unmatched": 0 }));
-            if served >= options.count { 0 } else { INCOMPLETE }
         }
-    };
-    drop(node);
-    let _ = spinning.join();
-    drop(context);
-    Ok(code)
+    }
+    std::thread::sleep(SETTLE);
+    emit("summary", json!({ "role": "server", "served": served, "unmatched": 0 }));
+    Ok(if served >= options.count { 0 } else { INCOMPLETE })
 }
 
 /// What a future comes to before a moment.
