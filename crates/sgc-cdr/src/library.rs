@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use crate::defaults::MemberDefault;
 use crate::definition::{Base, Definition, TypeName};
 use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, Struct};
 use crate::parse::{ParseError, parse};
@@ -155,11 +156,13 @@ impl Resolver<'_, '_> {
                 Base::Message(inner) => Element::Struct(self.resolve(inner, Some(name), above)?),
             };
             let shape = field.field_type.shape;
+            let default = field.default.map(|text| MemberDefault::new(&field.field_type, &text));
             members.push(Member {
                 name: Arc::from(field.name),
                 element,
                 shape,
                 field_type: field.field_type,
+                default,
             });
         }
         above.remove(name);
