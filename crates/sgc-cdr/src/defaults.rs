@@ -13,13 +13,16 @@ use crate::value::{Packed, Value, scalar};
 /// A default of a definition.
 #[derive(Clone, Debug)]
 pub(crate) struct MemberDefault {
+    /// As the definition spells it.
+    pub(crate) text: String,
     /// What it means; `None` if it means nothing.
     pub(crate) value: Option<Value>,
 }
 
 impl MemberDefault {
-    pub(crate) fn new(field_type: &FieldType, text: &str) -> Self {
-        Self { value: literal(field_type, text) }
+    pub(crate) fn new(field_type: &FieldType, text: String) -> Self {
+        let value = literal(field_type, &text);
+        Self { text, value }
     }
 }
 
@@ -27,12 +30,12 @@ impl Layout {
     /// The value of a member that is left out.
     pub(crate) fn default_of(&self, member: &Member, budget: &mut Budget) -> Result<Value, ValueError> {
         match &member.default {
-            Some(MemberDefault { value: Some(value) }) => {
+            Some(MemberDefault { value: Some(value), .. }) => {
                 budget.value()?;
                 budget.bytes(content_bytes(value))?;
                 Ok(value.clone())
             }
-            Some(MemberDefault { value: None }) => Err(ValueProblem::Default.into()),
+            Some(MemberDefault { value: None, .. }) => Err(ValueProblem::Default.into()),
             None => self.zero(member, budget),
         }
     }

@@ -13,6 +13,7 @@ mod cbor;
 mod decode;
 mod defaults;
 mod definition;
+mod describe;
 mod encode;
 mod encoding;
 mod fault;
@@ -31,6 +32,7 @@ pub use decode::{DecodeError, VALUES_MAX};
 pub use definition::{
     Base, Constant, DUMMY_MEMBER, Definition, Field, FieldType, Primitive, Shape, TypeName, TypeNameError,
 };
+pub use describe::{DESCRIPTION_BYTES_MAX, DescriptionError};
 pub use encoding::{ByteOrder, CdrVersion, Encoding, Padding, WideUnit};
 pub use fault::{CONTENT_BYTES_MAX, ValueError, ValueProblem};
 pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};

@@ -87,9 +87,14 @@ impl Library {
     /// Adds what a file defines; what was known under those names is replaced.
     pub fn add(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
         for definition in parse(file, text)? {
-            self.definitions.insert(definition.name.clone(), definition);
+            self.define(definition);
         }
         Ok(())
+    }
+
+    /// Adds a definition; what was known under its name is replaced.
+    pub(crate) fn define(&mut self, definition: Definition) {
+        self.definitions.insert(definition.name.clone(), definition);
     }
 
     /// The definition of a type, if it is known.
@@ -156,7 +161,7 @@ impl Resolver<'_, '_> {
                 Base::Message(inner) => Element::Struct(self.resolve(inner, Some(name), above)?),
             };
             let shape = field.field_type.shape;
-            let default = field.default.map(|text| MemberDefault::new(&field.field_type, &text));
+            let default = field.default.map(|text| MemberDefault::new(&field.field_type, text));
             members.push(Member {
                 name: Arc::from(field.name),
                 element,
