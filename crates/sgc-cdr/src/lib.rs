@@ -1,7 +1,7 @@
 //! ROS 2 message definitions, and messages by them: serialised, as values, as JSON and CBOR.
 //!
 //! [`Library`] holds definitions: those that come with ROS 2 ship inside, others are parsed from the text of `.msg`,
-//! `.srv` and `.action` files, which the caller finds. [`Library::layout`] resolves a type to what its CDR looks like.
+//! `.srv`, `.action` and `.idl` files, which the caller finds. [`Library::layout`] resolves a type to what its CDR looks like.
 //! [`Layout::decode`] turns a payload into a [`Value`], which is shown as YAML, JSON or CBOR;
 //! [`Layout::from_json`], [`Layout::from_cbor`] and [`Layout::encode`] go the other way. Where definitions are looked for, and where payloads come from, is for others.
 //!
@@ -19,6 +19,7 @@ mod encoding;
 mod fault;
 mod from_json;
 mod hash;
+mod idl;
 mod json;
 mod layout;
 mod library;
@@ -35,6 +36,7 @@ pub use definition::{
 pub use describe::{DESCRIPTION_BYTES_MAX, DescriptionError};
 pub use encoding::{ByteOrder, CdrVersion, Encoding, Padding, WideUnit};
 pub use fault::{CONTENT_BYTES_MAX, ValueError, ValueProblem};
+pub use idl::parse_idl;
 pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};
 pub use library::{Library, LookUp, TypeError};
 pub use parse::{DEFINITION_BYTES_MAX, ParseError, ParseProblem, parse};
