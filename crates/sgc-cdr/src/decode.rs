@@ -3,15 +3,13 @@
 use bytes::Bytes;
 
 use crate::definition::{Primitive, Shape};
+use crate::encoding::{ENCAPSULATION_BYTES, Encoding, PADDING_BYTES_MAX, Padding, WideUnit};
 use crate::layout::{Element, Layout, Member};
-use crate::value::Value;
+use crate::path;
+use crate::value::{Packed, Value, scalar};
 
-/// Most values in one message; a sequence of octets is one.
+/// Most values in one message; an array or a sequence of primitives is one.
 pub const VALUES_MAX: usize = 4 << 20;
-/// Bytes before the body: representation and options.
-const ENCAPSULATION_BYTES: usize = 4;
-/// Bytes that a payload may be filled up with.
-const PADDING_BYTES_MAX: usize = 3;
 /// Elements that room is made for before they are there.
 const RESERVE_MAX: usize = 1024;
 
@@ -33,13 +31,13 @@ pub enum DecodeError {
     /// It ends too early.
     #[error("it ends in {member}")]
     End {
-        /// The member that is cut.
+        /// The path of the member that is cut: `pose.position.x`.
         member: String,
     },
     /// More elements or units than the definition allows.
     #[error("{member} has {found} elements, and at most {bound} are allowed")]
     Bound {
-        /// The member.
+        /// The path of the member.
         member: String,
         /// Elements it has.
         found: u32,
@@ -49,7 +47,7 @@ pub enum DecodeError {
     /// A `bool` that is neither 0 nor 1.
     #[error("{member} is a bool of {found}")]
     Bool {
-        /// The member.
+        /// The path of the member.
         member: String,
         /// What it is.
         found: u8,
@@ -65,40 +63,62 @@ pub enum DecodeError {
     },
 }
 
-/// How a representation differs from others.
-#[derive(Clone, Copy)]
-struct Encoding {
-    little: bool,
-    /// Version 2: what has 8 bytes is aligned to 4, and collections of what is no primitive say their size.
-    second: bool,
-    /// Structures say their size, and may end early or go on.
-    delimited: bool,
-    /// Bytes of a unit of a `wstring`: vendors disagree.
-    wide_bytes: usize,
+impl DecodeError {
+    fn path(&mut self) -> Option<&mut String> {
+        match self {
+            Self::End { member } | Self::Bound { member, .. } | Self::Bool { member, .. } => Some(member),
+            _ => None,
+        }
+    }
+
+    fn under(mut self, member: &Member) -> Self {
+        if let Some(path) = self.path() {
+            path::under(path, &member.name);
+        }
+        self
+    }
+
+    fn at(mut self, index: usize) -> Self {
+        if let Some(path) = self.path() {
+            path::at(path, index);
+        }
+        self
+    }
 }
 
 impl Layout {
-    /// Decodes a serialised message: encapsulation header and body.
+    /// Decodes a serialised message: encapsulation header and body. Arrays and sequences of primitives share the
+    /// payload's memory.
     pub fn decode(&self, payload: &Bytes) -> Result<Value, DecodeError> {
+        self.decode_as(payload).map(|(value, _)| value)
+    }
+
+    /// Decodes a serialised message, and says how it is written: [`Layout::encode_as`] writes it again as it was, but for
+    /// alignment that is not filled with zeros, texts without the NUL at their end, and members that this definition lacks.
+    pub fn decode_as(&self, payload: &Bytes) -> Result<(Value, Encoding), DecodeError> {
         let short = DecodeError::TooShort { bytes: payload.len() };
         let Some((head, body)) = payload.split_first_chunk::<ENCAPSULATION_BYTES>() else {
             return Err(short);
         };
         let id = u16::from_be_bytes([head[0], head[1]]);
-        let (second, delimited) = match id {
-            0x0000 | 0x0001 => (false, false),
-            0x0006 | 0x0007 => (true, false),
-            0x0008 | 0x0009 => (true, true),
-            _ => return Err(DecodeError::Representation { id }),
-        };
+        let plain = Encoding::of(id).ok_or(DecodeError::Representation { id })?;
+        let said = head[3] & PADDING_BYTES_MAX as u8 != 0;
         let body = payload.slice_ref(body);
-        let decode = |wide_bytes| {
-            let encoding = Encoding { little: id & 1 == 1, second, delimited, wide_bytes };
-            Decoder { layout: self, encoding, body: body.clone(), at: 0, end: body.len(), values: 0 }.run()
+        let decode = |wide| -> Result<_, DecodeError> {
+            let encoding = Encoding { wide, ..plain };
+            let decoder =
+                Decoder { layout: self, encoding, body: body.clone(), at: 0, end: body.len(), values: 0 };
+            let (value, left) = decoder.run()?;
+            let padding = match left {
+                0 => Padding::None,
+                _ if said => Padding::Said,
+                _ => Padding::Silent,
+            };
+            Ok((value, Encoding { padding, ..encoding }))
         };
-        // UTF-16 in four bytes a unit was what Fast CDR 1 and RMWs of its time wrote. Only the whole shows which it is.
-        match decode(2) {
-            Err(first) if self.is_wide() => decode(4).map_err(|_| first),
+        // Which width a `wstring` has, only the whole shows.
+        match decode(WideUnit::Two) {
+            Err(first) if self.is_wide() && !plain.is_second() => decode(WideUnit::Four).map_err(|_| first),
             result => result,
         }
     }
@@ -122,26 +142,27 @@ enum Stop {
     TooManyValues,
 }
 
-impl Stop {
-    fn in_member(self, member: &Member) -> DecodeError {
-        let member = member.name.to_string();
-        match self {
-            Self::End => DecodeError::End { member },
-            Self::Bound { found, bound } => DecodeError::Bound { member, found, bound },
-            Self::Bool(found) => DecodeError::Bool { member, found },
-            Self::TooManyValues => DecodeError::TooManyValues,
+impl From<Stop> for DecodeError {
+    fn from(stop: Stop) -> Self {
+        let member = String::new();
+        match stop {
+            Stop::End => Self::End { member },
+            Stop::Bound { found, bound } => Self::Bound { member, found, bound },
+            Stop::Bool(found) => Self::Bool { member, found },
+            Stop::TooManyValues => Self::TooManyValues,
         }
     }
 }
 
 impl Decoder<'_> {
-    fn run(mut self) -> Result<Value, DecodeError> {
+    /// The value, and how many bytes are behind it.
+    fn run(mut self) -> Result<(Value, usize), DecodeError> {
         let Some(root) = self.layout.structs.len().checked_sub(1) else {
-            return Ok(Value::Record(Vec::new()));
+            return Ok((Value::Record(Vec::new()), 0));
         };
         let value = self.record(root)?;
         match self.body.len() - self.at {
-            0..=PADDING_BYTES_MAX => Ok(value),
+            left @ 0..=PADDING_BYTES_MAX => Ok((value, left)),
             bytes => Err(DecodeError::LeftOver { bytes }),
         }
     }
@@ -151,22 +172,23 @@ impl Decoder<'_> {
         let layout = self.layout;
         let Some(this) = layout.structs.get(place) else { return Ok(Value::Record(Vec::new())) };
         let outer = self.end;
-        if self.encoding.delimited {
+        if self.encoding.is_delimited() {
             let first = this.members.first();
             self.begin_delimited().map_err(|stop| match first {
-                Some(member) => stop.in_member(member),
+                Some(member) => DecodeError::from(stop).under(member),
                 None => DecodeError::TooManyValues,
             })?;
         }
         let mut members = Vec::with_capacity(this.members.len());
         for member in &this.members {
             // A publisher with an older definition leaves out what was added behind.
-            if self.encoding.delimited && self.at == self.end {
+            if self.encoding.is_delimited() && self.at == self.end {
                 break;
             }
-            members.push((member.name.clone(), self.member(member)?));
+            let value = self.member(member).map_err(|error| error.under(member))?;
+            members.push((member.name.clone(), value));
         }
-        if self.encoding.delimited {
+        if self.encoding.is_delimited() {
             self.at = self.end;
             self.end = outer;
         }
@@ -181,18 +203,18 @@ impl Decoder<'_> {
     }
 
     fn member(&mut self, member: &Member) -> Result<Value, DecodeError> {
-        let sized = self.encoding.second && !matches!(member.element, Element::Primitive(_));
+        let sized = self.encoding.is_second() && !matches!(member.element, Element::Primitive(_));
         let outer = self.end;
         if sized && member.shape != Shape::One {
-            self.begin_delimited().map_err(|stop| stop.in_member(member))?;
+            self.begin_delimited()?;
         }
         let count = match member.shape {
             Shape::One => return self.element(member),
             Shape::Array(count) => count,
             Shape::Sequence { bound } => {
-                let found = self.length().map_err(|stop| stop.in_member(member))?;
+                let found = self.length()?;
                 if let Some(bound) = bound.filter(|bound| found > *bound) {
-                    return Err(Stop::Bound { found, bound }.in_member(member));
+                    return Err(Stop::Bound { found, bound }.into());
                 }
                 found
             }
@@ -204,18 +226,42 @@ impl Decoder<'_> {
 
     fn elements(&mut self, member: &Member, count: u32) -> Result<Value, DecodeError> {
         let count = count as usize;
-        if let Element::Primitive(Primitive::Byte | Primitive::Uint8) = member.element {
-            return self.octets(count).map(Value::Octets).map_err(|stop| stop.in_member(member));
+        if let Element::Primitive(primitive) = member.element {
+            return self.packed(primitive, count);
         }
         // Every element has a byte at least.
         if count > self.end - self.at {
-            return Err(Stop::End.in_member(member));
+            return Err(Stop::End.into());
         }
         let mut all = Vec::with_capacity(count.min(RESERVE_MAX));
-        for _ in 0..count {
-            all.push(self.element(member)?);
+        for index in 0..count {
+            all.push(self.element(member).map_err(|error| error.at(index))?);
         }
         Ok(Value::List(all))
+    }
+
+    fn packed(&mut self, primitive: Primitive, count: usize) -> Result<Value, DecodeError> {
+        let size = primitive.bytes();
+        let bytes = count.checked_mul(size).ok_or(Stop::End)?;
+        if count > 0 {
+            self.at = self.at.next_multiple_of(self.encoding.alignment(size)).min(self.end);
+        }
+        let mut octets = self.octets(bytes)?;
+        if matches!(primitive, Primitive::Byte | Primitive::Uint8) {
+            return Ok(Value::Octets(octets));
+        }
+        if size > 1 && !self.encoding.is_little() {
+            let mut turned = octets.to_vec();
+            turned.chunks_exact_mut(size).for_each(<[u8]>::reverse);
+            octets = turned.into();
+        }
+        if let Some(packed) = Packed::new(primitive, octets.clone()) {
+            return Ok(Value::Packed(packed));
+        }
+        // Whole they are: it is a `bool` that is none.
+        let wrong = octets.iter().enumerate().find(|(_, octet)| **octet > 1);
+        let (index, found) = wrong.map_or((0, 0), |(index, octet)| (index, *octet));
+        Err(DecodeError::from(Stop::Bool(found)).at(index))
     }
 
     fn element(&mut self, member: &Member) -> Result<Value, DecodeError> {
@@ -223,55 +269,48 @@ impl Decoder<'_> {
         if self.values > VALUES_MAX {
             return Err(DecodeError::TooManyValues);
         }
-        let value = match member.element {
-            Element::Struct(place) => return self.record(place),
-            Element::Primitive(primitive) => self.primitive(primitive),
-            Element::String { bound } => self.string(bound),
-            Element::WString { bound } => self.wide_string(bound),
-        };
-        value.map_err(|stop| stop.in_member(member))
+        match member.element {
+            Element::Struct(place) => self.record(place),
+            Element::Primitive(primitive) => Ok(self.primitive(primitive)?),
+            Element::String { bound } => Ok(self.string(bound)?),
+            Element::WString { bound } => Ok(self.wide_string(bound)?),
+        }
     }
 
     fn primitive(&mut self, primitive: Primitive) -> Result<Value, Stop> {
-        Ok(match primitive {
-            Primitive::Bool => match self.number::<1>()? {
-                [0] => Value::Bool(false),
-                [1] => Value::Bool(true),
-                [other] => return Err(Stop::Bool(other)),
+        Ok(match primitive.bytes() {
+            1 => match (primitive, self.number::<1>()?) {
+                (Primitive::Bool, [found]) if found > 1 => return Err(Stop::Bool(found)),
+                (_, octet) => scalar(primitive, &octet),
             },
-            Primitive::Byte | Primitive::Uint8 => Value::Uint(u64::from(u8::from_le_bytes(self.number()?))),
-            Primitive::Int8 => Value::Int(i64::from(i8::from_le_bytes(self.number()?))),
-            Primitive::Int16 => Value::Int(i64::from(i16::from_le_bytes(self.number()?))),
-            Primitive::Int32 => Value::Int(i64::from(i32::from_le_bytes(self.number()?))),
-            Primitive::Int64 => Value::Int(i64::from_le_bytes(self.number()?)),
-            Primitive::Uint16 => Value::Uint(u64::from(u16::from_le_bytes(self.number()?))),
-            Primitive::Uint32 => Value::Uint(u64::from(u32::from_le_bytes(self.number()?))),
-            Primitive::Uint64 => Value::Uint(u64::from_le_bytes(self.number()?)),
-            Primitive::Float32 => Value::Float32(f32::from_le_bytes(self.number()?)),
-            Primitive::Float64 => Value::Float64(f64::from_le_bytes(self.number()?)),
+            2 => scalar(primitive, &self.number::<2>()?),
+            4 => scalar(primitive, &self.number::<4>()?),
+            _ => scalar(primitive, &self.number::<8>()?),
         })
     }
 
     fn string(&mut self, bound: Option<u32>) -> Result<Value, Stop> {
         let bytes = self.length()?;
-        let text = self.octets(bytes as usize)?;
+        let mut text = self.octets(bytes as usize)?;
         // Its length counts the NUL that ends it; an empty one may come without.
-        let text = text.strip_suffix(&[0]).unwrap_or(&text);
+        if text.last() == Some(&0) {
+            text.truncate(text.len() - 1);
+        }
         within(text.len(), bound)?;
-        Ok(Value::Text(String::from_utf8_lossy(text).into_owned()))
+        Ok(Value::of_bytes(text))
     }
 
     fn wide_string(&mut self, bound: Option<u32>) -> Result<Value, Stop> {
         let length = self.length()? as usize;
         // Version 2 counts bytes, version 1 units.
-        let units = if self.encoding.second { length / 2 } else { length };
-        let unit_bytes = if self.encoding.second { 2 } else { self.encoding.wide_bytes };
+        let units = if self.encoding.is_second() { length / 2 } else { length };
+        let unit_bytes = self.encoding.wide_bytes();
         let bytes = units.checked_mul(unit_bytes).ok_or(Stop::End)?;
         let raw = self.octets(bytes)?;
         let mut text: Vec<u16> = Vec::with_capacity(units);
         for unit in raw.chunks_exact(unit_bytes) {
             let value = unit.iter().enumerate().fold(0_u32, |value, (index, byte)| {
-                let place = if self.encoding.little { index } else { unit_bytes - 1 - index };
+                let place = if self.encoding.is_little() { index } else { unit_bytes - 1 - index };
                 value | u32::from(*byte) << (8 * place)
             });
             text.push(u16::try_from(value).map_err(|_| Stop::End)?);
@@ -280,7 +319,7 @@ impl Decoder<'_> {
             text.pop();
         }
         within(text.len(), bound)?;
-        Ok(Value::Text(String::from_utf16_lossy(&text)))
+        Ok(Value::of_units(text))
     }
 
     fn length(&mut self) -> Result<u32, Stop> {
@@ -289,13 +328,12 @@ impl Decoder<'_> {
 
     /// A number of so many bytes, aligned to them, the least first.
     fn number<const N: usize>(&mut self) -> Result<[u8; N], Stop> {
-        let alignment = if self.encoding.second { N.min(4) } else { N };
-        let begin = self.at.next_multiple_of(alignment);
+        let begin = self.at.next_multiple_of(self.encoding.alignment(N));
         let end = begin.checked_add(N).filter(|end| *end <= self.end).ok_or(Stop::End)?;
         let mut bytes: [u8; N] =
             self.body.get(begin..end).and_then(|bytes| bytes.try_into().ok()).ok_or(Stop::End)?;
         self.at = end;
-        if !self.encoding.little {
+        if !self.encoding.is_little() {
             bytes.reverse();
         }
         Ok(bytes)
@@ -406,15 +444,18 @@ mod tests {
                 DecodeError::Bound { member: member(), found: 2, bound: 1 },
             ),
             ("uint8 a", b"\0\x09\0\0\xff\0\0\0", DecodeError::End { member: member() }),
+            ("Two a", b"\0\x01\0\0\x01", DecodeError::End { member: "a.b".to_owned() }),
+            ("Two[] a", b"\0\x01\0\0\x01\0\0\0\x01", DecodeError::End { member: "a[0].b".to_owned() }),
+            ("bool[2] a", b"\0\x01\0\0\x01\x02", DecodeError::Bool { member: "a[1]".to_owned(), found: 2 }),
         ] {
             assert_eq!(decode(text, payload), Err(error), "{text}");
         }
         let mut many = b"\0\x01\0\0".to_vec();
         many.extend((VALUES_MAX as u32).to_le_bytes());
         many.resize(many.len() + VALUES_MAX, 0);
-        assert_eq!(decode("int8[] a", &many).unwrap().len(), 7 + VALUES_MAX * 2);
-        many.extend([0; 8]);
-        many[4] = 1;
-        assert_eq!(decode("int8[] a", &many), Err(DecodeError::TooManyValues));
+        // Elements of primitives are one value together.
+        assert!(decode("int8[] a", &many).is_ok());
+        many.extend(vec![0; 3 * VALUES_MAX]);
+        assert_eq!(decode("string[] a", &many), Err(DecodeError::TooManyValues));
     }
 }

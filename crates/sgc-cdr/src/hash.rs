@@ -9,10 +9,24 @@ use crate::definition::{Base, FieldType, Primitive, Shape};
 use crate::layout::{Element, Layout, Struct};
 
 /// Ids of `type_description_interfaces/msg/FieldType`.
-const NESTED: u8 = 1;
-const ARRAY: u8 = 48;
-const BOUNDED_SEQUENCE: u8 = 96;
-const SEQUENCE: u8 = 144;
+pub(crate) const NESTED: u8 = 1;
+pub(crate) const ARRAY: u8 = 48;
+pub(crate) const BOUNDED_SEQUENCE: u8 = 96;
+pub(crate) const SEQUENCE: u8 = 144;
+const PRIMITIVES: [(u8, Primitive); 12] = [
+    (2, Primitive::Int8),
+    (3, Primitive::Uint8),
+    (4, Primitive::Int16),
+    (5, Primitive::Uint16),
+    (6, Primitive::Int32),
+    (7, Primitive::Uint32),
+    (8, Primitive::Int64),
+    (9, Primitive::Uint64),
+    (10, Primitive::Float32),
+    (11, Primitive::Float64),
+    (15, Primitive::Bool),
+    (16, Primitive::Byte),
+];
 
 impl Layout {
     /// The hash that rmw announces for a message of this definition: `RIHS01_` and 64 hexadecimal digits.
@@ -34,7 +48,7 @@ impl Layout {
     }
 
     /// Everything that the type contains, in the order of names.
-    fn referenced(&self) -> BTreeMap<String, &Struct> {
+    pub(crate) fn referenced(&self) -> BTreeMap<String, &Struct> {
         let inner = self.structs.split_last().map_or(&[][..], |(_, inner)| inner);
         inner.iter().map(|inner| (inner.name.to_string(), inner)).collect()
     }
@@ -43,20 +57,8 @@ impl Layout {
 fn describe(text: &mut String, this: &Struct) {
     let _ = write!(text, "{{\"type_name\": \"{}\", \"fields\": [", this.name);
     for (index, member) in this.members.iter().enumerate() {
-        let FieldType { base, shape } = &member.field_type;
-        let (id, string_capacity) = match base {
-            Base::Primitive(primitive) => (id_of(*primitive), 0),
-            Base::String { bound } => bound.map_or((17, 0), |bound| (21, bound)),
-            Base::WString { bound } => bound.map_or((18, 0), |bound| (22, bound)),
-            Base::Message(_) => (NESTED, 0),
-        };
-        let (more, capacity) = match shape {
-            Shape::One => (0, 0),
-            Shape::Array(count) => (ARRAY, *count),
-            Shape::Sequence { bound: Some(bound) } => (BOUNDED_SEQUENCE, *bound),
-            Shape::Sequence { bound: None } => (SEQUENCE, 0),
-        };
-        let nested = match (base, member.element) {
+        let (id, capacity, string_capacity) = ids(&member.field_type);
+        let nested = match (&member.field_type.base, member.element) {
             (Base::Message(name), Element::Struct(_)) => name.to_string(),
             _ => String::new(),
         };
@@ -65,27 +67,36 @@ fn describe(text: &mut String, this: &Struct) {
             text,
             "{separator}{{\"name\": \"{}\", \"type\": {{\"type_id\": {}, \"capacity\": {capacity}, \
              \"string_capacity\": {string_capacity}, \"nested_type_name\": \"{nested}\"}}}}",
-            member.name,
-            id + more,
+            member.name, id,
         );
     }
     text.push_str("]}");
 }
 
-fn id_of(primitive: Primitive) -> u8 {
-    match primitive {
-        Primitive::Int8 => 2,
-        Primitive::Uint8 => 3,
-        Primitive::Int16 => 4,
-        Primitive::Uint16 => 5,
-        Primitive::Int32 => 6,
-        Primitive::Uint32 => 7,
-        Primitive::Int64 => 8,
-        Primitive::Uint64 => 9,
-        Primitive::Float32 => 10,
-        Primitive::Float64 => 11,
-        Primitive::Bool => 15,
-        Primitive::Byte => 16,
+/// Id, capacity and string capacity of a type.
+pub(crate) fn ids(field_type: &FieldType) -> (u8, u32, u32) {
+    let (id, string_capacity) = match &field_type.base {
+        Base::Primitive(primitive) => (primitive.id(), 0),
+        Base::String { bound } => bound.map_or((17, 0), |bound| (21, bound)),
+        Base::WString { bound } => bound.map_or((18, 0), |bound| (22, bound)),
+        Base::Message(_) => (NESTED, 0),
+    };
+    let (more, capacity) = match field_type.shape {
+        Shape::One => (0, 0),
+        Shape::Array(count) => (ARRAY, count),
+        Shape::Sequence { bound: Some(bound) } => (BOUNDED_SEQUENCE, bound),
+        Shape::Sequence { bound: None } => (SEQUENCE, 0),
+    };
+    (id + more, capacity, string_capacity)
+}
+
+impl Primitive {
+    fn id(self) -> u8 {
+        PRIMITIVES.iter().find(|(_, primitive)| *primitive == self).map_or(0, |(id, _)| *id)
+    }
+
+    pub(crate) fn of_id(id: u8) -> Option<Self> {
+        PRIMITIVES.iter().find(|(known, _)| *known == id).map(|(_, primitive)| *primitive)
     }
 }
 

@@ -1,69 +1,123 @@
-//! Values as JSON.
+//! Values as JSON (RFC 8259), in the form of docs/spec/json.md. Reading it is in `from_json`.
 
 use std::fmt::Write as _;
 
-use serde_json::Value as Json;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 
+use crate::definition::DUMMY_MEMBER;
 use crate::value::Value;
 
+/// What stands for a byte of a `string` that is no UTF-8 is this and the byte (Python's `surrogateescape`, PEP 383).
+pub(crate) const ESCAPED_BYTE: u16 = 0xdc00;
+
 impl Value {
-    /// As JSON, in one line: members in their order, 64-bit integers as numbers, and what JSON has no number for as one
-    /// of the texts `"NaN"`, `"Infinity"`, `"-Infinity"`.
+    /// As JSON, in one line: members in their order, 64-bit integers as numbers, octets in base64, and what JSON has no
+    /// number for as one of the texts `"NaN"`, `"Infinity"`, `"-Infinity"`. [`Layout::from_json`](crate::Layout::from_json)
+    /// reads it.
     pub fn to_json(&self) -> String {
         let mut out = String::new();
-        self.write(&mut out);
+        self.write_json(&mut out);
         out
     }
 
-    /// Depth is bounded: layouts are.
-    fn write(&self, out: &mut String) {
-        let _ = match self {
-            Self::Bool(value) => write!(out, "{value}"),
-            Self::Int(value) => write!(out, "{value}"),
-            Self::Uint(value) => write!(out, "{value}"),
-            // The shortest number that is this one as `float32`.
-            Self::Float32(value) if value.is_finite() => write!(out, "{value:?}"),
-            Self::Float64(value) if value.is_finite() => write!(out, "{value:?}"),
-            Self::Float32(value) => write!(out, "\"{}\"", no_number(f64::from(*value))),
-            Self::Float64(value) => write!(out, "\"{}\"", no_number(*value)),
-            Self::Text(text) => write!(out, "{}", Json::from(text.as_str())),
-            Self::Octets(octets) => {
-                out.push('[');
-                for (index, octet) in octets.iter().enumerate() {
-                    let _ = write!(out, "{}{octet}", comma(index));
+    /// Appends it as JSON. Depth is bounded: layouts are.
+    pub fn write_json(&self, out: &mut String) {
+        match self {
+            Self::Bool(value) => write(out, value),
+            Self::Int(value) => write(out, value),
+            Self::Uint(value) => write(out, value),
+            Self::Float32(value) => float(out, value, f64::from(*value)),
+            Self::Float64(value) => float(out, value, *value),
+            Self::Text(text) => quoted(out, |out| escaped(out, text)),
+            Self::Raw(bytes) => quoted(out, |out| {
+                for chunk in bytes.utf8_chunks() {
+                    escaped(out, chunk.valid());
+                    chunk.invalid().iter().for_each(|byte| unit(out, ESCAPED_BYTE + u16::from(*byte)));
                 }
-                write!(out, "]")
-            }
-            Self::List(all) => {
-                out.push('[');
-                for (index, value) in all.iter().enumerate() {
-                    out.push_str(comma(index));
-                    value.write(out);
+            }),
+            Self::Wide(units) => quoted(out, |out| {
+                for c in char::decode_utf16(units.iter().copied()) {
+                    match c {
+                        Ok(c) => escaped(out, c.encode_utf8(&mut [0; 4])),
+                        Err(half) => unit(out, half.unpaired_surrogate()),
+                    }
                 }
-                write!(out, "]")
-            }
+            }),
+            Self::Octets(octets) => quoted(out, |out| STANDARD.encode_string(octets, out)),
+            Self::Packed(packed) => list(out, packed.iter(), |out, value| value.write_json(out)),
+            Self::List(all) => list(out, all, |out, value| value.write_json(out)),
             Self::Record(members) => {
                 out.push('{');
-                for (index, (name, value)) in members.iter().enumerate() {
-                    let _ = write!(out, "{}\"{name}\":", comma(index));
-                    value.write(out);
+                let shown = members.iter().filter(|(name, _)| &**name != DUMMY_MEMBER);
+                for (index, (name, value)) in shown.enumerate() {
+                    out.push_str(if index == 0 { "\"" } else { ",\"" });
+                    out.push_str(name);
+                    out.push_str("\":");
+                    value.write_json(out);
                 }
-                write!(out, "}}")
+                out.push('}');
             }
-        };
+        }
     }
 }
 
-fn comma(index: usize) -> &'static str {
-    if index == 0 { "" } else { "," }
+fn write(out: &mut String, value: &impl std::fmt::Display) {
+    let _ = write!(out, "{value}");
 }
 
-fn no_number(value: f64) -> &'static str {
-    match value {
-        _ if value.is_nan() => "NaN",
-        _ if value > 0.0 => "Infinity",
-        _ => "-Infinity",
+/// The shortest number that is this one in its own type.
+fn float(out: &mut String, value: &impl std::fmt::Debug, wide: f64) {
+    let _ = match wide {
+        _ if wide.is_finite() => write!(out, "{value:?}"),
+        _ if wide.is_nan() => write!(out, "\"NaN\""),
+        _ if wide > 0.0 => write!(out, "\"Infinity\""),
+        _ => write!(out, "\"-Infinity\""),
+    };
+}
+
+fn list<T>(out: &mut String, all: impl IntoIterator<Item = T>, write: impl Fn(&mut String, T)) {
+    out.push('[');
+    for (index, value) in all.into_iter().enumerate() {
+        if index > 0 {
+            out.push(',');
+        }
+        write(out, value);
     }
+    out.push(']');
+}
+
+fn quoted(out: &mut String, write: impl FnOnce(&mut String)) {
+    out.push('"');
+    write(out);
+    out.push('"');
+}
+
+fn escaped(out: &mut String, text: &str) {
+    let mut rest = text;
+    while let Some(at) = rest.find(|c| c < ' ' || c == '"' || c == '\\') {
+        let (plain, after) = rest.split_at(at);
+        out.push_str(plain);
+        let mut after = after.chars();
+        match after.next() {
+            Some('"') => out.push_str("\\\""),
+            Some('\\') => out.push_str("\\\\"),
+            Some('\n') => out.push_str("\\n"),
+            Some('\r') => out.push_str("\\r"),
+            Some('\t') => out.push_str("\\t"),
+            Some(control) => {
+                let _ = write!(out, "\\u{:04x}", u32::from(control));
+            }
+            None => {}
+        }
+        rest = after.as_str();
+    }
+    out.push_str(rest);
+}
+
+/// A unit of UTF-16 by its number.
+fn unit(out: &mut String, unit: u16) {
+    let _ = write!(out, "\\u{unit:04x}");
 }
 
 #[cfg(test)]
@@ -73,6 +127,8 @@ mod tests {
     use bytes::Bytes;
 
     use super::*;
+    use crate::definition::Primitive;
+    use crate::value::Packed;
 
     #[test]
     fn numbers_are_exact_and_short() {
@@ -92,11 +148,22 @@ mod tests {
 
     #[test]
     fn members_keep_their_order() {
+        let packed = Packed::new(Primitive::Int16, Bytes::from_static(&[1, 0, 2, 0])).unwrap();
         let members = vec![
             (Arc::from("z"), Value::Text("\"\n".into())),
             (Arc::from("a"), Value::Octets(Bytes::from_static(&[1, 2]))),
             (Arc::from("m"), Value::List(vec![Value::Bool(true), Value::Record(Vec::new())])),
+            (Arc::from("p"), Value::Packed(packed)),
+            (Arc::from(DUMMY_MEMBER), Value::Uint(0)),
         ];
-        assert_eq!(Value::Record(members).to_json(), r#"{"z":"\"\n","a":[1,2],"m":[true,{}]}"#);
+        assert_eq!(Value::Record(members).to_json(), r#"{"z":"\"\n","a":"AQI=","m":[true,{}],"p":[1,2]}"#);
+    }
+
+    #[test]
+    fn what_is_no_unicode_is_kept() {
+        let raw = Value::Raw(Bytes::from_static(b"a\xff\x01\xc3\xbc\xc3"));
+        assert_eq!(raw.to_json(), "\"a\\udcff\\u0001\u{fc}\\udcc3\"");
+        let wide = Value::Wide(vec![0x61, 0xd83d, 0xde00, 0xd800, 0xdc]);
+        assert_eq!(wide.to_json(), "\"a\u{1f600}\\ud800\u{dc}\"");
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crate::defaults::MemberDefault;
 use crate::definition::{FieldType, Primitive, Shape, TypeName};
 
 /// How deep types may contain each other.
@@ -34,6 +35,8 @@ pub(crate) struct Member {
     pub(crate) shape: Shape,
     /// As the definition has it.
     pub(crate) field_type: FieldType,
+    /// What it is if it is left out, if the definition says so.
+    pub(crate) default: Option<MemberDefault>,
 }
 
 /// One element of a member.

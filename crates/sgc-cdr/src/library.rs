@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use crate::defaults::MemberDefault;
 use crate::definition::{Base, Definition, TypeName};
+use crate::idl::{is_idl, parse_idl};
 use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, Struct};
 use crate::parse::{ParseError, parse};
 
@@ -12,7 +14,8 @@ const COMMON: &str = include_str!("common.txt");
 /// What a file in it begins with.
 const COMMON_HEAD: &str = "== ";
 
-/// Finds the text of the file that defines a type: `std_srvs/srv/SetBool` for `std_srvs/srv/SetBool_Request`.
+/// Finds the text of the file that defines a type, `.idl` or not: `std_srvs/srv/SetBool` for
+/// `std_srvs/srv/SetBool_Request`.
 pub type LookUp<'a> = dyn FnMut(&TypeName) -> Option<String> + 'a;
 
 /// Why a type cannot be decoded.
@@ -86,9 +89,20 @@ impl Library {
     /// Adds what a file defines; what was known under those names is replaced.
     pub fn add(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
         for definition in parse(file, text)? {
-            self.definitions.insert(definition.name.clone(), definition);
+            self.define(definition);
         }
         Ok(())
+    }
+
+    /// Adds what an `.idl` file defines; what was known under those names is replaced.
+    pub fn add_idl(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
+        parse_idl(file, text)?.into_iter().for_each(|definition| self.define(definition));
+        Ok(())
+    }
+
+    /// Adds a definition; what was known under its name is replaced.
+    pub(crate) fn define(&mut self, definition: Definition) {
+        self.definitions.insert(definition.name.clone(), definition);
     }
 
     /// The definition of a type, if it is known.
@@ -115,7 +129,11 @@ impl Library {
         if !self.definitions.contains_key(name) {
             let file = TypeName::new(name.package(), name.kind(), name.file_stem()).ok_or_else(unknown)?;
             let text = look_up(&file).or_else(|| Self::shipped(&file)).ok_or_else(unknown)?;
-            self.add(&file, &text)?;
+            if is_idl(&text) {
+                self.add_idl(&file, &text)?;
+            } else {
+                self.add(&file, &text)?;
+            }
         }
         self.definitions.get(name).ok_or_else(unknown)
     }
@@ -155,11 +173,13 @@ impl Resolver<'_, '_> {
                 Base::Message(inner) => Element::Struct(self.resolve(inner, Some(name), above)?),
             };
             let shape = field.field_type.shape;
+            let default = field.default.map(|text| MemberDefault::new(&field.field_type, text));
             members.push(Member {
                 name: Arc::from(field.name),
                 element,
                 shape,
                 field_type: field.field_type,
+                default,
             });
         }
         above.remove(name);
@@ -195,6 +215,9 @@ mod tests {
         let name = "std_msgs/msg/String".parse().unwrap();
         let layout = Library::empty().layout(&name, &mut |_| Some("int8 a\nint8 b\n".into())).unwrap();
         assert_eq!(layout.structs[0].members.len(), 2);
+        let idl = "module std_msgs { module msg { struct String { int8 a; int8 b; int8 c; }; }; };";
+        let layout = Library::empty().layout(&name, &mut |_| Some(idl.into())).unwrap();
+        assert_eq!(layout.structs[0].members.len(), 3);
     }
 
     #[test]

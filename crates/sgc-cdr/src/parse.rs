@@ -3,11 +3,12 @@
 use crate::definition::{
     Base, Constant, DUMMY_MEMBER, Definition, Field, FieldType, Primitive, Shape, TypeName, is_identifier,
 };
+use crate::fault::short;
 
 /// Longest text that is looked at, bytes.
 pub const DEFINITION_BYTES_MAX: usize = 256 * 1024;
 /// Most members and constants of one message.
-const MEMBERS_MAX: usize = 4096;
+pub(crate) const MEMBERS_MAX: usize = 4096;
 /// What separates request from response, and goal from result from feedback.
 const SEPARATOR: &str = "---";
 
@@ -44,6 +45,14 @@ pub enum ParseProblem {
     /// A constant that cannot be one.
     #[error("{0:?} cannot be a constant: its type is neither a primitive nor a string")]
     Constant(String),
+    /// Something else than what has to stand there, in IDL.
+    #[error("{found:?} stands where {expected} should")]
+    Expected {
+        /// What should.
+        expected: String,
+        /// What does.
+        found: String,
+    },
     /// Not as many parts as the kind has.
     #[error("the definition has {found} parts separated by ---, not {expected}")]
     Parts {
@@ -61,11 +70,7 @@ pub fn parse(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseError>
     if text.len() > DEFINITION_BYTES_MAX {
         return Err(fail(1, ParseProblem::TooLong));
     }
-    let suffixes: &[&str] = match file.kind() {
-        "srv" => &["_Request", "_Response"],
-        "action" => &["_Goal", "_Result", "_Feedback"],
-        _ => &[""],
-    };
+    let suffixes = suffixes(file.kind());
     let mut parts = vec![Part::default()];
     for (index, line) in text.lines().enumerate() {
         let line = line.trim();
@@ -90,25 +95,38 @@ pub fn parse(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseError>
     for (part, suffix) in parts.into_iter().zip(suffixes) {
         all.push(part.finish(named(suffix).ok_or_else(no_name)?));
     }
-    if file.kind() == "action" {
-        for (suffix, fields) in action_messages() {
-            let mut definition = Definition {
-                name: named(suffix).ok_or_else(no_name)?,
-                fields: Vec::new(),
-                constants: Vec::new(),
-            };
-            for (name, field) in fields {
-                let base = match field {
-                    Made::Known(base) => base,
-                    Made::Part(suffix) => Base::Message(named(suffix).ok_or_else(no_name)?),
-                };
-                let field_type = FieldType { base, shape: Shape::One };
-                definition.fields.push(Field { name: name.to_owned(), field_type, default: None });
-            }
-            all.push(definition);
-        }
-    }
+    all.extend(action_definitions(file).ok_or_else(no_name)?);
     Ok(all)
+}
+
+/// What a file of a kind defines, behind its name.
+pub(crate) fn suffixes(kind: &str) -> &'static [&'static str] {
+    match kind {
+        "srv" => &["_Request", "_Response"],
+        "action" => &["_Goal", "_Result", "_Feedback"],
+        _ => &[""],
+    }
+}
+
+/// The messages that ROS 2 makes of an action; none of others. `None` if its name is too long.
+pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
+    let named =
+        |suffix: &str| TypeName::new(file.package(), file.kind(), &format!("{}{suffix}", file.name()));
+    let mut all = Vec::new();
+    let made = if file.kind() == "action" { action_messages() } else { Vec::new() };
+    for (suffix, fields) in made {
+        let mut definition = Definition { name: named(suffix)?, fields: Vec::new(), constants: Vec::new() };
+        for (name, field) in fields {
+            let base = match field {
+                Made::Known(base) => base,
+                Made::Part(suffix) => Base::Message(named(suffix)?),
+            };
+            let field_type = FieldType { base, shape: Shape::One };
+            definition.fields.push(Field { name: name.to_owned(), field_type, default: None });
+        }
+        all.push(definition);
+    }
+    Some(all)
 }
 
 enum Made {
@@ -141,10 +159,11 @@ fn action_messages() -> Vec<(&'static str, Vec<(&'static str, Made)>)> {
     ]
 }
 
+/// A message while it is read.
 #[derive(Default)]
-struct Part {
-    fields: Vec<Field>,
-    constants: Vec<Constant>,
+pub(crate) struct Part {
+    pub(crate) fields: Vec<Field>,
+    pub(crate) constants: Vec<Constant>,
 }
 
 impl Part {
@@ -186,7 +205,7 @@ impl Part {
         Ok(())
     }
 
-    fn finish(mut self, name: TypeName) -> Definition {
+    pub(crate) fn finish(mut self, name: TypeName) -> Definition {
         if self.fields.is_empty() {
             let field_type = FieldType { base: Base::Primitive(Primitive::Uint8), shape: Shape::One };
             self.fields.push(Field { name: DUMMY_MEMBER.to_owned(), field_type, default: None });
@@ -248,10 +267,6 @@ fn field_type(package: &str, text: &str) -> Option<FieldType> {
 fn positive(text: &str) -> Option<u32> {
     let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
     text.parse().ok().filter(|n| digits && *n > 0)
-}
-
-fn short(text: &str) -> String {
-    text.chars().take(80).collect()
 }
 
 #[cfg(test)]
