@@ -113,7 +113,7 @@ mod tests {
         let who = ["direct", "zenoh-tls", "sgc-dtls-standard", "tcp", "sgc-quic-standard"].to_vec();
         let together = |kind| super::together(&kind, who.clone(), |name| (*name).to_owned());
         assert!(together(PathKind::Bare).iter().all(|chunk| chunk.len() == 1));
-        assert_eq!(together(PathKind::Paper), [who.clone()]);
+        assert_eq!(together(PathKind::Paper), std::slice::from_ref(&who));
         assert_eq!(
             together(PathKind::Lossy),
             [&["direct", "sgc-dtls-standard"][..], &["sgc-quic-standard"], &["zenoh-tls", "tcp"]]

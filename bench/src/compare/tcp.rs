@@ -44,7 +44,7 @@ impl Tcp {
         for _ in 0..plan.warm_up {
             round_trip(&mut self.near, &message, &mut answer)?;
         }
-        let mut sample = Sample::default();
+        let mut sample = Sample { patience: plan.patience, ..Sample::default() };
         let begun = Instant::now();
         while sample.round_trips_us.len() < plan.count && begun.elapsed().as_secs_f64() < plan.seconds {
             let took = round_trip(&mut self.near, &message, &mut answer)?;

@@ -35,7 +35,7 @@ pub(crate) fn by_stages<W: Copy + Send, T: Send, R: Send, S: Copy + Sync>(
     start: impl Fn(W) -> Result<T> + Sync,
     measure: impl Fn(T, S) -> Result<(R, Option<T>)> + Sync,
 ) -> Vec<Turn<R>> {
-    let started = abreast(who.iter().copied(), |one| start(one));
+    let started = abreast(who.iter().copied(), start);
     let mut states = Vec::new();
     let mut turns = Vec::new();
     for outcome in started {
