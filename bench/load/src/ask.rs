@@ -110,9 +110,11 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<()> {
     let mut requests: Vec<Option<Request>> = node.readers.iter().map(|_| None).collect();
     let mut filler = Vec::new();
     loop {
+        let mut is_news = true;
         for (number, pending) in requests.iter_mut().enumerate() {
             let mut hellos = Vec::new();
             node.readers[number].take(|message| {
+                is_news = false;
                 match message.data.first_chunk::<ANSWER_BYTES>() {
                     None => hellos.push(message.seq),
                     Some(bytes) => {
@@ -126,6 +128,9 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<()> {
             for seq in hellos {
                 reply(&node, number, seq, &[])?;
             }
+        }
+        if is_news {
+            node.note_matches()?;
         }
         if requests.iter().all(Option::is_some) {
             for (number, request) in requests.iter_mut().enumerate() {

@@ -71,6 +71,12 @@ impl Node {
         }
     }
 
+    /// Takes note of who was found and who left. Until that is done nothing is waited for: what changed stays news.
+    pub(crate) fn note_matches(&self) -> Result<()> {
+        let readers = self.readers.iter().map(Reader::matched);
+        readers.chain(self.writers.iter().map(Writer::matched)).try_for_each(|matched| matched.map(drop))
+    }
+
     /// Says hello on the first topic, and whether anything came back on the first of the other way, an answer to an earlier
     /// hello too: the way may take longer than the time between two.
     pub(crate) fn is_heard(&self, seq: u64) -> Result<bool> {

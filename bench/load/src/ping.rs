@@ -56,7 +56,9 @@ pub(crate) fn pong(args: &PingArgs) -> Result<()> {
     let node = Node::start(&args.common, [args.common.topic.clone()], [args.back.clone()])?;
     loop {
         node.waiter.wait(LONG)?;
+        let mut is_news = true;
         node.readers[0].take(|message| {
+            is_news = false;
             while !node.writers[0].write(&message)? {
                 if matches!(node.orders.next()?, Next::End) {
                     bail!("ended while an answer waits for room");
@@ -64,6 +66,9 @@ pub(crate) fn pong(args: &PingArgs) -> Result<()> {
             }
             Ok(())
         })?;
+        if is_news {
+            node.note_matches()?;
+        }
         match node.orders.next()? {
             Next::Wait => {}
             Next::End => return Ok(()),
