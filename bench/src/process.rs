@@ -118,15 +118,18 @@ impl SgcRouter {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
 
-    /// Waits until it has a route for so many names. Counting them takes the router's time, so it is asked rarely when
-    /// answers are slow.
+    /// Waits until it has a route for so many names, as long as there are ever more. Counting them takes the router's time,
+    /// so it is asked rarely when answers are slow.
     pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
-        let deadline = Instant::now() + PATIENCE;
+        let (mut most, mut deadline) = (0, Instant::now() + PATIENCE);
         loop {
             let asked = Instant::now();
             let routed = self.routed_names()?;
             if routed == names {
                 return Ok(());
+            }
+            if routed > most {
+                (most, deadline) = (routed, asked + PATIENCE);
             }
             if asked > deadline {
                 bail!("the router has {routed} names with a route instead of {names}");

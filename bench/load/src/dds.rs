@@ -360,7 +360,8 @@ impl Waiter {
         // SAFETY: take numbers.
         let (set, bell) =
             unsafe { (dds_create_waitset(participant), dds_create_guardcondition(participant)) };
-        let mut waiter = Self { set: Entity::new(set)?, bell: Entity::new(bell)?, endpoints: Vec::new(), sources: 0 };
+        let mut waiter =
+            Self { set: Entity::new(set)?, bell: Entity::new(bell)?, endpoints: Vec::new(), sources: 0 };
         waiter.attach(waiter.bell.0, OTHER)?;
         Ok(waiter)
     }

@@ -5,11 +5,15 @@
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use serde_json::{Value, json};
+use serde::Deserialize;
+use serde_json::json;
 
 use super::lab::{Lab, PathKind, Side};
-use super::system::{System, Topic};
-use super::{Compare, Figures};
+use super::plan::Breadth;
+use super::program::Program;
+use super::system::{Running, System, Topic};
+use super::turns::by_stages;
+use super::{Compare, Figures, plan};
 use crate::report::Spread;
 
 const REQUEST: &str = "/bench/request";
@@ -41,87 +45,112 @@ const APPLICATIONS: [Application; 4] = [
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     let kinds = [PathKind::Bare, PathKind::Paper, PathKind::Lossy];
     for kind in kinds.into_iter().filter(|kind| compare.wants_path(kind)) {
-        for system in compare.systems() {
-            let name = system.name();
-            if !matches!(kind, PathKind::Bare) && !is_told_apart(&name) {
-                continue;
-            }
-            compare.note(&format!("applications, {}: {name}", kind.name()));
-            if let Err(error) = measure(compare, &kind, &**system, figures) {
-                figures.leave_out(&format!("applications {name} on {}", kind.name()), format!("{error:#}"));
+        let (breadth, why) = match kind {
+            PathKind::Bare => (Breadth::Cross, "what they differ in is in the rows of their own"),
+            _ => (Breadth::Transports, "the path says how long it takes there, and hardly the suite"),
+        };
+        let systems = compare.systems_of(breadth, &format!("applications on {}", kind.name()), why, figures);
+        for together in plan::together(&kind, systems, |system| system.name()) {
+            let names: Vec<_> = together.iter().map(|system| system.name()).collect();
+            compare.note(&format!("applications, {}: {}", kind.name(), names.join(", ")));
+            let turns = by_stages(
+                &together,
+                &APPLICATIONS.each_ref(),
+                |system| Turn::start(compare, &kind, system),
+                |turn, application| {
+                    turn.measure(application, &Plan::of(&kind, application, compare.is_quick()))
+                },
+            );
+            for (name, turn) in names.into_iter().zip(turns) {
+                for (application, answered) in APPLICATIONS.iter().zip(&turn.stages) {
+                    push(figures, &name, &kind, application, answered);
+                }
+                if let Some(error) = turn.error {
+                    figures
+                        .leave_out(&format!("applications {name} on {}", kind.name()), format!("{error:#}"));
+                }
             }
         }
     }
     Ok(())
 }
 
-/// Where the path says how long it takes, suites and a router beside it make no difference: of SGC one row for each
-/// transport is enough there.
-pub(super) fn is_told_apart(system: &str) -> bool {
-    !system.starts_with("sgc-") || system.ends_with("-standard")
+/// A turn of a system. Fields go in this order.
+struct Turn {
+    ask: Program,
+    _answer: Program,
+    _running: Running,
+    _lab: Lab,
 }
 
-/// One system, all applications.
-fn measure(compare: &Compare, kind: &PathKind, system: &dyn System, figures: &mut Figures) -> Result<()> {
-    let lab = Lab::new(*kind, compare.load())?;
-    let topics = [
-        Topic { name: REQUEST, towards: Side::Right, reliable: true },
-        Topic { name: ANSWER, towards: Side::Left, reliable: true },
-    ];
-    let running = system.start(&lab, &topics)?;
-    let args = ["--topic", REQUEST, "--back", ANSWER, "--reliable"];
-    let mut answer = lab.load(&running, Side::Right, &[&["answer"][..], &args].concat())?;
-    answer.soon("up")?;
-    let mut ask = lab.load(&running, Side::Left, &[&["ask"][..], &args].concat())?;
-    ask.until("connected", CONNECT_MAX)?;
-    for application in &APPLICATIONS {
-        let plan = Plan::of(kind, application, compare.is_quick());
-        ask.order(&json!({ "ask": {
+impl Turn {
+    fn start(compare: &Compare, kind: &PathKind, system: &dyn System) -> Result<Self> {
+        let lab = Lab::new(*kind, compare.load())?;
+        let topics = [
+            Topic { name: REQUEST, towards: Side::Right, reliable: true },
+            Topic { name: ANSWER, towards: Side::Left, reliable: true },
+        ];
+        let running = system.start(&lab, &topics)?;
+        let args = ["--topic", REQUEST, "--back", ANSWER, "--reliable"];
+        let mut answer = lab.load(&running, Side::Right, &[&["answer"][..], &args].concat())?;
+        answer.soon("up")?;
+        let mut ask = lab.load(&running, Side::Left, &[&["ask"][..], &args].concat())?;
+        ask.until("connected", CONNECT_MAX)?;
+        Ok(Self { ask, _answer: answer, _running: running, _lab: lab })
+    }
+
+    /// One application; itself, unless there is no going on.
+    fn measure(mut self, application: &Application, plan: &Plan) -> Result<(Answered, Option<Self>)> {
+        self.ask.order(&json!({ "ask": {
             "size": application.request, "answer": application.answer, "rate": application.rate,
             "count": plan.count, "seconds": plan.seconds, "warm_up": plan.warm_up,
             "patience_seconds": plan.patience.as_secs_f64(),
         }}))?;
         let most = plan.patience * (1 + plan.warm_up) + Duration::from_secs_f64(plan.seconds) + SPARE;
-        let answered = ask.until("answered", most).with_context(|| application.name)?;
-        let is_lost = push(figures, &system.name(), kind.name(), application, &answered)?;
-        if is_lost {
-            // What was given up still fills the path.
-            figures.leave_out(
-                &format!("applications {} on {} from {} on", system.name(), kind.name(), application.name),
-                format!("no answer within {:?}", plan.patience),
-            );
-            break;
-        }
+        let answered = self.ask.until("answered", most).with_context(|| application.name)?;
+        let answered: Answered = serde_json::from_value(answered).context("what a program was answered")?;
+        // What was given up still fills the path.
+        let goes_on = answered.lost == 0;
+        Ok((answered, goes_on.then_some(self)))
     }
-    Ok(())
 }
 
-/// Adds what an application reached. Whether an answer did not come.
+/// What a program that asks says of its answers.
+#[derive(Deserialize)]
+struct Answered {
+    round_trips_us: Vec<f64>,
+    lost: u64,
+    begun_ns: u64,
+    ended_ns: u64,
+}
+
+/// Adds what an application reached.
 fn push(
     figures: &mut Figures,
     system: &str,
-    path: &str,
+    kind: &PathKind,
     application: &Application,
-    answered: &Value,
-) -> Result<bool> {
-    let round_trips = answered["round_trips_us"].as_array().context("no round trips")?;
-    let round_trips: Vec<_> = round_trips.iter().filter_map(Value::as_f64).collect();
-    let lost = answered["lost"].as_u64().context("no count of what was lost")?;
-    let moment = |name: &str| answered[name].as_u64().with_context(|| format!("no {name}"));
-    let seconds = moment("ended_ns")?.saturating_sub(moment("begun_ns")?) as f64 / 1e9;
+    answered: &Answered,
+) {
+    let Answered { round_trips_us, lost, .. } = answered;
+    let seconds = answered.ended_ns.saturating_sub(answered.begun_ns) as f64 / 1e9;
     let mut push = |metric: &str, value| {
-        figures.push("applications", system, path, 0.0, &format!("{}_{metric}", application.name), value);
+        let metric = format!("{}_{metric}", application.name);
+        figures.push("applications", system, kind.name(), 0.0, &metric, value);
     };
     if application.rate.is_some() && seconds > 0.0 {
-        push("frames_per_second", round_trips.len() as f64 / seconds);
+        push("frames_per_second", round_trips_us.len() as f64 / seconds);
     }
-    if !round_trips.is_empty() {
-        let spread = Spread::of(round_trips);
+    if !round_trips_us.is_empty() {
+        let spread = Spread::of(round_trips_us.clone());
         push("p50_us", spread.p50);
         push("p99_us", spread.p99);
     }
-    push("lost", lost as f64);
-    Ok(lost > 0)
+    push("lost", *lost as f64);
+    if *lost > 0 {
+        let what = format!("applications {system} on {} after {}", kind.name(), application.name);
+        figures.leave_out(&what, "an answer did not come in time");
+    }
 }
 
 /// How an application is measured.
@@ -136,12 +165,11 @@ impl Plan {
     fn of(kind: &PathKind, application: &Application, quick: bool) -> Self {
         let is_huge = application.request >= 1 << 20;
         let (count, seconds, warm_up, patience) = match kind {
-            PathKind::Bare if is_huge => (40, 3.0, 2, 20),
-            PathKind::Bare => (1000, 4.0, 5, 5),
-            // It takes 21 s there at least: one is enough.
-            PathKind::Paper if is_huge => (1, 1.0, 0, 150),
-            _ if is_huge => (3, 1.0, 0, 60),
-            _ => (100, 8.0, 1, 30),
+            PathKind::Bare if is_huge => (12, 2.5, 1, 20),
+            PathKind::Bare => (1000, 2.5, 5, 5),
+            // It takes 22 s at 5 Mbit/s, and TCP where packets are lost twice that: one is enough.
+            _ if is_huge => (1, 1.0, 0, 100),
+            _ => (100, 5.0, 1, 30),
         };
         let seconds = if quick { f64::min(seconds, 1.0) } else { seconds };
         let count = if quick { count.min(30) } else { count };

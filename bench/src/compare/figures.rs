@@ -44,6 +44,12 @@ impl Figures {
         });
     }
 
+    /// Adds all of others.
+    pub(crate) fn append(&mut self, others: Self) {
+        self.figures.extend(others.figures);
+        self.left_out.extend(others.left_out);
+    }
+
     /// Says that something is missing.
     pub(crate) fn leave_out(&mut self, what: &str, why: impl std::fmt::Display) {
         self.left_out.push(format!("{what}: {why}"));

@@ -19,6 +19,8 @@ use sgc_wire::Qos;
 
 use super::lab::{Lab, PathKind};
 use super::program::Program;
+use super::system::System;
+use super::turns::abreast;
 use super::{Compare, Figures};
 use crate::fleet::BenchFleet;
 use crate::process::{PATIENCE, SgcRouter, resident_bytes_of, status, status_field_of, thread_seconds_of};
@@ -67,7 +69,9 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
             figures.leave_out(&format!("footprint, {names} names"), format!("{error:#}"));
         }
     }
-    bridges(compare, if compare.is_quick() { IDLE_QUICK } else { IDLE }, figures)
+    compare.note("footprint, others");
+    bridges(compare, if compare.is_quick() { IDLE_QUICK } else { IDLE }, figures);
+    Ok(())
 }
 
 /// What is the same for all.
@@ -174,20 +178,21 @@ impl Stage {
             if let Some(applications) = &applications {
                 until("every topic is at the other end", || Ok(applications.found.load(Relaxed) == topics))?;
             }
-            for ((system, node), none) in
-                [("sgc-proxy", &robot), ("sgc-proxy-use", &desk)].into_iter().zip(&mut none)
-            {
-                let rss = self.measure(system, "topics", topics, node.process.pid(), figures)?;
+            let pids = [("sgc-proxy", robot.process.pid()), ("sgc-proxy-use", desk.process.pid())];
+            let both = abreast(pids, |(system, pid)| {
+                let mut figures = Figures::default();
+                let rss = self.measure(system, "topics", topics, pid, &mut figures)?;
+                Ok::<_, anyhow::Error>((system, figures, rss))
+            });
+            for (outcome, none) in both.into_iter().zip(&mut none) {
+                let (system, its, rss) = outcome?;
+                figures.append(its);
                 match topics {
                     0 => *none = rss,
-                    n => figures.push(
-                        TABLE,
-                        system,
-                        "topics",
-                        n as f64,
-                        "each_bytes",
-                        (rss - *none) / n as f64,
-                    ),
+                    n => {
+                        let each = (rss - *none) / n as f64;
+                        figures.push(TABLE, system, "topics", n as f64, "each_bytes", each);
+                    }
                 }
             }
         }
@@ -236,7 +241,8 @@ impl Stage {
 
     /// Waits until it is at rest and measures; its resident memory, bytes.
     fn measure(&self, system: &str, path: &str, at: usize, pid: u32, figures: &mut Figures) -> Result<f64> {
-        let idle = if at == 0 { IDLE } else { IDLE_WITH_MORE };
+        // A router without names has been watched when it had no links.
+        let idle = if at == 0 && path != "names" { IDLE } else { IDLE_WITH_MORE };
         measure((system, path, at), pid, if self.is_quick { IDLE_QUICK } else { idle }, figures)
     }
 }
@@ -314,17 +320,23 @@ impl Applications {
 }
 
 /// Others that do the same, if they are here: their process at the robot.
-fn bridges(compare: &Compare, idle: Duration, figures: &mut Figures) -> Result<()> {
-    for system in compare.systems().iter().filter(|system| system.name().starts_with("zenoh")) {
-        let lab = Lab::new(PathKind::Bare, compare.load())?;
-        match system.start(&lab, &[]) {
-            Ok(running) => {
-                let (_, process) = running.processes.last().context("a bridge without a process")?;
-                measure((&system.name(), "topics", 0), process.pid(), idle, figures)?;
-            }
-            Err(error) => figures.leave_out(&format!("footprint, {}", system.name()), format!("{error:#}")),
+fn bridges(compare: &Compare, idle: Duration, figures: &mut Figures) {
+    let systems = compare.systems().iter().filter(|system| system.name().starts_with("zenoh"));
+    let measured = abreast(systems, |system| {
+        let (name, mut figures) = (system.name(), Figures::default());
+        if let Err(error) = bridge(compare, &**system, idle, &mut figures) {
+            figures.leave_out(&format!("footprint, {name}"), format!("{error:#}"));
         }
-    }
+        figures
+    });
+    measured.into_iter().for_each(|its| figures.append(its));
+}
+
+fn bridge(compare: &Compare, system: &dyn System, idle: Duration, figures: &mut Figures) -> Result<()> {
+    let lab = Lab::new(PathKind::Bare, compare.load())?;
+    let running = system.start(&lab, &[])?;
+    let (_, process) = running.processes.last().context("a bridge without a process")?;
+    measure((&system.name(), "topics", 0), process.pid(), idle, figures)?;
     Ok(())
 }
 

@@ -5,6 +5,7 @@
 
 use super::figures::{Figure, Figures};
 use super::plot::Unit;
+use super::round_trip::GAVE_UP;
 
 /// A goal and what became of it.
 #[derive(Debug, PartialEq)]
@@ -174,8 +175,17 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
     let parts = thin.iter().map(|path| part(path, huge(path))).collect();
     goals.push(goal("13 MB over the thin links: `standard` to plain TCP", Bound::AtMost(1.1), None, parts));
     for path in thin {
-        let beside =
-            |&at: &f64| run.at_size(at, run.ratio(("round-trip", path, at, "p50_us"), STANDARD, "wireguard"));
+        let beside = |&at: &f64| {
+            let place = ("round-trip", path, at, "p50_us");
+            match run.patience(path, at, "wireguard") {
+                None => run.at_size(at, run.ratio(place, STANDARD, "wireguard")),
+                // It takes longer than that, so the ratio is less than this.
+                Some(waited) => Part {
+                    label: format!("{}, none came back over WireGuard", Unit::Bytes.text(at)),
+                    value: run.number(place, STANDARD).map(|ours| ours / waited),
+                },
+            }
+        };
         let what = format!("Round trip p50, every size, `{path}`: `standard` to DDS over WireGuard");
         goals.push(goal(what, Bound::AtMost(1.0), None, SIZES.iter().map(beside).collect()));
     }
@@ -222,6 +232,12 @@ impl Run<'_> {
     fn ratio(&self, place: Place<'_>, ours: &str, theirs: &str) -> Option<f64> {
         let (ours, theirs) = (self.number(place, ours)?, self.number(place, theirs)?);
         (theirs > 0.0).then(|| ours / theirs)
+    }
+
+    /// How long round trips were waited for of which none came back.
+    fn patience(&self, path: &str, at: f64, system: &str) -> Option<f64> {
+        let is_measured = self.number(("round-trip", path, at, "p50_us"), system).is_some();
+        self.number(("round-trip", path, at, GAVE_UP), system).filter(|_| !is_measured)
     }
 
     fn at_size(&self, at: f64, value: Option<f64>) -> Part {
@@ -357,6 +373,20 @@ mod tests {
         assert_eq!(verdict_of_three, Verdict::NotMeasured);
         assert!(reached.ends_with("8 KB: –"), "{reached}");
         assert!(judge(&Figures::default()).iter().all(|g| g.verdict == Verdict::NotMeasured));
+    }
+
+    #[test]
+    fn what_never_came_back_took_longer_than_it_was_waited_for() {
+        let what = "Round trip p50, every size, `paper`: `standard` to DDS over WireGuard";
+        let mut figures = Figures::default();
+        for at in SIZES {
+            figures.push("round-trip", STANDARD, "paper", at, "p50_us", 50.0);
+            let metric = if at == HUGE { GAVE_UP } else { "p50_us" };
+            figures.push("round-trip", "wireguard", "paper", at, metric, 100.0);
+        }
+        let (judged, reached) = verdict(&figures, what);
+        assert_eq!(judged, Verdict::Met);
+        assert!(reached.ends_with("13 MB, none came back over WireGuard: 0.5 ×"), "{reached}");
     }
 
     #[test]

@@ -13,6 +13,7 @@ mod footprint;
 mod goals;
 mod lab;
 mod multi_hop;
+mod plan;
 mod plot;
 mod program;
 mod report;
@@ -24,14 +25,17 @@ mod tally;
 mod tcp;
 mod teleop;
 mod throughput;
+mod turns;
 
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use sgc_testkit::netsim;
 
 use lab::PathKind;
+use plan::Breadth;
 use system::{Peers, System};
 
 pub(crate) use figures::Figures;
@@ -93,6 +97,7 @@ pub(crate) struct Compare {
     args: CompareArgs,
     load: PathBuf,
     systems: Vec<Box<dyn System>>,
+    begun: Instant,
 }
 
 impl Compare {
@@ -122,12 +127,28 @@ impl Compare {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
         }
-        Ok(Self { args, load, systems })
+        Ok(Self { args, load, systems, begun: Instant::now() })
     }
 
     /// What is compared in this run.
     pub(crate) fn systems(&self) -> &[Box<dyn System>] {
         &self.systems
+    }
+
+    /// Those that a table has, of what was asked for; what it has not is said. Who asks for systems by name gets them.
+    pub(crate) fn systems_of(
+        &self,
+        breadth: Breadth,
+        table: &str,
+        why: &str,
+        figures: &mut Figures,
+    ) -> Vec<&dyn System> {
+        let has = |system: &&dyn System| !self.args.systems.is_empty() || breadth.has(&system.name());
+        let all: Vec<_> = self.systems.iter().map(|system| &**system).collect();
+        if !all.iter().all(has) {
+            figures.leave_out(&format!("{table}, {}", breadth.lacks()), why);
+        }
+        all.into_iter().filter(has).collect()
     }
 
     /// Whether a system is asked for, whatever kind of thing it is.
@@ -171,19 +192,15 @@ impl Compare {
         self.args.quick
     }
 
-    /// How often each system has its turn.
-    pub(crate) fn rounds(&self, kind: &PathKind) -> usize {
-        match kind {
-            _ if self.is_quick() => 1,
-            PathKind::Bare => 3,
-            // Here the path says how long it takes, and not the machine.
-            _ => 1,
-        }
+    /// How many rounds there are; who has a turn in which is [`plan::rounds`]'s.
+    pub(crate) fn rounds(&self) -> usize {
+        if self.is_quick() { 1 } else { plan::ROUNDS_MAX }
     }
 
-    /// Says how far it is.
+    /// Says how far it is, and since when.
     pub(crate) fn note(&self, what: &str) {
-        eprintln!("{what}");
+        let seconds = self.begun.elapsed().as_secs();
+        eprintln!("{:3}:{:02} {what}", seconds / 60, seconds % 60);
     }
 }
 
@@ -205,9 +222,11 @@ pub(crate) fn run(args: CompareArgs) -> Result<()> {
     }
     for (name, table) in TABLES {
         if is_among(&compare.args.only, name) {
+            let begun = Instant::now();
             if let Err(error) = table(&compare, &mut figures) {
                 figures.leave_out(&format!("the rest of {name}"), format!("{error:#}"));
             }
+            compare.note(&format!("{name} took {} s", begun.elapsed().as_secs()));
             let run = Run::here(figures.clone(), compare.is_quick());
             run.write(&compare.args.out)?;
             run.render(&compare.args.out)?;

@@ -17,7 +17,8 @@ const BYTES: usize = 1000;
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    Round::all(compare, figures, "multi-hop", |round| {
+    // One round: no goal asks.
+    Round::all(compare, figures, "multi-hop", 1, |round| {
         for suite in SUITES {
             let name = format!("sgc-quic-{suite}");
             for routers in ROUTERS.filter(|_| compare.wants(&name)) {

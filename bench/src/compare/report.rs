@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::figures::{Figure, Figures};
 use super::goals;
 use super::plot::{self, Axis, Bar, Hue, Series, Stroke, Unit, join, three_digits};
+use super::round_trip::GAVE_UP;
 use crate::report::Machine;
 
 /// What a run leaves behind.
@@ -593,7 +594,7 @@ fn plots(figures: &Figures, about: &About<'_>) -> Vec<Page> {
 const LINES_MAX: usize = 10;
 
 /// Metrics that say how far to trust the others: they are in the tables.
-const NOT_DRAWN: [&str; 2] = ["samples", "lost"];
+const NOT_DRAWN: [&str; 3] = ["samples", "lost", GAVE_UP];
 
 /// A plot for each metric that was measured at several places. Where there are many systems, one with SGC's default
 /// transport beside the others, and one with SGC's transports alone.

@@ -1,6 +1,7 @@
 //! Table `round-trip`: a message to the other place and back, by its size.
 //!
-//! Systems take turns in rounds. A round starts the system anew, and measures all sizes one after the other.
+//! Systems take turns in rounds. A turn starts the system anew, and measures all sizes one after the other; on thin paths several
+//! have theirs at the same time.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -10,16 +11,23 @@ use serde_json::json;
 
 use super::flow::CONNECT_MAX;
 use super::lab::{Lab, PathKind, Side};
-use super::system::{System, Topic};
-use super::{Compare, Figures, tcp};
+use super::plan::Breadth;
+use super::program::Program;
+use super::system::{Running, System, Topic};
+use super::turns::by_stages;
+use super::{Compare, Figures, plan, tcp};
 use crate::report::Spread;
 
 const PING: &str = "/bench/ping";
 const PONG: &str = "/bench/pong";
+/// Of a size that never came back: how long it was waited for, µs.
+pub(crate) const GAVE_UP: &str = "gave_up_us";
 /// Bytes of a message.
 const SIZES: [usize; 7] = [16, 100, 1000, 8 << 10, 64 << 10, 1 << 20, 13 << 20];
 /// From where on a message is large: few are measured, and one is enough where the path is thin.
 const LARGE_BYTES: usize = 1 << 20;
+/// And from where on it is huge: there one says it all where the path is thin.
+const HUGE_BYTES: usize = 8 << 20;
 /// How much longer than it may take is waited for an answer.
 const SPARE: Duration = Duration::from_secs(5);
 
@@ -30,23 +38,35 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
             continue;
         }
         let sizes = sizes(&kind, compare.is_quick());
+        let breadth = if matches!(kind, PathKind::Bare) { Breadth::Whole } else { Breadth::Cross };
+        let why = "the path says how long it takes there, and hardly the suite";
+        let systems = compare.systems_of(breadth, &format!("round-trip on {}", kind.name()), why, figures);
+        let mut who: Vec<_> = systems.into_iter().map(Who::System).collect();
+        who.extend(compare.wants(tcp::NAME).then_some(Who::Tcp));
         let mut samples = BTreeMap::new();
-        for round in 0..compare.rounds(&kind) {
-            for system in compare.systems() {
-                let name = system.name();
-                compare.note(&format!("round trip, {}, round {round}: {name}", kind.name()));
-                if let Err(error) = measure(compare, &kind, &**system, sizes, &mut samples) {
-                    figures.leave_out(&format!("round-trip {name} on {}", kind.name()), format!("{error:#}"));
-                }
-            }
-            if compare.wants(tcp::NAME) {
-                compare.note(&format!("round trip, {}, round {round}: {}", kind.name(), tcp::NAME));
-                if let Err(error) = measure_tcp(compare, &kind, sizes, &mut samples) {
-                    figures.leave_out(&format!("round-trip tcp on {}", kind.name()), format!("{error:#}"));
+        for round in 0..compare.rounds() {
+            let its = who.iter().copied().filter(|who| round < plan::rounds(&kind, &who.name())).collect();
+            for together in plan::together(&kind, its, Who::name) {
+                let names: Vec<_> = together.iter().map(Who::name).collect();
+                compare.note(&format!("round trip, {}, round {round}: {}", kind.name(), names.join(", ")));
+                let turns = by_stages(
+                    &together,
+                    sizes,
+                    |who| Turn::start(compare, &kind, who),
+                    |turn, size| turn.measure(size, &Plan::of(&kind, size, compare.is_quick())),
+                );
+                for (name, turn) in names.into_iter().zip(turns) {
+                    add(&mut samples, &name, sizes, turn.stages);
+                    if let Some(error) = turn.error {
+                        figures.leave_out(
+                            &format!("round-trip {name} on {}", kind.name()),
+                            format!("{error:#}"),
+                        );
+                    }
                 }
             }
         }
-        for ((name, size), Sample { round_trips_us, lost }) in samples {
+        for ((name, size), Sample { round_trips_us, lost, patience }) in samples {
             let mut push =
                 |metric, value| figures.push("round-trip", &name, kind.name(), size as f64, metric, value);
             push("lost", lost as f64);
@@ -56,6 +76,8 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
                 push("p50_us", spread.p50);
                 push("p99_us", spread.p99);
                 push("max_us", spread.max);
+            } else if lost > 0 {
+                push(GAVE_UP, patience.as_secs_f64() * 1e6);
             }
         }
     }
@@ -81,19 +103,89 @@ pub(crate) struct Sample {
     pub(crate) round_trips_us: Vec<f64>,
     /// Messages that did not come back in time.
     pub(crate) lost: u64,
+    /// That time.
+    pub(crate) patience: Duration,
 }
 
-/// A turn of TCP.
-fn measure_tcp(compare: &Compare, kind: &PathKind, sizes: &[usize], samples: &mut Samples) -> Result<()> {
-    let lab = Lab::new(*kind, compare.load())?;
-    let plans: Vec<_> = sizes.iter().map(|&size| (size, Plan::of(kind, size, compare.is_quick()))).collect();
-    tcp::measure(&lab, &plans, |size, sample| {
-        let of_size = samples.entry((tcp::NAME.to_owned(), size)).or_default();
+/// Adds what was measured of these sizes, as far as it came.
+fn add(samples: &mut Samples, name: &str, sizes: &[usize], measured: Vec<Sample>) {
+    for (&size, sample) in sizes.iter().zip(measured) {
+        let of_size = samples.entry((name.to_owned(), size)).or_default();
         of_size.round_trips_us.extend(sample.round_trips_us);
-    })
+        of_size.lost += sample.lost;
+        of_size.patience = sample.patience;
+    }
 }
 
-/// A turn of a system.
+/// Who has turns.
+#[derive(Clone, Copy)]
+enum Who<'a> {
+    System(&'a dyn System),
+    Tcp,
+}
+
+impl Who<'_> {
+    fn name(&self) -> String {
+        match self {
+            Self::System(system) => system.name(),
+            Self::Tcp => tcp::NAME.to_owned(),
+        }
+    }
+}
+
+/// A turn. Fields go in this order.
+struct Turn {
+    ends: Ends,
+    _lab: Lab,
+}
+
+#[expect(clippy::large_enum_variant, reason = "there are a few at a time")]
+enum Ends {
+    Programs { ping: Program, _pong: Program, _running: Running },
+    Tcp(tcp::Tcp),
+}
+
+impl Turn {
+    fn start(compare: &Compare, kind: &PathKind, who: Who<'_>) -> Result<Self> {
+        let lab = Lab::new(*kind, compare.load())?;
+        let Who::System(system) = who else {
+            return Ok(Self { ends: Ends::Tcp(tcp::Tcp::connect(&lab)?), _lab: lab });
+        };
+        let topics = [
+            Topic { name: PING, towards: Side::Right, reliable: true },
+            Topic { name: PONG, towards: Side::Left, reliable: true },
+        ];
+        let running = system.start(&lab, &topics)?;
+        let args = ["--topic", PING, "--back", PONG, "--reliable"];
+        let mut pong = lab.load(&running, Side::Right, &[&["pong"][..], &args].concat())?;
+        pong.soon("up")?;
+        let mut ping = lab.load(&running, Side::Left, &[&["ping"][..], &args].concat())?;
+        ping.until("connected", CONNECT_MAX)?;
+        Ok(Self { ends: Ends::Programs { ping, _pong: pong, _running: running }, _lab: lab })
+    }
+
+    /// One size; itself, unless there is no going on.
+    fn measure(mut self, size: usize, plan: &Plan) -> Result<(Sample, Option<Self>)> {
+        let ping = match &mut self.ends {
+            Ends::Tcp(tcp) => return Ok((tcp.measure(size, plan)?, Some(self))),
+            Ends::Programs { ping, .. } => ping,
+        };
+        ping.order(&json!({ "measure": {
+            "size": size, "count": plan.count, "seconds": plan.seconds, "warm_up": plan.warm_up,
+            "patience_seconds": plan.patience.as_secs_f64(),
+        }}))?;
+        let most = plan.patience * (1 + plan.warm_up as u32) + Duration::from_secs_f64(plan.seconds) + SPARE;
+        let measured = ping.until("measured", most)?;
+        let round_trips = measured["round_trips_us"].as_array().context("no round trips")?;
+        let round_trips_us = round_trips.iter().filter_map(serde_json::Value::as_f64).collect();
+        let lost = measured["lost"].as_u64().context("no count of what was lost")?;
+        // What was given up still fills the path.
+        let goes_on = lost == 0 || size < LARGE_BYTES;
+        Ok((Sample { round_trips_us, lost, patience: plan.patience }, goes_on.then_some(self)))
+    }
+}
+
+/// A turn of a system by itself.
 pub(crate) fn measure(
     compare: &Compare,
     kind: &PathKind,
@@ -101,34 +193,12 @@ pub(crate) fn measure(
     sizes: &[usize],
     samples: &mut Samples,
 ) -> Result<()> {
-    let lab = Lab::new(*kind, compare.load())?;
-    let topics = [
-        Topic { name: PING, towards: Side::Right, reliable: true },
-        Topic { name: PONG, towards: Side::Left, reliable: true },
-    ];
-    let running = system.start(&lab, &topics)?;
-    let args = ["--topic", PING, "--back", PONG, "--reliable"];
-    let mut pong = lab.load(&running, Side::Right, &[&["pong"][..], &args].concat())?;
-    pong.soon("up")?;
-    let mut ping = lab.load(&running, Side::Left, &[&["ping"][..], &args].concat())?;
-    ping.until("connected", CONNECT_MAX)?;
+    let mut turn = Some(Turn::start(compare, kind, Who::System(system))?);
     for &size in sizes {
-        let plan = Plan::of(kind, size, compare.is_quick());
-        ping.order(&json!({ "measure": {
-            "size": size, "count": plan.count, "seconds": plan.seconds, "warm_up": plan.warm_up,
-            "patience_seconds": plan.patience.as_secs_f64(),
-        }}))?;
-        let most = plan.patience * (1 + plan.warm_up as u32) + Duration::from_secs_f64(plan.seconds) + SPARE;
-        let measured = ping.until("measured", most)?;
-        let sample = samples.entry((system.name(), size)).or_default();
-        let round_trips = measured["round_trips_us"].as_array().context("no round trips")?;
-        sample.round_trips_us.extend(round_trips.iter().filter_map(serde_json::Value::as_f64));
-        let lost = measured["lost"].as_u64().context("no count of what was lost")?;
-        sample.lost += lost;
-        if lost > 0 && size >= LARGE_BYTES {
-            // What was given up still fills the path.
-            break;
-        }
+        let Some(going) = turn.take() else { break };
+        let (sample, after) = going.measure(size, &Plan::of(kind, size, compare.is_quick()))?;
+        add(samples, &system.name(), &[size], vec![sample]);
+        turn = after;
     }
     Ok(())
 }
@@ -149,11 +219,15 @@ pub(crate) struct Plan {
 impl Plan {
     fn of(kind: &PathKind, size: usize, quick: bool) -> Self {
         let is_large = size >= LARGE_BYTES;
+        let is_huge = size >= HUGE_BYTES;
         let (count, seconds, warm_up, patience): (usize, f64, usize, u64) = match kind {
-            PathKind::Bare if is_large => (60, 3.0, 2, 20),
-            PathKind::Bare => (3000, 2.0, 50, 5),
-            _ if is_large => (3, 1.0, 0, 150),
-            _ => (200, 6.0, 2, 10),
+            PathKind::Bare if is_huge => (12, 2.5, 1, 15),
+            PathKind::Bare if is_large => (60, 1.5, 2, 10),
+            PathKind::Bare => (3000, 1.0, 50, 5),
+            // 13 MB take 44 s there and back at 5 Mbit/s.
+            _ if is_huge => (1, 1.0, 0, 100),
+            _ if is_large => (3, 1.0, 0, 40),
+            _ => (200, 4.0, 2, 10),
         };
         let (count, seconds) = if quick { (count.min(100), seconds.min(0.5)) } else { (count, seconds) };
         Self { count, seconds, warm_up, patience: Duration::from_secs(patience) }

@@ -9,6 +9,7 @@ use anyhow::Result;
 use sgc_trust::Suite;
 
 use super::lab::{Lab, PathKind, Side};
+use super::plan::Breadth;
 use super::system::{System, Topic};
 use super::{Compare, Figures};
 use crate::fleet::BenchFleet;
@@ -20,6 +21,8 @@ const TABLE: &str = "start-up";
 /// Names that the router knows.
 const RECORDS: [usize; 3] = [10_000, 100_000, 1_000_000];
 const TOPIC: &str = "/bench/first";
+/// How often an application is started.
+const STARTS: usize = 3;
 /// How long an application may wait for its first message.
 const CONNECT_MAX: Duration = Duration::from_secs(60);
 
@@ -32,10 +35,12 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
             figures.leave_out(&format!("start-up with {records} records"), format!("{error:#}"));
         }
     }
-    let starts = if is_quick { 1 } else { 5 };
-    for system in compare.systems() {
+    let starts = if is_quick { 1 } else { STARTS };
+    let why = "what they differ in is in the rows of their own";
+    let systems = compare.systems_of(Breadth::Cross, "start-up of an application", why, figures);
+    for system in systems {
         compare.note(&format!("start-up, {}", system.name()));
-        match application(compare, &**system, starts) {
+        match application(compare, system, starts) {
             Ok(times) => {
                 let spread = Spread::of(times);
                 figures.push(

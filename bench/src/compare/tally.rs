@@ -47,20 +47,22 @@ pub(crate) struct Round<'a> {
     compare: &'a Compare,
     figures: &'a mut Figures,
     tally: Tally,
-    number: usize,
+    /// Which it is, from 0.
+    pub(crate) number: usize,
 }
 
 impl Round<'_> {
-    /// Measures a table over the bare path, if that is asked for: as many rounds as there are to be.
+    /// Measures a table over the bare path in so many rounds, if that is asked for.
     pub(crate) fn all(
         compare: &Compare,
         figures: &mut Figures,
         table: &'static str,
+        rounds: usize,
         mut run: impl FnMut(&mut Round<'_>),
     ) {
         if compare.wants_path(&PathKind::Bare) {
             let mut round = Round { compare, figures, tally: Tally::new(table), number: 0 };
-            for number in 0..compare.rounds(&PathKind::Bare) {
+            for number in 0..rounds {
                 round.number = number;
                 run(&mut round);
             }

@@ -3,10 +3,9 @@
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 
 use super::lab::{Lab, Side};
 use super::round_trip::{Plan, Sample};
@@ -16,40 +15,43 @@ pub(crate) const NAME: &str = "tcp";
 /// Longest message that the far end takes, bytes.
 const MESSAGE_BYTES_MAX: u64 = 64 << 20;
 
-/// Round trips of these sizes over one connection, each handed out as it is measured.
-pub(crate) fn measure(
-    lab: &Lab,
-    plans: &[(usize, Plan)],
-    mut handle: impl FnMut(usize, Sample),
-) -> Result<()> {
-    let address = SocketAddr::new(lab.address(Side::Right), 0);
-    let listener = lab.place(Side::Right).within(|| TcpListener::bind(address))??;
-    let address = listener.local_addr()?;
-    let mut near = lab.place(Side::Left).within(|| TcpStream::connect(address))??;
-    let place = Arc::clone(lab.place(Side::Right));
-    let far = std::thread::spawn(move || {
-        place.enter()?;
-        echo(&listener)
-    });
-    near.set_nodelay(true)?;
-    for (size, plan) in plans {
-        near.set_read_timeout(Some(plan.patience))?;
-        near.set_write_timeout(Some(plan.patience))?;
-        let message = vec![0x5a; *size];
-        let mut answer = vec![0; *size];
+/// One connection.
+pub(crate) struct Tcp {
+    near: TcpStream,
+}
+
+impl Tcp {
+    /// From the left place to the right one, where what comes is sent back until this is dropped.
+    pub(crate) fn connect(lab: &Lab) -> Result<Self> {
+        let address = SocketAddr::new(lab.address(Side::Right), 0);
+        let listener = lab.place(Side::Right).within(|| TcpListener::bind(address))??;
+        let address = listener.local_addr()?;
+        let near = lab.place(Side::Left).within(|| TcpStream::connect(address))??;
+        near.set_nodelay(true)?;
+        std::thread::spawn(move || {
+            // It is the near end that says what went wrong.
+            let _ = echo(&listener);
+        });
+        Ok(Self { near })
+    }
+
+    /// Round trips of a size.
+    pub(crate) fn measure(&mut self, size: usize, plan: &Plan) -> Result<Sample> {
+        self.near.set_read_timeout(Some(plan.patience))?;
+        self.near.set_write_timeout(Some(plan.patience))?;
+        let message = vec![0x5a; size];
+        let mut answer = vec![0; size];
         for _ in 0..plan.warm_up {
-            round_trip(&mut near, &message, &mut answer)?;
+            round_trip(&mut self.near, &message, &mut answer)?;
         }
-        let mut sample = Sample::default();
+        let mut sample = Sample { patience: plan.patience, ..Sample::default() };
         let begun = Instant::now();
         while sample.round_trips_us.len() < plan.count && begun.elapsed().as_secs_f64() < plan.seconds {
-            let took = round_trip(&mut near, &message, &mut answer)?;
+            let took = round_trip(&mut self.near, &message, &mut answer)?;
             sample.round_trips_us.push(took.as_secs_f64() * 1e6);
         }
-        handle(*size, sample);
+        Ok(sample)
     }
-    drop(near);
-    far.join().ok().context("the far end of TCP panicked")?
 }
 
 fn round_trip(stream: &mut TcpStream, message: &[u8], answer: &mut [u8]) -> Result<Duration> {

@@ -7,40 +7,53 @@ use anyhow::Result;
 
 use super::flow::{Flow, FlowSpec, Order, Outcome};
 use super::lab::{Lab, PathKind, Side};
+use super::plan::Breadth;
 use super::system::{System, Topic};
 use super::tally::{Round, Tally};
-use super::{Compare, Figures};
+use super::{Compare, Figures, plan};
 
 const TOPIC: &str = "/bench/flow";
 /// Bytes of a message.
 const SIZES: [usize; 4] = [100, 1000, 64 << 10, 1 << 20];
 /// Seconds of a run, and of the one before, which does not count.
-const RUN_SECONDS: f64 = 2.5;
-const WARM_UP_SECONDS: f64 = 0.5;
+const RUN_SECONDS: f64 = 2.0;
+const WARM_UP_SECONDS: f64 = 0.3;
+/// The size that goals ask about: it alone is measured in every round, and of every variant.
+const SIZE_ASKED: usize = 1000;
 /// What a run sends at most, bytes, so that its end is not far behind its last write.
 const RUN_BYTES_MAX: usize = 2 << 30;
 
 /// Measures it.
 pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
-    Round::all(compare, figures, "throughput", |round| {
-        for system in compare.systems() {
-            round.measure(&system.name(), |tally| measure(compare, &**system, tally));
+    let why = "what a suite and what a transport costs at other sizes is in the rows of their own";
+    let what = format!("throughput at other sizes than {SIZE_ASKED} B");
+    let others = compare.systems_of(Breadth::Cross, &what, why, figures);
+    let others: Vec<_> = others.into_iter().map(System::name).collect();
+    Round::all(compare, figures, "throughput", compare.rounds(), |round| {
+        let number = round.number;
+        let has_turn = |name: &str| number < plan::rounds(&PathKind::Bare, name);
+        for system in compare.systems().iter().filter(|system| has_turn(&system.name())) {
+            let name = system.name();
+            let is_measured = |size| size == SIZE_ASKED || (number == 0 && others.contains(&name));
+            for size in SIZES.into_iter().filter(|size| is_measured(*size)) {
+                let what = format!("{name} at {size} B");
+                round.measure(&what, |tally| measure(compare, &**system, size, tally));
+            }
         }
     });
     Ok(())
 }
 
-fn measure(compare: &Compare, system: &dyn System, tally: &mut Tally) -> Result<()> {
+/// Anew for each size, so that memory is that of the size.
+fn measure(compare: &Compare, system: &dyn System, size: usize, tally: &mut Tally) -> Result<()> {
     let (kind, name) = (PathKind::Bare, system.name());
-    for size in SIZES {
-        let (outcome, rss_bytes) = one_way(compare, system, size)?;
-        let mut add = |metric, value| tally.add(&name, kind.name(), size as u64, metric, value);
-        add("per_second", outcome.arrived() / outcome.seconds);
-        add("lost", outcome.lost());
-        add("cpu_us_per_message", outcome.cpu_seconds * 1e6 / outcome.arrived());
-        add("load_cpu_us_per_message", outcome.load_cpu_seconds * 1e6 / outcome.arrived());
-        add("rss_bytes", rss_bytes as f64);
-    }
+    let (outcome, rss_bytes) = one_way(compare, system, size)?;
+    let mut add = |metric, value| tally.add(&name, kind.name(), size as u64, metric, value);
+    add("per_second", outcome.arrived() / outcome.seconds);
+    add("lost", outcome.lost());
+    add("cpu_us_per_message", outcome.cpu_seconds * 1e6 / outcome.arrived());
+    add("load_cpu_us_per_message", outcome.load_cpu_seconds * 1e6 / outcome.arrived());
+    add("rss_bytes", rss_bytes as f64);
     Ok(())
 }
 

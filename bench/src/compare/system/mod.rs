@@ -19,7 +19,7 @@ use super::lab::{Lab, Side};
 use super::program::Program;
 
 /// A way to join two places.
-pub(crate) trait System {
+pub(crate) trait System: Sync {
     /// As figures call it.
     fn name(&self) -> String;
 

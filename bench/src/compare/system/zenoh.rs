@@ -93,7 +93,8 @@ impl System for Zenoh {
                 command.env_remove(variable);
             }
             let name = format!("bridge-{}", side.name());
-            let mut program = Program::start(&name, command, &dir)?;
+            // It ends by signals, and does not look at its standard input.
+            let mut program = Program::start_daemon(&name, command, &dir)?;
             program.soon("started")?;
             running.processes.push((side, program));
         }

@@ -1,0 +1,122 @@
+//! What a whole run can afford: which of the many variants of `sgc` a table has, how often each system has its turn, and how many
+//! have it at the same time. The budget is in `bench/README.md`.
+
+use super::lab::PathKind;
+use super::tcp;
+
+/// Which variants of `sgc` are in a table. The other systems are in all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Breadth {
+    /// Every transport with every suite, and with a router.
+    Whole,
+    /// Every transport with the default suite, every suite with the default transport, no router.
+    Cross,
+    /// Every transport with the default suite.
+    Transports,
+}
+
+impl Breadth {
+    /// Whether a system is in it.
+    pub(crate) fn has(self, system: &str) -> bool {
+        let is_default_suite = system.ends_with("-standard");
+        let is_default_transport = system.starts_with("sgc-quic-") && !system.contains("-router");
+        match self {
+            _ if !system.starts_with("sgc-") => true,
+            Self::Whole => true,
+            Self::Cross => is_default_suite || is_default_transport,
+            Self::Transports => is_default_suite,
+        }
+    }
+
+    /// What is not in it.
+    pub(crate) fn lacks(self) -> &'static str {
+        match self {
+            Self::Whole => "nothing of sgc",
+            Self::Cross => {
+                "sgc over other transports than QUIC with other suites than `standard`, and with a router"
+            }
+            Self::Transports => "sgc with other suites than `standard`, and with a router",
+        }
+    }
+}
+
+/// Those that goals compare where the machine is the limit: they have a turn in each round, the others in the first.
+const OFTEN: [&str; 5] =
+    ["direct", "zenoh-tcp", "sgc-quic-group", "sgc-quic-standard", "sgc-quic-group-router"];
+pub(crate) const ROUNDS_MAX: usize = 3;
+
+/// How often a system has its turn.
+pub(crate) fn rounds(kind: &PathKind, system: &str) -> usize {
+    match kind {
+        PathKind::Bare if OFTEN.contains(&system) => ROUNDS_MAX,
+        // On thin paths the path says how long it takes.
+        _ => 1,
+    }
+}
+
+/// How many go at the same time over paths of their own. 5 Mbit/s are little for a machine, and so is what TCP makes of a path that
+/// loses packets; what copes with losses fills 50 Mbit/s.
+const ABREAST_PAPER: usize = 6;
+const ABREAST_LOSSY: usize = 2;
+const ABREAST_LOSSY_TCP: usize = 6;
+
+/// Who goes together, of these.
+pub(crate) fn together<T>(kind: &PathKind, who: Vec<T>, name: impl Fn(&T) -> String) -> Vec<Vec<T>> {
+    match kind {
+        PathKind::Paper => chunks(who, ABREAST_PAPER),
+        PathKind::Lossy => {
+            let (by_tcp, others) = who.into_iter().partition(|one| is_by_tcp(&name(one)));
+            let mut all = chunks(others, ABREAST_LOSSY);
+            all.extend(chunks(by_tcp, ABREAST_LOSSY_TCP));
+            all
+        }
+        _ => chunks(who, 1),
+    }
+}
+
+/// Whether kernel TCP carries it.
+fn is_by_tcp(system: &str) -> bool {
+    system.split('-').any(|word| ["tcp", "tls"].contains(&word)) || system == tcp::NAME
+}
+
+fn chunks<T>(all: Vec<T>, most: usize) -> Vec<Vec<T>> {
+    let mut chunks: Vec<Vec<T>> = Vec::new();
+    for one in all {
+        match chunks.last_mut() {
+            Some(last) if last.len() < most => last.push(one),
+            _ => chunks.push(vec![one]),
+        }
+    }
+    chunks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn goals_are_asked_of_systems_that_every_breadth_has() {
+        for breadth in [Breadth::Whole, Breadth::Cross, Breadth::Transports] {
+            assert!(
+                ["direct", "wireguard", "zenoh-tcp", "tcp", "sgc-quic-standard"]
+                    .iter()
+                    .all(|s| breadth.has(s))
+            );
+        }
+        assert!(Breadth::Cross.has("sgc-quic-group") && Breadth::Cross.has("sgc-tls-standard"));
+        assert!(!Breadth::Cross.has("sgc-tls-group") && !Breadth::Cross.has("sgc-quic-standard-router"));
+        assert!(!Breadth::Transports.has("sgc-quic-paper"));
+    }
+
+    #[test]
+    fn nobody_shares_a_machine_that_is_the_limit() {
+        let who = ["direct", "zenoh-tls", "sgc-dtls-standard", "tcp", "sgc-quic-standard"].to_vec();
+        let together = |kind| super::together(&kind, who.clone(), |name| (*name).to_owned());
+        assert!(together(PathKind::Bare).iter().all(|chunk| chunk.len() == 1));
+        assert_eq!(together(PathKind::Paper), std::slice::from_ref(&who));
+        assert_eq!(
+            together(PathKind::Lossy),
+            [&["direct", "sgc-dtls-standard"][..], &["sgc-quic-standard"], &["zenoh-tls", "tcp"]]
+        );
+    }
+}

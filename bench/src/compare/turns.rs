@@ -1,0 +1,99 @@
+//! Turns that several have at the same time, each in a lab of its own, where the path says how long things take and not the
+//! machine. Knows nothing of what is measured.
+
+use anyhow::Result;
+
+/// What one of several came to.
+#[derive(Debug)]
+pub(crate) struct Turn<R> {
+    /// Of each stage that it went through.
+    pub(crate) stages: Vec<R>,
+    /// Why there are no more.
+    pub(crate) error: Option<anyhow::Error>,
+}
+
+/// Does something for all at the same time; the outcomes are in the order of who they belong to.
+pub(crate) fn abreast<W: Send, R: Send>(
+    who: impl IntoIterator<Item = W>,
+    act: impl Fn(W) -> R + Sync,
+) -> Vec<R> {
+    let act = &act;
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = who.into_iter().map(|one| scope.spawn(move || act(one))).collect();
+        let outcomes = threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        outcomes.collect()
+    })
+}
+
+/// Starts everybody and lets them go through stages: each begins when all are through the one before, so that nobody's start or
+/// end is in what another one measures. Who fails is out, and so is who a stage leaves in no state to go on (`None`).
+pub(crate) fn by_stages<W: Copy + Send, T: Send, R: Send, S: Copy + Sync>(
+    who: &[W],
+    stages: &[S],
+    start: impl Fn(W) -> Result<T> + Sync,
+    measure: impl Fn(T, S) -> Result<(R, Option<T>)> + Sync,
+) -> Vec<Turn<R>> {
+    let started = abreast(who.iter().copied(), start);
+    let mut states = Vec::new();
+    let mut turns = Vec::new();
+    for outcome in started {
+        let (state, error) = match outcome {
+            Ok(state) => (Some(state), None),
+            Err(error) => (None, Some(error)),
+        };
+        states.push(state);
+        turns.push(Turn { stages: Vec::new(), error });
+    }
+    for stage in stages {
+        let measured = abreast(states, |state| state.map(|state| measure(state, *stage)));
+        states = Vec::new();
+        for (turn, outcome) in turns.iter_mut().zip(measured) {
+            let (outcome, error) =
+                outcome.transpose().map_or_else(|error| (None, Some(error)), |o| (o, None));
+            turn.error = turn.error.take().or(error);
+            let (of_stage, state) = outcome.unzip();
+            turn.stages.extend(of_stage);
+            states.push(state.flatten());
+        }
+    }
+    abreast(states, drop);
+    turns
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::bail;
+    use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
+
+    #[test]
+    fn who_fails_is_out_and_the_others_go_on() {
+        let turns = by_stages(
+            &["well", "never", "once"],
+            &[1, 2],
+            |who| if who == "never" { bail!("no start") } else { Ok(who) },
+            |who, stage| match (who, stage) {
+                ("once", 1) => Ok((stage, None)),
+                _ => Ok((stage, Some(who))),
+            },
+        );
+        let stages: Vec<_> = turns.iter().map(|turn| &*turn.stages).collect();
+        assert_eq!(stages, [&[1, 2][..], &[], &[1]]);
+        let is_failed: Vec<_> = turns.iter().map(|turn| turn.error.is_some()).collect();
+        assert_eq!(is_failed, [false, true, false]);
+    }
+
+    #[test]
+    fn a_stage_begins_when_all_are_through_the_one_before() {
+        let through = AtomicUsize::new(0);
+        let turns = by_stages(&[0, 1, 2], &[0, 1], Ok, |who, stage| {
+            assert!(through.load(SeqCst) >= stage * 3);
+            std::thread::sleep(std::time::Duration::from_millis(who));
+            through.fetch_add(1, SeqCst);
+            Ok(((), Some(who)))
+        });
+        assert!(turns.iter().all(|turn| turn.stages.len() == 2));
+    }
+}
