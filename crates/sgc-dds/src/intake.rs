@@ -12,7 +12,7 @@ use std::mem::MaybeUninit;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use cyclors::{
     DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
@@ -32,7 +32,7 @@ pub const WAITING_BYTES_MAX: usize = 64 << 20;
 
 /// After handling a sample the receiving thread handles none for as long as that took, and for no less than this: what
 /// comes so fast is better handled by the reader's thread, several at a time.
-const REST_MIN: Duration = Duration::from_micros(20);
+const REST_MIN_NS: u64 = 20_000;
 
 thread_local! {
     /// Whether this thread is in a listener.
@@ -99,12 +99,19 @@ impl Pace {
     /// When it is, if a sample may be handled.
     fn begin(&self) -> Option<u64> {
         let now_ns = self.now_ns();
-        (now_ns >= self.rests_until_ns.load(Ordering::Relaxed)).then_some(now_ns)
+        self.may_begin(now_ns).then_some(now_ns)
     }
 
     fn end(&self, began_ns: u64) {
-        let now_ns = self.now_ns();
-        let rest_ns = now_ns.saturating_sub(began_ns).max(REST_MIN.as_nanos() as u64);
+        self.end_at(began_ns, self.now_ns());
+    }
+
+    fn may_begin(&self, now_ns: u64) -> bool {
+        now_ns >= self.rests_until_ns.load(Ordering::Relaxed)
+    }
+
+    fn end_at(&self, began_ns: u64, now_ns: u64) {
+        let rest_ns = now_ns.saturating_sub(began_ns).max(REST_MIN_NS);
         self.rests_until_ns.store(now_ns.saturating_add(rest_ns), Ordering::Relaxed);
     }
 }
@@ -407,17 +414,13 @@ mod tests {
     #[test]
     fn receiving_threads_rest_for_as_long_as_they_worked() {
         let pace = Pace::new();
-        let began = pace.begin().expect("nothing was handled yet");
-        pace.end(began.saturating_sub(1_000_000_000));
-        assert!(pace.begin().is_none());
-        let pace = Pace::new();
-        let began = pace.begin().expect("nothing was handled yet");
-        pace.end(began);
-        let end = Instant::now() + Duration::from_secs(30);
-        while pace.begin().is_none() {
-            assert!(Instant::now() < end, "it rests for longer than it has to");
-            std::hint::spin_loop();
-        }
-        assert!(pace.now_ns() >= began + REST_MIN.as_nanos() as u64);
+        let may = |now_ns| pace.may_begin(now_ns);
+        assert!(may(0), "nothing was handled yet");
+        pace.end_at(1_000_000, 4_000_000);
+        assert!(!may(4_000_000) && !may(6_999_999) && may(7_000_000));
+        pace.end_at(7_000_000, 7_000_001);
+        assert!(!may(7_020_000) && may(7_020_001), "a short time at least");
+        pace.end_at(1, 0);
+        assert!(!may(19_999) && may(20_000), "clocks of two threads may differ");
     }
 }

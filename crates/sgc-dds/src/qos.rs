@@ -6,6 +6,7 @@
 #![allow(non_upper_case_globals)]
 
 use std::ffi::{CStr, CString, c_char, c_void};
+use std::sync::Once;
 
 use cyclors::*;
 use sgc_ros::EndpointKind;
@@ -37,10 +38,18 @@ const XCDR2: i16 = DDS_DATA_REPRESENTATION_XCDR2 as i16;
 /// Cyclone's QoS object, deleted on drop.
 pub(crate) struct NativeQos(*mut dds_qos_t);
 
+/// Whether Cyclone's tables of policies are made.
+static TABLES: Once = Once::new();
+
 impl NativeQos {
     pub(crate) fn new() -> Result<Self, String> {
-        // SAFETY: no arguments; allocates.
-        let qos = unsafe { dds_create_qos() };
+        // SAFETY: no arguments; allocates. What is deleted was just made.
+        let qos = unsafe {
+            // Cyclone makes its tables of policies when the first QoS object ends, and heeds no other thread meanwhile: who
+            // ends another one then frees parts of it twice. A domain makes them, too, but need not be there.
+            TABLES.call_once(|| dds_delete_qos(dds_create_qos()));
+            dds_create_qos()
+        };
         if qos.is_null() { Err("out of memory".into()) } else { Ok(Self(qos)) }
     }
 
