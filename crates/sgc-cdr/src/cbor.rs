@@ -444,16 +444,7 @@ fn is_no(header: Header, expected: &'static str) -> ValueProblem {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::library::Library;
-
-    fn layout(text: &str) -> Layout {
-        let mut texts = |file: &crate::TypeName| match file.name() {
-            "M" => Some(text.to_owned()),
-            "Two" => Some("uint8 a\nuint16 b 7".to_owned()),
-            _ => None,
-        };
-        Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut texts).unwrap()
-    }
+    use crate::testing::layout;
 
     fn read(text: &str, cbor: &[u8]) -> Result<String, String> {
         let layout = layout(text);

@@ -364,15 +364,7 @@ fn within(found: usize, bound: Option<u32>) -> Result<(), Stop> {
 mod tests {
     use super::*;
     use crate::library::Library;
-
-    fn layout(text: &str) -> Layout {
-        let mut texts = |file: &crate::TypeName| match file.name() {
-            "M" => Some(text.to_owned()),
-            "Two" => Some("uint8 a\nuint16 b".to_owned()),
-            _ => None,
-        };
-        Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut texts).unwrap()
-    }
+    use crate::testing::layout;
 
     fn decode(text: &str, payload: &[u8]) -> Result<String, DecodeError> {
         layout(text).decode(&Bytes::copy_from_slice(payload)).map(|value| value.to_json())

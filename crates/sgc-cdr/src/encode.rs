@@ -252,16 +252,7 @@ mod tests {
 
     use super::*;
     use crate::encoding::{ByteOrder, CdrVersion, WideUnit};
-    use crate::library::Library;
-
-    fn layout(text: &str) -> Layout {
-        let mut texts = |file: &crate::TypeName| match file.name() {
-            "M" => Some(text.to_owned()),
-            "Two" => Some("uint8 a\nuint16 b 7".to_owned()),
-            _ => None,
-        };
-        Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut texts).unwrap()
-    }
+    use crate::testing::layout;
 
     fn record(members: Vec<(&str, Value)>) -> Value {
         Value::Record(members.into_iter().map(|(name, value)| (Arc::from(name), value)).collect())

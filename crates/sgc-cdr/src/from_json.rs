@@ -445,18 +445,7 @@ fn units(text: &[u8]) -> Vec<u16> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::library::Library;
-
-    fn layout(text: &str) -> Layout {
-        let mut texts = |file: &crate::TypeName| match file.name() {
-            "M" => Some(text.to_owned()),
-            "Two" => Some("uint8 a\nuint16 b 7".to_owned()),
-            "Empty" => Some(String::new()),
-            _ => None,
-        };
-        Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut texts).unwrap()
-    }
+    use crate::testing::layout;
 
     fn read(text: &str, json: &str) -> Result<String, String> {
         let layout = layout(text);

@@ -27,6 +27,8 @@ mod library;
 mod number;
 mod parse;
 mod path;
+#[cfg(test)]
+mod testing;
 mod value;
 mod yaml;
 
