@@ -1,0 +1,1 @@
+//! Programs without ROS on a ROS 2 network.
