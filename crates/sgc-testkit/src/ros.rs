@@ -47,9 +47,9 @@ struct Endpoint {
 }
 
 impl Endpoint {
-    /// True if a reader of that network hears this writer: not its own, and no proxy another proxy.
-    fn reaches(&self, network: u32, tagged: bool) -> bool {
-        self.network != network && !(self.tagged && tagged)
+    /// True if a reader of such a network hears this writer: no proxy hears a proxy, itself included.
+    fn reaches(&self, tagged: bool) -> bool {
+        !(self.tagged && tagged)
     }
 }
 
@@ -170,7 +170,7 @@ impl FakeDomain {
             let missed: Vec<_> = state
                 .endpoints
                 .values()
-                .filter(|w| reader.is_some() && w.reaches(network.network, network.tagged))
+                .filter(|w| reader.is_some() && w.reaches(network.tagged))
                 .filter(|w| matches(&w.discovered, &discovered))
                 .flat_map(|w| w.history.iter().cloned())
                 .collect();
@@ -421,7 +421,7 @@ impl FakeWriter {
             state
                 .endpoints
                 .values()
-                .filter(|r| writer.reaches(r.network, r.tagged) && matches(&writer.discovered, &r.discovered))
+                .filter(|r| writer.reaches(r.tagged) && matches(&writer.discovered, &r.discovered))
                 .filter_map(|r| r.reader.clone())
                 .collect()
         };
@@ -446,7 +446,7 @@ impl RosWriter for FakeWriter {
         let matched = state
             .endpoints
             .values()
-            .filter(|r| writer.reaches(r.network, r.tagged))
+            .filter(|r| writer.reaches(r.tagged))
             .filter(|r| r.reader.is_some() && matches(&writer.discovered, &r.discovered));
         matched.count() as u32
     }

@@ -1,0 +1,322 @@
+//! [`Feed`]: a reader of a topic, and all who hear it. Each topic is read once for everybody who takes it as it is offered.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Duration;
+
+use sgc_cdr::Layout;
+use sgc_ros::{
+    DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid, HandleSamples, Sample, SampleKind, dds_topic,
+    dds_type, reader_for, weakest,
+};
+use sgc_wire::{Durability, History, Qos, Reliability};
+use tokio::time::Instant;
+
+use crate::content::Form;
+use crate::error::GatewayError;
+use crate::graph::Graph;
+use crate::hub::Shared;
+use crate::message::Message;
+use crate::queue::{Overflow, Queue};
+use crate::ros::LocalReader;
+
+/// Messages of one writer that are kept for who subscribes later, of a topic whose writers do so too.
+const LATCHED_DEPTH_MAX: usize = 100;
+/// Bytes of them, of all writers of a topic.
+const LATCHED_BYTES_MAX: usize = 64 << 20;
+
+/// Which reader a subscriber shares.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct FeedKey {
+    pub(crate) topic: String,
+    pub(crate) type_name: String,
+    /// What to request; none takes each publisher as it is.
+    pub(crate) qos: Option<Qos>,
+}
+
+/// A reader and its subscribers.
+pub(crate) struct Feed {
+    pub(crate) key: FeedKey,
+    hub: Weak<Shared>,
+    outlets: Mutex<Outlets>,
+    /// The reader, and what it requests. Locked by who changes it, which may take a while.
+    reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
+}
+
+#[derive(Default)]
+struct Outlets {
+    queues: Vec<Weak<Queue>>,
+    latched: Latched,
+}
+
+/// What is kept for who subscribes later.
+#[derive(Default)]
+struct Latched {
+    is_on: bool,
+    /// Messages of each writer, the newest last.
+    writers: BTreeMap<Option<Guid>, VecDeque<Arc<Message>>>,
+    bytes: usize,
+    depth: usize,
+}
+
+impl Latched {
+    fn add(&mut self, message: &Arc<Message>) {
+        if !self.is_on {
+            return;
+        }
+        let kept = self.writers.entry(message.writer).or_default();
+        kept.push_back(Arc::clone(message));
+        self.bytes += message.payload.len();
+        let mut gone = 0;
+        while kept.len() > self.depth || (self.bytes - gone > LATCHED_BYTES_MAX && kept.len() > 1) {
+            gone += kept.pop_front().map_or(0, |old| old.payload.len());
+        }
+        self.bytes -= gone;
+    }
+
+    /// Whether it was heard before: a reader that is made anew hears again what writers kept.
+    fn has(&self, sample: &Sample) -> bool {
+        let newest = self.writers.get(&sample.writer).and_then(|kept| kept.back());
+        self.is_on && newest.is_some_and(|newest| sample.source_timestamp_ns <= newest.source_timestamp_ns)
+    }
+
+    fn retain(&mut self, is_there: impl Fn(&Guid) -> bool) {
+        self.writers.retain(|writer, _| writer.as_ref().is_none_or(&is_there));
+        self.bytes = self.writers.values().flatten().map(|message| message.payload.len()).sum();
+    }
+}
+
+/// What comes from a feed's reader.
+struct Intake(Arc<Feed>);
+
+impl HandleSamples for Intake {
+    fn handle(&mut self, sample: Sample) {
+        self.0.hand_out(sample);
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        let would_wait = {
+            let outlets = self.0.outlets();
+            let bytes = sample.payload.len();
+            outlets.queues.iter().filter_map(Weak::upgrade).any(|queue| queue.would_wait(bytes))
+        };
+        if would_wait {
+            return Err(sample);
+        }
+        self.0.hand_out(sample);
+        Ok(())
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        self.0.outlets().queues.iter().filter_map(Weak::upgrade).for_each(|q| q.add_dropped(samples));
+    }
+}
+
+impl Feed {
+    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>) -> Arc<Self> {
+        let (outlets, reader) = (Mutex::default(), Mutex::new(None));
+        Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
+    }
+
+    fn outlets(&self) -> MutexGuard<'_, Outlets> {
+        self.outlets.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn hand_out(&self, sample: Sample) {
+        if sample.kind != SampleKind::Write {
+            return;
+        }
+        let mut outlets = self.outlets();
+        if outlets.latched.has(&sample) {
+            return;
+        }
+        let message = Arc::new(Message::new(sample.payload, sample.writer, sample.source_timestamp_ns));
+        outlets.latched.add(&message);
+        let queues: Vec<_> = outlets.queues.iter().filter_map(Weak::upgrade).collect();
+        drop(outlets);
+        queues.iter().for_each(|queue| queue.push(&message));
+    }
+
+    /// Adds a subscriber, who hears first what is kept.
+    pub(crate) fn join(&self, queue: &Arc<Queue>) {
+        let mut outlets = self.outlets();
+        outlets.latched.writers.values().flatten().for_each(|message| queue.push(message));
+        outlets.queues.push(Arc::downgrade(queue));
+    }
+
+    fn leave(&self, queue: &Arc<Queue>) {
+        self.outlets().queues.retain(|other| !std::ptr::eq(other.as_ptr(), Arc::as_ptr(queue)));
+    }
+
+    /// What its reader is to request, as the graph is.
+    fn wanted(&self, graph: &Graph) -> EndpointSpec {
+        let FeedKey { topic, type_name, qos } = &self.key;
+        let info = graph.topics.get(topic);
+        let of_type = |info: &&crate::graph::EndpointInfo| info.type_name == *type_name;
+        let publishers: Vec<_> = info.iter().flat_map(|info| &info.publishers).filter(of_type).collect();
+        let qos = qos.clone().unwrap_or_else(|| {
+            let offers = weakest(publishers.iter().map(|publisher| &publisher.qos));
+            match offers {
+                // Heard are those who say so; with any other reliability, who comes first would not be.
+                None => Qos {
+                    reliability: Reliability::BestEffort,
+                    history: History::KeepLast(10),
+                    ..Qos::default()
+                },
+                Some(offer) => reader_for(&offer, publishers.len()),
+            }
+        });
+        EndpointSpec {
+            topic: dds_topic(topic),
+            type_name: dds_type(type_name),
+            keyless: publishers.first().is_none_or(|publisher| publisher.keyless),
+            type_hash: info.and_then(|info| info.type_hash(type_name)).map(str::to_owned),
+            qos,
+        }
+    }
+
+    /// Makes the reader, or makes it anew if what is offered has changed. May block.
+    pub(crate) fn adapt(self: &Arc<Self>) -> Result<(), GatewayError> {
+        let hub = self.hub.upgrade().ok_or(GatewayError::Stopping)?;
+        let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
+        let wanted = self.wanted(&hub.graph());
+        {
+            let mut outlets = self.outlets();
+            let latched = &mut outlets.latched;
+            latched.retain(|writer| hub.is_there(writer));
+            latched.is_on = wanted.qos.durability >= Durability::TransientLocal;
+            latched.depth = match wanted.qos.history {
+                History::KeepLast(depth) => (depth as usize).clamp(1, LATCHED_DEPTH_MAX),
+                History::KeepAll => LATCHED_DEPTH_MAX,
+            };
+        }
+        let is_as_wanted = |spec: &EndpointSpec| {
+            spec.qos == wanted.qos && spec.keyless == wanted.keyless && spec.type_name == wanted.type_name
+        };
+        if reader.as_ref().is_some_and(|(_, spec)| is_as_wanted(spec)) {
+            return Ok(());
+        }
+        if let Some((old, _)) = reader.take() {
+            hub.forget(&[old.guid()]);
+            drop(old);
+        }
+        let made = hub.ros.reader(&wanted, Box::new(Intake(Arc::clone(self))))?;
+        hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
+        *reader = Some((made, wanted));
+        Ok(())
+    }
+
+    /// Ends the reader, which holds the feed. May block.
+    pub(crate) fn end(&self) {
+        // Who waits for room would be waited for.
+        self.outlets().queues.drain(..).filter_map(|q| q.upgrade()).for_each(|queue| queue.close());
+        let reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(((reader, _), hub)) = reader.zip(self.hub.upgrade()) {
+            hub.forget(&[reader.guid()]);
+        }
+    }
+
+    pub(crate) fn is_unused(&self) -> bool {
+        self.outlets().queues.iter().all(|queue| queue.strong_count() == 0)
+    }
+}
+
+/// An endpoint of the gateway's own, as discovery would tell of it.
+pub(crate) fn own_endpoint(kind: EndpointKind, guid: Guid, spec: &EndpointSpec) -> DiscoveredEndpoint {
+    DiscoveredEndpoint {
+        kind,
+        guid,
+        topic: spec.topic.clone(),
+        type_name: spec.type_name.clone(),
+        keyless: spec.keyless,
+        type_hash: spec.type_hash.clone(),
+        qos: spec.qos.clone(),
+    }
+}
+
+/// A message for one subscriber.
+#[derive(Clone, Debug)]
+pub struct Delivery {
+    /// The message, shared with others.
+    pub message: Arc<Message>,
+    /// How many were left out for this subscriber until now: it took them too slowly.
+    pub dropped: u64,
+}
+
+/// How much one subscriber takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Intaking {
+    pub(crate) depth: usize,
+    pub(crate) bytes_max: usize,
+    pub(crate) interval_min: Option<Duration>,
+    pub(crate) overflow: Overflow,
+}
+
+/// What one client hears of a topic; ends when dropped.
+pub struct Subscription {
+    feed: Arc<Feed>,
+    queue: Arc<Queue>,
+    layout: Arc<Layout>,
+    interval_min: Option<Duration>,
+    not_before: Option<Instant>,
+}
+
+impl Subscription {
+    pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
+        let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.overflow));
+        feed.join(&queue);
+        Self { feed, queue, layout, interval_min: taking.interval_min, not_before: None }
+    }
+
+    /// The topic.
+    pub fn topic(&self) -> &str {
+        &self.feed.key.topic
+    }
+
+    /// Its ROS type.
+    pub fn type_name(&self) -> &str {
+        &self.feed.key.type_name
+    }
+
+    /// What its messages look like.
+    pub fn layout(&self) -> &Arc<Layout> {
+        &self.layout
+    }
+
+    /// A message in a form.
+    pub fn write(&self, message: &Message, form: Form) -> Result<bytes::Bytes, GatewayError> {
+        message.written(form, &self.layout)
+    }
+
+    /// Waits for the next message, and for the time at which one may come; `None` once the gateway stops. It may be given up
+    /// at any time, and nothing is lost.
+    pub async fn next(&mut self) -> Option<Delivery> {
+        if let Some(at) = self.not_before {
+            tokio::time::sleep_until(at).await;
+        }
+        let (message, dropped) = self.queue.next().await?;
+        self.not_before = self.interval_min.map(|interval| Instant::now() + interval);
+        Some(Delivery { message, dropped })
+    }
+
+    /// How many messages were left out until now.
+    pub fn dropped(&self) -> u64 {
+        self.queue.dropped()
+    }
+}
+
+impl std::fmt::Debug for Subscription {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Subscription").field("key", &self.feed.key).finish_non_exhaustive()
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        self.feed.leave(&self.queue);
+        self.queue.close();
+        if let Some(hub) = self.feed.hub.upgrade() {
+            hub.sweep();
+        }
+    }
+}

@@ -1,0 +1,324 @@
+//! [`Hub`]: the gateway's node on the local network, which all clients share.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Duration;
+
+use sgc_ros::{DiscoveredEndpoint, GraphNode, Guid, RosError};
+use sgc_wire::RosNode;
+use tokio::runtime::Handle;
+use tokio::sync::{Notify, watch};
+use tokio::task::JoinHandle;
+
+use crate::error::GatewayError;
+use crate::feed::{Feed, FeedKey, Intaking, Subscription};
+use crate::graph::{Graph, GraphState};
+use crate::ros::LocalRos;
+use crate::service::Caller;
+use crate::types::Types;
+
+/// How long changes of the graph are gathered before readers are adapted to them.
+const SETTLE: Duration = Duration::from_millis(20);
+/// How long a reader that nobody uses is kept: a page that is loaded again finds it.
+const LINGER: Duration = Duration::from_secs(2);
+/// Clients of services that are kept for further calls.
+const CALLERS_MAX: usize = 256;
+
+/// What a hub is to be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HubOptions {
+    /// Name of its ROS 2 node, of letters, digits and `_`.
+    pub node: String,
+}
+
+impl Default for HubOptions {
+    fn default() -> Self {
+        Self { node: "sgc_gateway".to_owned() }
+    }
+}
+
+/// The gateway's node. Clones are the same one; it ends with [`Hub::stop`].
+#[derive(Clone)]
+pub struct Hub {
+    pub(crate) shared: Arc<Shared>,
+    keeper: Arc<Keeper>,
+}
+
+struct Keeper(JoinHandle<()>);
+
+impl Drop for Keeper {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// What all clients share.
+pub(crate) struct Shared {
+    pub(crate) ros: Arc<dyn LocalRos>,
+    pub(crate) types: Types,
+    pub(crate) runtime: Handle,
+    node: Option<RosNode>,
+    node_name: String,
+    state: Mutex<GraphState>,
+    changed: watch::Sender<u64>,
+    feeds: Mutex<Vec<Arc<Feed>>>,
+    unused: Notify,
+    callers: Mutex<VecDeque<Arc<Caller>>>,
+}
+
+impl fmt::Debug for Hub {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Hub").field(&self.shared.node_name).finish()
+    }
+}
+
+impl Hub {
+    /// Joins the network, which has to be the hub's own.
+    ///
+    /// # Errors
+    /// What discovery says.
+    pub async fn start(
+        ros: Arc<dyn LocalRos>,
+        types: Types,
+        options: HubOptions,
+    ) -> Result<Self, GatewayError> {
+        let node = RosNode::new("/", &options.node, None);
+        let node_name = node.as_ref().map_or_else(|| format!("/{}", options.node), ToString::to_string);
+        let shared = Arc::new(Shared {
+            ros,
+            types,
+            runtime: Handle::current(),
+            node,
+            node_name,
+            state: Mutex::default(),
+            changed: watch::Sender::new(0),
+            feeds: Mutex::default(),
+            unused: Notify::new(),
+            callers: Mutex::default(),
+        });
+        let weak = Arc::downgrade(&shared);
+        shared
+            .blocking(move |shared| {
+                shared.ros.discover(Box::new(move |event| {
+                    if let Some(shared) = weak.upgrade() {
+                        shared.state().handle(event);
+                        shared.tell();
+                    }
+                }))?;
+                shared.announce();
+                Ok(())
+            })
+            .await?;
+        let keeper = tokio::spawn(keep(Arc::downgrade(&shared), shared.changed.subscribe()));
+        Ok(Self { shared, keeper: Arc::new(Keeper(keeper)) })
+    }
+
+    /// What is on the network.
+    pub fn graph(&self) -> Arc<Graph> {
+        self.shared.graph()
+    }
+
+    /// Marked as changed whenever the graph has changed.
+    pub fn graph_changes(&self) -> watch::Receiver<u64> {
+        self.shared.changed.subscribe()
+    }
+
+    /// What messages look like.
+    pub fn types(&self) -> &Types {
+        &self.shared.types
+    }
+
+    /// Full name of the gateway's node.
+    pub fn node_name(&self) -> &str {
+        &self.shared.node_name
+    }
+
+    /// How many readers there are, shared by all who subscribe.
+    pub fn readers(&self) -> usize {
+        lock(&self.shared.feeds).len()
+    }
+
+    /// Leaves the network: subscriptions end, and calls are not answered any more.
+    pub async fn stop(&self) {
+        self.keeper.0.abort();
+        let _ = self
+            .shared
+            .blocking(|shared| {
+                let feeds = std::mem::take(&mut *lock(&shared.feeds));
+                feeds.iter().for_each(|feed| feed.end());
+                let callers = std::mem::take(&mut *lock(&shared.callers));
+                drop(callers);
+                let _ = shared.ros.announce(&[]);
+                Ok(())
+            })
+            .await;
+    }
+}
+
+/// Adapts readers to the graph, and ends those that nobody uses.
+async fn keep(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
+    loop {
+        let Some(strong) = shared.upgrade() else { return };
+        let unused = strong.unused.notified();
+        tokio::select! {
+            result = changed.changed() => {
+                if result.is_err() {
+                    return;
+                }
+                tokio::time::sleep(SETTLE).await;
+                changed.mark_unchanged();
+                let done = strong.blocking(|shared| {
+                    let feeds = lock(&shared.feeds).clone();
+                    for feed in feeds.iter().filter(|feed| feed.key.qos.is_none()) {
+                        if let Err(error) = feed.adapt() {
+                            tracing::warn!(%error, "a reader could not be made anew");
+                        }
+                    }
+                    shared.announce();
+                    Ok(())
+                });
+                let _ = done.await;
+                changed.mark_unchanged();
+            }
+            () = unused => {
+                tokio::time::sleep(LINGER).await;
+                let done = strong.blocking(|shared| {
+                    let mut gone = Vec::new();
+                    lock(&shared.feeds).retain(|feed| {
+                        let is_used = !feed.is_unused();
+                        if !is_used {
+                            gone.push(Arc::clone(feed));
+                        }
+                        is_used
+                    });
+                    gone.iter().for_each(|feed| feed.end());
+                    Ok(())
+                });
+                let _ = done.await;
+            }
+        }
+    }
+}
+
+impl Shared {
+    fn state(&self) -> MutexGuard<'_, GraphState> {
+        lock(&self.state)
+    }
+
+    pub(crate) fn graph(&self) -> Arc<Graph> {
+        self.state().graph(&self.node_name)
+    }
+
+    pub(crate) fn is_there(&self, guid: &Guid) -> bool {
+        self.state().is_there(guid)
+    }
+
+    fn tell(&self) {
+        self.changed.send_modify(|version| *version += 1);
+    }
+
+    /// Counts an endpoint of the gateway's own as there.
+    pub(crate) fn know(&self, endpoint: DiscoveredEndpoint) {
+        self.state().add_own(endpoint);
+        self.tell();
+    }
+
+    /// The opposite.
+    pub(crate) fn forget(&self, guids: &[Guid]) {
+        guids.iter().for_each(|guid| self.state().remove_own(guid));
+        self.tell();
+    }
+
+    /// Has the local graph show the gateway's node. May block.
+    fn announce(&self) {
+        let Some(node) = self.node.clone() else { return };
+        let (readers, writers) = self.state().own();
+        if let Err(error) = self.ros.announce(&[GraphNode { node, readers, writers }]) {
+            tracing::debug!(%error, "the gateway's node could not be announced");
+        }
+    }
+
+    /// Something may be unused from now on.
+    pub(crate) fn sweep(&self) {
+        self.unused.notify_one();
+    }
+
+    /// Runs what may block on a thread that may.
+    pub(crate) async fn blocking<T: Send + 'static>(
+        self: &Arc<Self>,
+        work: impl FnOnce(&Arc<Self>) -> Result<T, RosError> + Send + 'static,
+    ) -> Result<T, GatewayError> {
+        self.run(move |shared| work(shared).map_err(GatewayError::Ros)).await
+    }
+
+    /// The same for what fails in more ways.
+    pub(crate) async fn run<T: Send + 'static>(
+        self: &Arc<Self>,
+        work: impl FnOnce(&Arc<Self>) -> Result<T, GatewayError> + Send + 'static,
+    ) -> Result<T, GatewayError> {
+        let shared = Arc::clone(self);
+        let done = self.runtime.spawn_blocking(move || work(&shared)).await;
+        done.unwrap_or(Err(GatewayError::Stopping))
+    }
+
+    /// Subscribes, with the reader that others have if there is one.
+    pub(crate) async fn subscribe(
+        self: &Arc<Self>,
+        key: FeedKey,
+        taking: Intaking,
+    ) -> Result<Subscription, GatewayError> {
+        self.run(move |shared| {
+            let layout = shared.layout_of(&key)?;
+            // A subscriber that is waited for has a reader of its own.
+            let may_share = taking.overflow == crate::queue::Overflow::DropOldest;
+            let (feed, is_new) = {
+                let mut feeds = lock(&shared.feeds);
+                match feeds.iter().find(|feed| may_share && feed.key == key) {
+                    Some(feed) => (Arc::clone(feed), false),
+                    None => {
+                        let feed = Feed::new(key, shared);
+                        feeds.push(Arc::clone(&feed));
+                        (feed, true)
+                    }
+                }
+            };
+            // What a new reader hears first is for who made it, so it joins before.
+            let subscription = Subscription::new(Arc::clone(&feed), layout, taking);
+            if is_new {
+                feed.adapt()?;
+            }
+            Ok(subscription)
+        })
+        .await
+    }
+
+    fn layout_of(&self, key: &FeedKey) -> Result<Arc<sgc_cdr::Layout>, GatewayError> {
+        let graph = self.graph();
+        let hash = graph.topics.get(&key.topic).and_then(|info| info.type_hash(&key.type_name));
+        self.types.layout(&key.type_name, hash)
+    }
+
+    /// What calls a service, made if nobody has called it lately. May block.
+    pub(crate) fn caller(
+        self: &Arc<Self>,
+        service: &str,
+        type_name: &str,
+    ) -> Result<Arc<Caller>, GatewayError> {
+        let mut callers = lock(&self.callers);
+        if let Some(at) = callers.iter().position(|caller| caller.is_for(service, type_name))
+            && let Some(caller) = callers.remove(at)
+        {
+            callers.push_front(Arc::clone(&caller));
+            return Ok(caller);
+        }
+        let caller = Arc::new(Caller::new(self, service, type_name)?);
+        callers.push_front(Arc::clone(&caller));
+        callers.truncate(CALLERS_MAX);
+        Ok(caller)
+    }
+}
+
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

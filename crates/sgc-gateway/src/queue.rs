@@ -1,0 +1,175 @@
+//! [`Queue`]: what waits for one subscriber, bounded by number and bytes.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+
+use crate::message::Message;
+
+/// What is done with a message that there is no room for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Overflow {
+    /// The oldest gives way, and is counted.
+    #[default]
+    DropOldest,
+    /// The reader waits, and with it everybody who subscribes with it: so only for those who have one of their own.
+    Wait,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    messages: VecDeque<Arc<Message>>,
+    bytes: usize,
+    dropped: u64,
+    is_closed: bool,
+}
+
+/// What waits for one subscriber.
+#[derive(Debug)]
+pub(crate) struct Queue {
+    state: Mutex<State>,
+    filled: Notify,
+    room: Condvar,
+    depth: usize,
+    bytes_max: usize,
+    overflow: Overflow,
+}
+
+impl Queue {
+    pub(crate) fn new(depth: usize, bytes_max: usize, overflow: Overflow) -> Self {
+        let (state, filled, room) = (Mutex::default(), Notify::new(), Condvar::new());
+        Self { state, filled, room, depth: depth.max(1), bytes_max, overflow }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn has_room(&self, state: &State, bytes: usize) -> bool {
+        let fits = state.messages.len() < self.depth && state.bytes + bytes <= self.bytes_max;
+        // One that is longer than the bound alone passes alone.
+        fits || state.messages.is_empty()
+    }
+
+    /// Whether a message of that length would have to wait.
+    pub(crate) fn would_wait(&self, bytes: usize) -> bool {
+        if self.overflow == Overflow::DropOldest {
+            return false;
+        }
+        let state = self.lock();
+        !state.is_closed && !self.has_room(&state, bytes)
+    }
+
+    /// Puts a message behind the others.
+    pub(crate) fn push(&self, message: &Arc<Message>) {
+        let bytes = message.payload.len();
+        let mut state = self.lock();
+        while !state.is_closed && !self.has_room(&state, bytes) {
+            match self.overflow {
+                Overflow::Wait => state = self.room.wait(state).unwrap_or_else(PoisonError::into_inner),
+                Overflow::DropOldest => {
+                    if let Some(oldest) = state.messages.pop_front() {
+                        state.bytes -= oldest.payload.len();
+                        state.dropped += 1;
+                    }
+                }
+            }
+        }
+        if state.is_closed {
+            return;
+        }
+        state.bytes += bytes;
+        state.messages.push_back(Arc::clone(message));
+        drop(state);
+        self.filled.notify_one();
+    }
+
+    /// Counts what was lost before it came here.
+    pub(crate) fn add_dropped(&self, messages: u64) {
+        self.lock().dropped += messages;
+    }
+
+    /// The oldest, if any waits, and how many were dropped until now.
+    pub(crate) fn pop(&self) -> Option<(Arc<Message>, u64)> {
+        let mut state = self.lock();
+        let message = state.messages.pop_front()?;
+        state.bytes -= message.payload.len();
+        let dropped = state.dropped;
+        drop(state);
+        if self.overflow == Overflow::Wait {
+            self.room.notify_one();
+        }
+        Some((message, dropped))
+    }
+
+    /// Waits for one; `None` once it is closed and empty.
+    pub(crate) async fn next(&self) -> Option<(Arc<Message>, u64)> {
+        loop {
+            let filled = self.filled.notified();
+            if let Some(next) = self.pop() {
+                return Some(next);
+            }
+            if self.lock().is_closed {
+                return None;
+            }
+            filled.await;
+        }
+    }
+
+    pub(crate) fn dropped(&self) -> u64 {
+        self.lock().dropped
+    }
+
+    /// Nothing comes any more; who waits for room goes on.
+    pub(crate) fn close(&self) {
+        self.lock().is_closed = true;
+        self.room.notify_all();
+        self.filled.notify_one();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(bytes: usize) -> Arc<Message> {
+        Arc::new(Message::new(vec![0; bytes].into(), None, 0))
+    }
+
+    #[tokio::test]
+    async fn the_oldest_gives_way_and_is_counted() {
+        let queue = Queue::new(2, 100, Overflow::DropOldest);
+        for bytes in [10, 20, 30] {
+            queue.push(&message(bytes));
+        }
+        let lengths = |next: Option<(Arc<Message>, u64)>| next.map(|(m, dropped)| (m.payload.len(), dropped));
+        assert_eq!(lengths(queue.next().await), Some((20, 1)));
+        // By bytes, too; what is longer than all there may be comes alone.
+        queue.push(&message(90));
+        assert_eq!((lengths(queue.pop()), queue.dropped()), (Some((90, 2)), 2));
+        queue.push(&message(1));
+        queue.push(&message(1000));
+        assert_eq!(lengths(queue.pop()), Some((1000, 3)));
+        queue.close();
+        assert!(queue.next().await.is_none());
+    }
+
+    #[test]
+    fn who_waits_for_room_goes_on_when_there_is_some_or_the_end() {
+        let queue = Arc::new(Queue::new(1, 100, Overflow::Wait));
+        queue.push(&message(1));
+        assert!(queue.would_wait(1));
+        let pusher = {
+            let queue = queue.clone();
+            std::thread::spawn(move || {
+                queue.push(&message(2));
+                queue.push(&message(3));
+            })
+        };
+        assert_eq!(queue.pop().unwrap().0.payload.len(), 1);
+        queue.close();
+        pusher.join().unwrap();
+        assert!(!queue.would_wait(1));
+    }
+}

@@ -1,0 +1,261 @@
+//! [`Caller`] calls a service for all clients; [`Serving`] serves one for a client.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+use std::sync::{Arc, Mutex, Weak};
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_cdr::Layout;
+use sgc_ros::{
+    EndpointKind, EndpointSpec, RequestId, RosClient, RosError, RosServer, ServiceSpec, ServiceTopic,
+    service_qos,
+};
+use tokio::sync::{mpsc, oneshot};
+
+use crate::content::{Content, Form, convert};
+use crate::error::GatewayError;
+use crate::feed::own_endpoint;
+use crate::hub::{Shared, lock};
+
+/// Replies that came before it was known what they answer.
+const EARLY_MAX: usize = 64;
+/// Requests that wait for a client that serves; then those who ask wait.
+const REQUESTS_MAX: usize = 256;
+
+/// Layouts of both halves of a service.
+#[derive(Clone, Debug)]
+pub(crate) struct Halves {
+    pub(crate) request: Arc<Layout>,
+    pub(crate) reply: Arc<Layout>,
+}
+
+impl Halves {
+    /// Of a service's type; may read files.
+    pub(crate) fn find(shared: &Shared, type_name: &str) -> Result<Self, GatewayError> {
+        let layout = |half: &str| shared.types.layout(&format!("{type_name}_{half}"), None);
+        Ok(Self { request: layout("Request")?, reply: layout("Response")? })
+    }
+}
+
+fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
+    let half = |half: ServiceTopic, layout: &Layout| EndpointSpec {
+        topic: half.dds_topic(service),
+        type_name: half.dds_type(type_name),
+        keyless: true,
+        type_hash: Some(layout.type_hash()),
+        qos: service_qos(),
+    };
+    ServiceSpec {
+        request: half(ServiceTopic::Request, &halves.request),
+        reply: half(ServiceTopic::Reply, &halves.reply),
+    }
+}
+
+#[derive(Default)]
+struct Pending {
+    asked: BTreeMap<i64, oneshot::Sender<Bytes>>,
+    early: VecDeque<(i64, Bytes)>,
+}
+
+/// A client of a service, shared by all who call it.
+pub(crate) struct Caller {
+    service: String,
+    type_name: String,
+    pub(crate) halves: Halves,
+    client: Box<dyn RosClient>,
+    pending: Arc<Mutex<Pending>>,
+    shared: Weak<Shared>,
+}
+
+/// A call under way: nobody waits for its reply once this is dropped.
+struct Asked<'c> {
+    caller: &'c Caller,
+    number: i64,
+}
+
+impl Drop for Asked<'_> {
+    fn drop(&mut self) {
+        lock(&self.caller.pending).asked.remove(&self.number);
+    }
+}
+
+impl Caller {
+    /// May block.
+    pub(crate) fn new(shared: &Arc<Shared>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
+        let halves = Halves::find(shared, type_name)?;
+        let pending: Arc<Mutex<Pending>> = Arc::default();
+        let answered = Arc::clone(&pending);
+        let spec = spec(service, type_name, &halves);
+        let client = shared.ros.client(
+            &spec,
+            Box::new(move |id: RequestId, payload: Bytes| {
+                let mut pending = lock(&answered);
+                match pending.asked.remove(&id.number) {
+                    Some(waiting) => drop(waiting.send(payload)),
+                    None => {
+                        pending.early.push_back((id.number, payload));
+                        if pending.early.len() > EARLY_MAX {
+                            pending.early.pop_front();
+                        }
+                    }
+                }
+            }),
+        )?;
+        let [reader, writer] = client.guids();
+        shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.reply));
+        shared.know(own_endpoint(EndpointKind::Writer, writer, &spec.request));
+        let (service, type_name) = (service.to_owned(), type_name.to_owned());
+        Ok(Self { service, type_name, halves, client, pending, shared: Arc::downgrade(shared) })
+    }
+
+    pub(crate) fn is_for(&self, service: &str, type_name: &str) -> bool {
+        self.service == service && self.type_name == type_name
+    }
+
+    /// Asks, and waits for the reply.
+    pub(crate) async fn call(self: &Arc<Self>, payload: Bytes, max: Duration) -> Result<Bytes, GatewayError> {
+        let shared = self.shared.upgrade().ok_or(GatewayError::Stopping)?;
+        let caller = Arc::clone(self);
+        let asked = shared.blocking(move |_| caller.client.request(payload)).await;
+        let number = match asked {
+            Ok(id) => id.number,
+            Err(GatewayError::Ros(RosError::NoPeer { .. })) => {
+                return Err(GatewayError::NoServer { name: self.service.clone() });
+            }
+            Err(error) => return Err(error),
+        };
+        let (send, reply) = oneshot::channel();
+        let _asked = Asked { caller: self, number };
+        {
+            let mut pending = lock(&self.pending);
+            match pending.early.iter().position(|(early, _)| *early == number) {
+                Some(at) => {
+                    if let Some((_, payload)) = pending.early.remove(at) {
+                        return Ok(payload);
+                    }
+                }
+                None => drop(pending.asked.insert(number, send)),
+            }
+        }
+        match tokio::time::timeout(max, reply).await {
+            Ok(Ok(payload)) => Ok(payload),
+            Ok(Err(_)) => Err(GatewayError::Stopping),
+            Err(_) => Err(GatewayError::Timeout {
+                name: self.service.clone(),
+                waited_ms: u64::try_from(max.as_millis()).unwrap_or(u64::MAX),
+            }),
+        }
+    }
+}
+
+impl Drop for Caller {
+    fn drop(&mut self) {
+        if let Some(shared) = self.shared.upgrade() {
+            shared.forget(&self.client.guids());
+        }
+    }
+}
+
+/// What a client that serves is asked.
+#[derive(Debug)]
+pub struct Request {
+    /// By this it is answered.
+    pub id: RequestId,
+    /// The serialised request.
+    pub payload: Bytes,
+}
+
+/// A service that a client serves; ends when dropped.
+pub struct Serving {
+    shared: Arc<Shared>,
+    server: Arc<dyn RosServer>,
+    halves: Halves,
+    requests: mpsc::Receiver<Request>,
+    service: String,
+}
+
+/// Answers requests of a [`Serving`], wherever they are worked on.
+#[derive(Clone)]
+pub struct Replier {
+    shared: Arc<Shared>,
+    server: Arc<dyn RosServer>,
+    halves: Halves,
+}
+
+impl Replier {
+    /// Answers a request.
+    pub async fn reply(&self, id: RequestId, content: &Content) -> Result<(), GatewayError> {
+        let payload = content.to_cdr(&self.halves.reply)?;
+        let server = Arc::clone(&self.server);
+        self.shared.blocking(move |_| server.reply(&id, payload)).await
+    }
+}
+
+impl fmt::Debug for Replier {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Replier").finish_non_exhaustive()
+    }
+}
+
+impl Serving {
+    pub(crate) async fn new(
+        shared: &Arc<Shared>,
+        service: String,
+        type_name: String,
+    ) -> Result<Self, GatewayError> {
+        shared
+            .run(move |shared| {
+                let halves = Halves::find(shared, &type_name)?;
+                let spec = spec(&service, &type_name, &halves);
+                let (send, requests) = mpsc::channel(REQUESTS_MAX);
+                // It waits for room on the server's own thread.
+                let handler = Box::new(move |id, payload| drop(send.blocking_send(Request { id, payload })));
+                let server: Arc<dyn RosServer> = Arc::from(shared.ros.server(&spec, handler)?);
+                let [reader, writer] = server.guids();
+                shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.request));
+                shared.know(own_endpoint(EndpointKind::Writer, writer, &spec.reply));
+                Ok(Self { shared: Arc::clone(shared), server, halves, requests, service })
+            })
+            .await
+    }
+
+    /// The service.
+    pub fn service(&self) -> &str {
+        &self.service
+    }
+
+    /// Waits for a request; `None` once the gateway stops.
+    pub async fn next(&mut self) -> Option<Request> {
+        self.requests.recv().await
+    }
+
+    /// A request in a form.
+    pub fn write(&self, request: &Request, form: Form) -> Result<Bytes, GatewayError> {
+        convert(&self.halves.request, &request.payload, form)
+    }
+
+    /// What answers.
+    pub fn replier(&self) -> Replier {
+        let (shared, server) = (Arc::clone(&self.shared), Arc::clone(&self.server));
+        Replier { shared, server, halves: self.halves.clone() }
+    }
+}
+
+impl fmt::Debug for Serving {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Serving").field("service", &self.service).finish_non_exhaustive()
+    }
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        // Who waits for room in there goes on.
+        self.requests.close();
+        let (shared, server) = (Arc::clone(&self.shared), Arc::clone(&self.server));
+        self.shared.runtime.spawn_blocking(move || {
+            shared.forget(&server.guids());
+            drop(server);
+        });
+    }
+}

@@ -1,0 +1,249 @@
+//! [`Session`]: one client's part in the hub, within its scope and its bounds.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_ros::is_topic_name;
+use sgc_wire::Qos;
+
+use crate::access::{Client, Right};
+use crate::content::{Content, Form, convert};
+use crate::error::GatewayError;
+use crate::feed::{FeedKey, Intaking, Subscription};
+use crate::graph::Graph;
+use crate::hub::Hub;
+use crate::publisher::Publication;
+use crate::queue::Overflow;
+use crate::service::Serving;
+use crate::types::InterfaceType;
+
+/// What one client may have at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SessionLimits {
+    /// Bytes that wait for it in all its subscriptions together; each alone may hold as many.
+    pub waiting_bytes_max: usize,
+    /// Subscriptions.
+    pub subscriptions_max: usize,
+    /// Topics that it publishes.
+    pub publications_max: usize,
+    /// Services and actions that it serves.
+    pub servings_max: usize,
+    /// Calls under way.
+    pub calls_max: usize,
+}
+
+impl Default for SessionLimits {
+    fn default() -> Self {
+        Self {
+            waiting_bytes_max: 64 << 20,
+            subscriptions_max: 1024,
+            publications_max: 256,
+            servings_max: 256,
+            calls_max: 256,
+        }
+    }
+}
+
+/// What to hear.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Subscribe {
+    /// ROS topic.
+    pub topic: String,
+    /// ROS type, `std_msgs/msg/String` or `std_msgs/String`; none takes that of the topic's publishers.
+    pub type_name: Option<String>,
+    /// What to request; none takes each publisher as it is.
+    pub qos: Option<Qos>,
+    /// Messages that may wait; 0 is 1.
+    pub depth: usize,
+    /// At most one message in that time.
+    pub interval_min: Option<Duration>,
+    /// Rather than leaving messages out, the local network is made to wait, as far as it can be: it takes a reader of its own.
+    pub waits: bool,
+}
+
+/// What to publish.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Advertise {
+    /// ROS topic.
+    pub topic: String,
+    /// ROS type; none takes that which the topic has already.
+    pub type_name: Option<String>,
+    /// What to offer.
+    pub qos: Qos,
+}
+
+/// One client's part in the hub.
+#[derive(Debug)]
+pub struct Session {
+    hub: Hub,
+    client: Client,
+    limits: SessionLimits,
+    calls: AtomicUsize,
+}
+
+/// A call of a client's, counted while it lasts.
+struct Counted<'s>(&'s AtomicUsize);
+
+impl Drop for Counted<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Session {
+    /// A client's.
+    pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
+        Self { hub: hub.clone(), client, limits, calls: AtomicUsize::new(0) }
+    }
+
+    /// Who it is.
+    pub fn client(&self) -> &Client {
+        &self.client
+    }
+
+    /// The hub.
+    pub fn hub(&self) -> &Hub {
+        &self.hub
+    }
+
+    /// What it may have. Protocols count what they hold by [`Session::check_count`].
+    pub fn limits(&self) -> &SessionLimits {
+        &self.limits
+    }
+
+    /// What the client may see of the graph: what it may use in one way or another.
+    pub fn graph(&self) -> Graph {
+        let scope = &self.client.scope;
+        let any = |rights: [Right; 2], name: &str| rights.iter().any(|right| scope.permits(*right, name));
+        self.hub.graph().filtered(
+            |topic| {
+                any([Right::Subscribe, Right::Publish], topic)
+                    || any([Right::Call, Right::Serve], action_of(topic))
+            },
+            |service| any([Right::Call, Right::Serve], action_of(service)),
+        )
+    }
+
+    /// Refuses what is beyond a bound of [`SessionLimits`].
+    pub fn check_count(&self, what: &'static str, now: usize, max: usize) -> Result<(), GatewayError> {
+        if now >= max { Err(GatewayError::TooMany { what, max }) } else { Ok(()) }
+    }
+
+    /// Refuses names that are none, and what the scope does not have.
+    pub fn check(&self, right: Right, name: &str) -> Result<(), GatewayError> {
+        if !is_topic_name(name) {
+            return Err(GatewayError::Name { name: name.to_owned() });
+        }
+        if !self.client.scope.permits(right, name) {
+            let (client, name) = (self.client.name.to_string(), name.to_owned());
+            return Err(GatewayError::Denied { client, right, name });
+        }
+        Ok(())
+    }
+
+    /// The type of a topic: as it is said, else as the network has it.
+    fn topic_type(&self, topic: &str, said: Option<&str>) -> Result<String, GatewayError> {
+        let graph = self.hub.graph();
+        let actual = graph.topics.get(topic).and_then(|info| info.type_name());
+        let Some(said) = said.filter(|said| !said.is_empty() && *said != "*") else {
+            return actual
+                .map(str::to_owned)
+                .ok_or_else(|| GatewayError::TypeUnknown { name: topic.to_owned() });
+        };
+        let said = InterfaceType::Message.full_name(said)?;
+        let info = graph.topics.get(topic);
+        let has = |info: &crate::graph::TopicInfo| {
+            info.publishers.iter().chain(&info.subscribers).any(|end| end.type_name == said)
+        };
+        match actual {
+            Some(actual) if !info.is_some_and(has) => {
+                let (name, actual) = (topic.to_owned(), actual.to_owned());
+                Err(GatewayError::OtherType { name, actual, wanted: said })
+            }
+            _ => Ok(said),
+        }
+    }
+
+    /// The type of a service: as it is said, else as the network has it.
+    pub fn service_type(&self, service: &str, said: Option<&str>) -> Result<String, GatewayError> {
+        let graph = self.hub.graph();
+        let actual = graph.services.get(service).map(|info| info.type_name.clone());
+        match said.filter(|said| !said.is_empty()) {
+            None => actual.ok_or_else(|| GatewayError::TypeUnknown { name: service.to_owned() }),
+            Some(said) => {
+                let wanted = InterfaceType::Service.full_name(said)?;
+                match actual {
+                    Some(actual) if actual != wanted => {
+                        Err(GatewayError::OtherType { name: service.to_owned(), actual, wanted })
+                    }
+                    _ => Ok(wanted),
+                }
+            }
+        }
+    }
+
+    /// Subscribes.
+    pub async fn subscribe(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
+        self.check(Right::Subscribe, &wanted.topic)?;
+        self.subscribe_checked(wanted).await
+    }
+
+    /// Subscribes to what belongs to something that the client may use.
+    pub(crate) async fn subscribe_checked(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
+        let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
+        let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos };
+        let taking = Intaking {
+            depth: wanted.depth,
+            bytes_max: self.limits.waiting_bytes_max,
+            interval_min: wanted.interval_min,
+            overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
+        };
+        self.hub.shared.subscribe(key, taking).await
+    }
+
+    /// Becomes a publisher.
+    pub async fn advertise(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
+        self.check(Right::Publish, &wanted.topic)?;
+        self.advertise_checked(wanted).await
+    }
+
+    /// Becomes a publisher of what belongs to something that the client may serve.
+    pub(crate) async fn advertise_checked(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
+        let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
+        Publication::new(&self.hub.shared, wanted.topic, type_name, wanted.qos).await
+    }
+
+    /// Calls a service and waits for its reply, which comes in the form that is asked for.
+    pub async fn call(
+        &self,
+        service: &str,
+        type_name: Option<&str>,
+        request: &Content,
+        form: Form,
+        max: Duration,
+    ) -> Result<Bytes, GatewayError> {
+        self.check(Right::Call, action_of(service))?;
+        let type_name = self.service_type(service, type_name)?;
+        self.check_count("calls under way", self.calls.load(Ordering::Relaxed), self.limits.calls_max)?;
+        self.calls.fetch_add(1, Ordering::Relaxed);
+        let _counted = Counted(&self.calls);
+        let name = service.to_owned();
+        let caller = self.hub.shared.run(move |shared| shared.caller(&name, &type_name)).await?;
+        let payload = request.to_cdr(&caller.halves.request)?;
+        let reply = caller.call(payload, max).await?;
+        convert(&caller.halves.reply, &reply, form)
+    }
+
+    /// Serves a service.
+    pub async fn serve(&self, service: &str, type_name: Option<&str>) -> Result<Serving, GatewayError> {
+        self.check(Right::Serve, action_of(service))?;
+        let type_name = self.service_type(service, type_name)?;
+        Serving::new(&self.hub.shared, service.to_owned(), type_name).await
+    }
+}
+
+/// The action that a topic or service is a part of; any other is itself.
+fn action_of(name: &str) -> &str {
+    name.split_once("/_action/").map_or(name, |(action, _)| action)
+}
