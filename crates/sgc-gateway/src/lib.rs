@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 mod access;
+mod action;
 mod content;
 mod error;
 mod feed;
@@ -24,6 +25,9 @@ mod session;
 mod types;
 
 pub use access::{Client, Right, Scope};
+pub use action::{
+    ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
+};
 pub use content::{Content, Form};
 pub use error::{ErrorKind, GatewayError};
 pub use feed::{Delivery, Subscription};
