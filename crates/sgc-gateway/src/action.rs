@@ -425,7 +425,7 @@ impl ActionReplier {
     /// Tells of a goal that is worked on.
     pub async fn feedback(&self, id: &GoalId, content: &Content) -> Result<(), GatewayError> {
         let server = &self.0;
-        if !lock(&server.goals).get(id).is_some_and(|goal| !goal.status.is_end()) {
+        if lock(&server.goals).get(id).is_none_or(|goal| goal.status.is_end()) {
             return Err(server.no_goal());
         }
         let feedback = content.value(&server.layouts.feedback)?;
