@@ -1,4 +1,5 @@
 //! Clients that send goals to clients that serve actions, on a network in memory.
+#![allow(clippy::unwrap_used)]
 
 mod support;
 
