@@ -7,12 +7,14 @@ use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
+use sgc_wire::UnixMillis;
 use tokio::sync::watch;
 use tonic::{Request, Status};
 
 use super::GrpcOptions;
+use super::connection::Connection;
 use super::fault::Fault;
-use super::gate::{Caller, Connection, Gate, Refusal};
+use crate::access::{Access, Admission, Client, Denied};
 use crate::error::GatewayError;
 use crate::feed::{Subscription, SubscriptionEnd};
 use crate::hub::{Hub, lock};
@@ -21,10 +23,13 @@ use crate::session::Session;
 /// Credentials that may be in use on one connection at a time.
 const CREDENTIALS_MAX: usize = 16;
 
+/// Access as it is at present.
+type Gate = Arc<dyn Fn() -> Access + Send + Sync>;
+
 /// Admits clients.
 pub(super) struct Clients {
     hub: Hub,
-    gate: Arc<dyn Gate>,
+    access: Gate,
     options: GrpcOptions,
     stopping: watch::Receiver<bool>,
 }
@@ -43,13 +48,8 @@ pub(super) struct Known {
 }
 
 impl Clients {
-    pub(super) fn new(
-        hub: Hub,
-        gate: Arc<dyn Gate>,
-        options: GrpcOptions,
-        stopping: watch::Receiver<bool>,
-    ) -> Self {
-        Self { hub, gate, options, stopping }
+    pub(super) fn new(hub: Hub, access: Gate, options: GrpcOptions, stopping: watch::Receiver<bool>) -> Self {
+        Self { hub, access, options, stopping }
     }
 
     pub(super) fn hub(&self) -> &Hub {
@@ -81,17 +81,29 @@ impl Clients {
             }),
             origin: origin.map(Box::from),
         };
+        let access = (self.access)();
         let mut known = lock(connection.known());
         if let Some(at) = known.iter().position(|known| known.shown == shown) {
             let guest = &known[at].guest;
-            match self.gate.still_admits(guest.session.client()) {
+            match still_admits(&access, guest.session.client()) {
                 Ok(()) if !guest.has_ended() => return Ok(Arc::clone(guest)),
                 Ok(()) => drop(known.remove(at)),
                 // By the rules as they are now it may be admitted anew.
                 Err(why) => known.remove(at).guest.end(why),
             }
         }
-        let client = self.gate.admit(&Caller { connection, token, origin })?;
+        let client = access.admit(&Admission {
+            peer: connection.peer(),
+            encrypted: connection.is_encrypted(),
+            origin,
+            token,
+            certificate: connection.certificate(),
+            now: now(),
+        });
+        let client = client.map_err(|why| {
+            tracing::debug!(%why, peer = %connection.peer(), "a gRPC client is not admitted");
+            Fault::Denied(why)
+        })?;
         tracing::debug!(client = %client.name, peer = %connection.peer(), "a gRPC client is admitted");
         if known.len() >= CREDENTIALS_MAX {
             let idle = known.iter().position(|known| Arc::strong_count(&known.guest) == 1);
@@ -106,12 +118,21 @@ impl Clients {
         known.push(Known { shown, guest: Arc::clone(&guest) });
         tokio::spawn(watch_over(
             Arc::downgrade(&guest),
-            Arc::clone(&self.gate),
+            Arc::clone(&self.access),
             self.options.judge_interval,
             self.stopping.clone(),
         ));
         Ok(guest)
     }
+}
+
+fn now() -> UnixMillis {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    UnixMillis(since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX)))
+}
+
+fn still_admits(access: &Access, client: &Client) -> Result<(), Denied> {
+    access.still_admits(client, now())
 }
 
 /// The token in a header.
@@ -124,7 +145,7 @@ fn bearer(header: &str) -> Option<&str> {
 /// Ends a guest once it is not admitted any more, or once nobody is.
 async fn watch_over(
     guest: Weak<Guest>,
-    gate: Arc<dyn Gate>,
+    access: Gate,
     interval: Duration,
     mut stopping: watch::Receiver<bool>,
 ) {
@@ -137,7 +158,7 @@ async fn watch_over(
         if is_stopping {
             return guest.end_with(GatewayError::Stopping.into());
         }
-        if let Err(why) = gate.still_admits(guest.session.client()) {
+        if let Err(why) = still_admits(&access(), guest.session.client()) {
             return guest.end(why);
         }
     }
@@ -149,6 +170,7 @@ struct Counts {
     subscriptions: AtomicUsize,
     publications: AtomicUsize,
     servings: AtomicUsize,
+    goals: AtomicUsize,
 }
 
 /// Of which of its bounds a stream takes one.
@@ -157,6 +179,7 @@ pub(super) enum Taken {
     Subscription,
     Publication,
     Serving,
+    Goal,
 }
 
 /// One credential on one connection.
@@ -191,6 +214,7 @@ impl Guest {
         match taken {
             Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
             Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
             Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
         }
     }
@@ -204,9 +228,9 @@ impl Guest {
         Ok(place)
     }
 
-    fn end(&self, why: Refusal) {
-        tracing::info!(client = %self.session.client().name, %why, "a gRPC client is not admitted any more");
-        self.end_with(why.into());
+    fn end(&self, why: Denied) {
+        tracing::debug!(client = %self.session.client().name, %why, "a gRPC client is not admitted any more");
+        self.end_with(Fault::Denied(why));
     }
 
     fn end_with(&self, why: Fault) {

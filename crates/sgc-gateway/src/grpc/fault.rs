@@ -2,15 +2,15 @@
 
 use tonic::{Code, Status};
 
-use super::gate::Refusal;
+use crate::access::Denied;
 use crate::error::{ErrorKind, GatewayError};
 
 /// Why a call fails.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Fault {
     /// Who calls is not admitted, or no more.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
+    #[error("{}", .0.told())]
+    Denied(Denied),
     /// Metadata that are no text of that form.
     #[error("`authorization` is not of the form `Bearer TOKEN`")]
     Authorization,
@@ -59,6 +59,12 @@ pub enum Fault {
         /// What was said.
         id: u64,
     },
+    /// Not the id of a goal.
+    #[error("an id of a goal has 16 bytes, not {bytes}")]
+    GoalId {
+        /// What was said.
+        bytes: usize,
+    },
     /// Which message of a stream it was.
     #[error("message {number} of this stream: {error}")]
     Message {
@@ -84,12 +90,13 @@ pub enum Fault {
 impl Fault {
     fn code(&self) -> Code {
         match self {
-            Self::Refused(_) | Self::Authorization => Code::Unauthenticated,
+            Self::Denied(_) | Self::Authorization => Code::Unauthenticated,
             Self::Credentials { .. } => Code::ResourceExhausted,
             Self::Order { .. }
             | Self::Enumeration { .. }
             | Self::KeepAllWithDepth
             | Self::Depth { .. }
+            | Self::GoalId { .. }
             | Self::Rate { .. } => Code::InvalidArgument,
             Self::NotOpen { .. } => Code::NotFound,
             Self::Message { error, .. } | Self::Gateway(error) => match error.kind() {
@@ -98,6 +105,7 @@ impl Fault {
                 ErrorKind::Exists => Code::AlreadyExists,
                 ErrorKind::Denied => Code::PermissionDenied,
                 ErrorKind::Exhausted => Code::ResourceExhausted,
+                ErrorKind::Refused => Code::FailedPrecondition,
                 ErrorKind::Unavailable => Code::Unavailable,
                 ErrorKind::Timeout => Code::DeadlineExceeded,
                 ErrorKind::Internal => Code::Internal,

@@ -1,16 +1,18 @@
 //! The gRPC front end: `sgc.gateway.v1`, with reflection and health beside it.
 //!
 //! [`Grpc`] serves streams of bytes that others have accepted, each with what is known of its other end ([`Connection`]).
-//! Whom it admits, a [`Gate`] decides, before anything of a request is read. Each connection has one
+//! Whom it
+//! admits, [`Access`] decides, before anything of a request is read, and again and again while streams last. Each connection has one
 //! [`Session`](crate::Session) for each credential that is shown on it, so bounds are those of a program, however many
 //! streams it has. Reflection and health tell nothing of the network and are for everybody who can connect.
 //!
 //! It opens no socket, makes no TLS handshake and counts no connections: `server` does. What comes and goes on the network is
 //! the business of sessions.
 
+mod action;
 mod client;
+mod connection;
 mod fault;
-mod gate;
 mod graph;
 mod publish;
 mod qos;
@@ -41,9 +43,10 @@ use tonic::service::Routes;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
 
+pub use connection::{Accepted, Connection};
 pub use fault::Fault;
-pub use gate::{Accepted, Caller, Connection, Gate, Refusal};
 
+use crate::access::Access;
 use crate::hub::Hub;
 use crate::session::SessionLimits;
 use client::Clients;
@@ -91,10 +94,11 @@ pub struct Grpc {
 }
 
 impl Grpc {
-    /// One on a hub, for whom a gate admits.
-    pub fn new(hub: Hub, gate: impl Gate, options: GrpcOptions) -> Self {
+    /// One on a hub. `access` says whom it admits, as the configuration is at that moment: a client that it does not admit any
+    /// more loses its streams within [`GrpcOptions::judge_interval`].
+    pub fn new(hub: Hub, access: impl Fn() -> Access + Send + Sync + 'static, options: GrpcOptions) -> Self {
         let stopping = Arc::new(watch::Sender::new(false));
-        let clients = Arc::new(Clients::new(hub, Arc::new(gate), options, stopping.subscribe()));
+        let clients = Arc::new(Clients::new(hub, Arc::new(access), options, stopping.subscribe()));
         Self { clients, stopping }
     }
 

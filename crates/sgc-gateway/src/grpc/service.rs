@@ -12,10 +12,11 @@ use super::fault::Fault;
 use super::proto::gateway_server::Gateway;
 use super::proto::{
     CallRequest, CallResponse, GetGraphRequest, GetGraphResponse, GetTypeRequest, GetTypeResponse,
-    PublishRequest, PublishResponse, ServeRequest, ServeResponse, SubscribeRequest, SubscribeResponse,
-    WatchGraphRequest, WatchGraphResponse,
+    PublishRequest, PublishResponse, SendGoalRequest, SendGoalResponse, ServeActionRequest,
+    ServeActionResponse, ServeRequest, ServeResponse, SubscribeRequest, SubscribeResponse, WatchGraphRequest,
+    WatchGraphResponse,
 };
-use super::{graph, publish, qos, serve, subscribe, types};
+use super::{action, graph, publish, qos, serve, subscribe, types};
 use crate::content::Content;
 
 /// How long a reply is waited for by who says nothing of it.
@@ -36,6 +37,8 @@ impl Gateway for Service {
     type WatchGraphStream = Responses<WatchGraphResponse>;
     type SubscribeStream = Responses<SubscribeResponse>;
     type ServeStream = Responses<ServeResponse>;
+    type SendGoalStream = Responses<SendGoalResponse>;
+    type ServeActionStream = Responses<ServeActionResponse>;
 
     async fn get_graph(
         &self,
@@ -95,6 +98,22 @@ impl Gateway for Service {
     ) -> Result<Response<Self::ServeStream>, Status> {
         let guest = Guest::of(&request)?;
         Ok(Response::new(serve::serve(guest, request.into_inner()).await?))
+    }
+
+    async fn send_goal(
+        &self,
+        request: Request<Streaming<SendGoalRequest>>,
+    ) -> Result<Response<Self::SendGoalStream>, Status> {
+        let guest = Guest::of(&request)?;
+        Ok(Response::new(action::send_goal(guest, request.into_inner()).await?))
+    }
+
+    async fn serve_action(
+        &self,
+        request: Request<Streaming<ServeActionRequest>>,
+    ) -> Result<Response<Self::ServeActionStream>, Status> {
+        let guest = Guest::of(&request)?;
+        Ok(Response::new(action::serve(guest, request.into_inner()).await?))
     }
 }
 

@@ -577,6 +577,237 @@ pub mod serve_response {
         Refused(Refused),
     }
 }
+/// What a client says that sends a goal.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SendGoalRequest {
+    /// Sends the goal, or asks that it be given up.
+    #[prost(oneof = "send_goal_request::Kind", tags = "1, 2")]
+    pub kind: ::core::option::Option<send_goal_request::Kind>,
+}
+/// Nested message and enum types in `SendGoalRequest`.
+pub mod send_goal_request {
+    /// A goal.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Goal {
+        /// The action.
+        #[prost(string, tag = "1")]
+        pub action: ::prost::alloc::string::String,
+        /// Its type; may be left out if the network has the action.
+        #[prost(string, tag = "2")]
+        pub r#type: ::prost::alloc::string::String,
+        /// How the goal is encoded, and feedback and result are to be.
+        #[prost(enumeration = "super::Encoding", tag = "3")]
+        pub encoding: i32,
+        /// The goal.
+        #[prost(bytes = "bytes", tag = "4")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// It is to be given up.
+    #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Cancel {}
+    /// Sends the goal, or asks that it be given up.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Kind {
+        /// The first request.
+        #[prost(message, tag = "1")]
+        Goal(Goal),
+        /// Each that follows.
+        #[prost(message, tag = "2")]
+        Cancel(Cancel),
+    }
+}
+/// What a client is told that has sent a goal.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SendGoalResponse {
+    /// One of these.
+    #[prost(oneof = "send_goal_response::Kind", tags = "1, 2, 3, 4")]
+    pub kind: ::core::option::Option<send_goal_response::Kind>,
+}
+/// Nested message and enum types in `SendGoalResponse`.
+pub mod send_goal_response {
+    /// A server has taken it.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Taken {
+        /// Its id, 16 bytes.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// Type of the action.
+        #[prost(string, tag = "2")]
+        pub r#type: ::prost::alloc::string::String,
+    }
+    /// What its server tells of it.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Feedback {
+        /// The feedback.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// What its server says to being asked to give it up.
+    #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct CancelAnswer {
+        /// Whether it does: then the result follows, once it has.
+        #[prost(bool, tag = "1")]
+        pub is_taken: bool,
+    }
+    /// How it ended.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Result {
+        /// How.
+        #[prost(enumeration = "super::GoalStatus", tag = "1")]
+        pub status: i32,
+        /// The result.
+        #[prost(bytes = "bytes", tag = "2")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// One of these.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Kind {
+        /// The first response: a server has taken it.
+        #[prost(message, tag = "1")]
+        Taken(Taken),
+        /// What its server tells of it.
+        #[prost(message, tag = "2")]
+        Feedback(Feedback),
+        /// What its server says to being asked to give it up.
+        #[prost(message, tag = "3")]
+        CancelAnswer(CancelAnswer),
+        /// The last response.
+        #[prost(message, tag = "4")]
+        Result(Result),
+    }
+}
+/// What a client says that serves an action.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ServeActionRequest {
+    /// One of these.
+    #[prost(oneof = "serve_action_request::Kind", tags = "1, 2, 3, 4")]
+    pub kind: ::core::option::Option<serve_action_request::Kind>,
+}
+/// Nested message and enum types in `ServeActionRequest`.
+pub mod serve_action_request {
+    /// What is served.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Server {
+        /// The action.
+        #[prost(string, tag = "1")]
+        pub action: ::prost::alloc::string::String,
+        /// Its type; may be left out if the network has the action.
+        #[prost(string, tag = "2")]
+        pub r#type: ::prost::alloc::string::String,
+        /// How goals are to be encoded, and feedback and results are.
+        #[prost(enumeration = "super::Encoding", tag = "3")]
+        pub encoding: i32,
+    }
+    /// Whether a goal is taken.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Answer {
+        /// Which.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// Whether it is.
+        #[prost(bool, tag = "2")]
+        pub is_taken: bool,
+    }
+    /// Tells of a goal that was taken.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Feedback {
+        /// Which.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// The feedback.
+        #[prost(bytes = "bytes", tag = "2")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// Ends a goal.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Finish {
+        /// Which.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// How; unspecified is succeeded.
+        #[prost(enumeration = "super::GoalStatus", tag = "2")]
+        pub status: i32,
+        /// The result.
+        #[prost(bytes = "bytes", tag = "3")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// One of these.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Kind {
+        /// The first request.
+        #[prost(message, tag = "1")]
+        Server(Server),
+        /// Whether a goal is taken.
+        #[prost(message, tag = "2")]
+        Answer(Answer),
+        /// Tells of a goal.
+        #[prost(message, tag = "3")]
+        Feedback(Feedback),
+        /// Ends one.
+        #[prost(message, tag = "4")]
+        Finish(Finish),
+    }
+}
+/// What a client is told that serves an action.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ServeActionResponse {
+    /// One of these.
+    #[prost(oneof = "serve_action_response::Kind", tags = "1, 2, 3, 4")]
+    pub kind: ::core::option::Option<serve_action_response::Kind>,
+}
+/// Nested message and enum types in `ServeActionResponse`.
+pub mod serve_action_response {
+    /// The action is served from now on.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Served {
+        /// Its type.
+        #[prost(string, tag = "1")]
+        pub r#type: ::prost::alloc::string::String,
+    }
+    /// A goal.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Goal {
+        /// By this it is spoken of, 16 bytes.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// The goal.
+        #[prost(bytes = "bytes", tag = "2")]
+        pub payload: ::prost::bytes::Bytes,
+    }
+    /// A goal is to be given up.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Cancel {
+        /// Which.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+    }
+    /// What was said of a goal and does not hold.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+    pub struct Refused {
+        /// Of which.
+        #[prost(bytes = "bytes", tag = "1")]
+        pub goal_id: ::prost::bytes::Bytes,
+        /// Why.
+        #[prost(string, tag = "2")]
+        pub reason: ::prost::alloc::string::String,
+    }
+    /// One of these.
+    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    pub enum Kind {
+        /// The first response.
+        #[prost(message, tag = "1")]
+        Served(Served),
+        /// A goal, which is to be answered.
+        #[prost(message, tag = "2")]
+        Goal(Goal),
+        /// A goal that was taken is to be given up: it is finished as canceled, or otherwise.
+        #[prost(message, tag = "3")]
+        Cancel(Cancel),
+        /// What was said of a goal and does not hold.
+        #[prost(message, tag = "4")]
+        Refused(Refused),
+    }
+}
 /// How a message is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -612,6 +843,43 @@ impl Encoding {
             "ENCODING_CDR" => Some(Self::Cdr),
             "ENCODING_JSON" => Some(Self::Json),
             "ENCODING_CBOR" => Some(Self::Cbor),
+            _ => None,
+        }
+    }
+}
+/// How a goal ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum GoalStatus {
+    /// Nobody knows.
+    Unspecified = 0,
+    /// It is done.
+    Succeeded = 4,
+    /// It was given up as a client wished.
+    Canceled = 5,
+    /// It was given up.
+    Aborted = 6,
+}
+impl GoalStatus {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "GOAL_STATUS_UNSPECIFIED",
+            Self::Succeeded => "GOAL_STATUS_SUCCEEDED",
+            Self::Canceled => "GOAL_STATUS_CANCELED",
+            Self::Aborted => "GOAL_STATUS_ABORTED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "GOAL_STATUS_UNSPECIFIED" => Some(Self::Unspecified),
+            "GOAL_STATUS_SUCCEEDED" => Some(Self::Succeeded),
+            "GOAL_STATUS_CANCELED" => Some(Self::Canceled),
+            "GOAL_STATUS_ABORTED" => Some(Self::Aborted),
             _ => None,
         }
     }
@@ -883,6 +1151,62 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "Serve"));
             self.inner.streaming(req, path, codec).await
         }
+        /// Sends a goal to an action. The first request is the goal; if its server takes it, the first response says so, else the
+        /// stream ends with FAILED_PRECONDITION. Feedback follows, and then the result, which is the last response. Further requests
+        /// ask that the goal be given up. A goal goes on, as goals of ROS 2 do, when its client does not wait for its end.
+        pub async fn send_goal(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<Message = super::SendGoalRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::SendGoalResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/sgc.gateway.v1.Gateway/SendGoal",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "SendGoal"));
+            self.inner.streaming(req, path, codec).await
+        }
+        /// Serves an action for as long as the stream lasts. The first request names the action; the first response says that it is
+        /// served. Then goals come, each of which is to be answered, told of, and finished. Goals that are not finished when the
+        /// stream ends are aborted.
+        pub async fn serve_action(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<
+                Message = super::ServeActionRequest,
+            >,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::ServeActionResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/sgc.gateway.v1.Gateway/ServeAction",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "ServeAction"));
+            self.inner.streaming(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -956,6 +1280,35 @@ pub mod gateway_server {
             &self,
             request: tonic::Request<tonic::Streaming<super::ServeRequest>>,
         ) -> std::result::Result<tonic::Response<Self::ServeStream>, tonic::Status>;
+        /// Server streaming response type for the SendGoal method.
+        type SendGoalStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::SendGoalResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Sends a goal to an action. The first request is the goal; if its server takes it, the first response says so, else the
+        /// stream ends with FAILED_PRECONDITION. Feedback follows, and then the result, which is the last response. Further requests
+        /// ask that the goal be given up. A goal goes on, as goals of ROS 2 do, when its client does not wait for its end.
+        async fn send_goal(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::SendGoalRequest>>,
+        ) -> std::result::Result<tonic::Response<Self::SendGoalStream>, tonic::Status>;
+        /// Server streaming response type for the ServeAction method.
+        type ServeActionStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::ServeActionResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Serves an action for as long as the stream lasts. The first request names the action; the first response says that it is
+        /// served. Then goals come, each of which is to be answered, told of, and finished. Goals that are not finished when the
+        /// stream ends are aborted.
+        async fn serve_action(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::ServeActionRequest>>,
+        ) -> std::result::Result<
+            tonic::Response<Self::ServeActionStream>,
+            tonic::Status,
+        >;
     }
     /// All that a program may do. Each stream is independent of the others; one connection is enough for all of them, in both
     /// directions, and it is always the client that opens it.
@@ -1334,6 +1687,102 @@ pub mod gateway_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ServeSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/sgc.gateway.v1.Gateway/SendGoal" => {
+                    #[allow(non_camel_case_types)]
+                    struct SendGoalSvc<T: Gateway>(pub Arc<T>);
+                    impl<
+                        T: Gateway,
+                    > tonic::server::StreamingService<super::SendGoalRequest>
+                    for SendGoalSvc<T> {
+                        type Response = super::SendGoalResponse;
+                        type ResponseStream = T::SendGoalStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::SendGoalRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Gateway>::send_goal(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SendGoalSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/sgc.gateway.v1.Gateway/ServeAction" => {
+                    #[allow(non_camel_case_types)]
+                    struct ServeActionSvc<T: Gateway>(pub Arc<T>);
+                    impl<
+                        T: Gateway,
+                    > tonic::server::StreamingService<super::ServeActionRequest>
+                    for ServeActionSvc<T> {
+                        type Response = super::ServeActionResponse;
+                        type ResponseStream = T::ServeActionStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::ServeActionRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Gateway>::serve_action(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ServeActionSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -1,4 +1,4 @@
-//! [`Gate`]: who is admitted, and what is known of who calls ([`Caller`], [`Connection`]). Deciding is for others.
+//! [`Connection`]: what is known of one, and who was admitted on it; [`Accepted`]: its stream of bytes.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -11,55 +11,6 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
 use super::client::Known;
-use crate::access::Client;
-
-/// Decides who is admitted.
-pub trait Gate: Send + Sync + 'static {
-    /// Who this is, and what it may do. Asked once for each credential on a connection, and again once it does not hold.
-    ///
-    /// # Errors
-    /// Why it may do nothing.
-    fn admit(&self, caller: &Caller<'_>) -> Result<Client, Refusal>;
-
-    /// Whether one that was admitted is so still: at each call, and again and again while streams last.
-    ///
-    /// # Errors
-    /// Why not: it has expired, was revoked, or may do something else now.
-    fn still_admits(&self, client: &Client) -> Result<(), Refusal> {
-        let _ = client;
-        Ok(())
-    }
-}
-
-/// One that admits for good.
-impl<F: Fn(&Caller<'_>) -> Result<Client, Refusal> + Send + Sync + 'static> Gate for F {
-    fn admit(&self, caller: &Caller<'_>) -> Result<Client, Refusal> {
-        self(caller)
-    }
-}
-
-/// What is known of who calls.
-#[derive(Clone, Copy)]
-pub struct Caller<'a> {
-    /// Its connection.
-    pub connection: &'a Connection,
-    /// The token that it showed: `authorization: Bearer TOKEN`.
-    pub token: Option<&'a str>,
-    /// Its `Origin`, if it sent that header: then it is a page in a browser, through some proxy.
-    pub origin: Option<&'a str>,
-}
-
-impl fmt::Debug for Caller<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (connection, has_token) = (self.connection, self.token.is_some());
-        f.debug_struct("Caller").field("connection", connection).field("has_token", &has_token).finish()
-    }
-}
-
-/// Why somebody is not admitted, as the other end is told: UNAUTHENTICATED.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct Refusal(pub String);
 
 /// A connection, as whoever accepted it knows it. Clones are the same one.
 #[derive(Clone)]
