@@ -71,11 +71,11 @@ pub enum Fault {
         /// The first is 1.
         number: u64,
         /// What is wrong with it.
-        error: GatewayError,
+        error: Box<GatewayError>,
     },
     /// The hub refuses.
     #[error(transparent)]
-    Gateway(#[from] GatewayError),
+    Gateway(Box<GatewayError>),
     /// What serves these requests does not say where they come from.
     #[error("the gateway does not know where this call comes from")]
     NoConnection,
@@ -112,6 +112,12 @@ impl Fault {
             },
             Self::NoConnection | Self::Descriptor(_) | Self::Transport(_) => Code::Internal,
         }
+    }
+}
+
+impl From<GatewayError> for Fault {
+    fn from(error: GatewayError) -> Self {
+        Self::Gateway(Box::new(error))
     }
 }
 

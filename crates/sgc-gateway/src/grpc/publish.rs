@@ -49,7 +49,7 @@ pub(super) async fn publish(
         let content = Content { form, bytes };
         let written = async {
             let result = publication.publish(&content).await;
-            result.map_err(|error| Fault::Message { number: published + 1, error })
+            result.map_err(|error| Fault::Message { number: published + 1, error: Box::new(error) })
         };
         guest.admitted(written).await?;
         published += 1;
