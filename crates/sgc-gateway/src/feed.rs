@@ -87,6 +87,12 @@ impl Latched {
     }
 }
 
+impl std::fmt::Debug for Feed {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Feed").field(&self.key).finish()
+    }
+}
+
 /// What comes from a feed's reader.
 struct Intake(Arc<Feed>);
 
@@ -307,6 +313,11 @@ impl Subscription {
         Some(Delivery { message, dropped })
     }
 
+    /// What ends it whoever holds it.
+    pub(crate) fn ender(&self) -> SubscriptionEnd {
+        SubscriptionEnd { feed: Arc::downgrade(&self.feed), queue: Arc::downgrade(&self.queue) }
+    }
+
     /// How many messages were left out until now.
     pub fn dropped(&self) -> u64 {
         self.queue.dropped()
@@ -323,6 +334,32 @@ impl Subscription {
     /// Has what is kept for who subscribes later come once more, for another part of the same client.
     pub fn replay(&self) {
         self.feed.replay(&self.queue);
+    }
+}
+
+/// Ends a [`Subscription`] that somebody else holds: one that is waited for, for example, by who does not look at it.
+#[derive(Debug)]
+pub(crate) struct SubscriptionEnd {
+    feed: Weak<Feed>,
+    queue: Weak<Queue>,
+}
+
+impl SubscriptionEnd {
+    /// Nothing comes any more, and nothing waits any more.
+    pub(crate) fn end(&self) {
+        if let (Some(feed), Some(queue)) = (self.feed.upgrade(), self.queue.upgrade()) {
+            feed.leave(&queue);
+            queue.close();
+            queue.clear();
+            if let Some(hub) = feed.hub.upgrade() {
+                hub.sweep();
+            }
+        }
+    }
+
+    /// Whether the subscription is dropped.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.queue.strong_count() == 0
     }
 }
 

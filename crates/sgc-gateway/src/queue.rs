@@ -139,6 +139,12 @@ impl Queue {
         self.lock().dropped
     }
 
+    /// Forgets what waits.
+    pub(crate) fn clear(&self) {
+        let mut state = self.lock();
+        (state.messages, state.bytes) = (VecDeque::new(), 0);
+    }
+
     /// Nothing comes any more; who waits for room goes on.
     pub(crate) fn close(&self) {
         self.lock().is_closed = true;
