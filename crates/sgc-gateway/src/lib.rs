@@ -21,6 +21,7 @@ mod message;
 mod publisher;
 mod queue;
 mod ros;
+pub mod rosbridge;
 mod service;
 mod session;
 mod types;

@@ -184,6 +184,11 @@ pub struct Replier {
 }
 
 impl Replier {
+    /// What replies look like.
+    pub fn reply_layout(&self) -> &Arc<Layout> {
+        &self.halves.reply
+    }
+
     /// Answers a request.
     pub async fn reply(&self, id: RequestId, content: &Content) -> Result<(), GatewayError> {
         let payload = content.to_cdr(&self.halves.reply)?;
