@@ -12,6 +12,7 @@ use tokio::sync::watch;
 use tonic::{Request, Status};
 
 use super::GrpcOptions;
+use super::budget::Budget;
 use super::connection::Connection;
 use super::fault::Fault;
 use crate::access::{Access, Admission, Client, Denied};
@@ -114,6 +115,7 @@ impl Clients {
             counts: Counts::default(),
             ended: watch::Sender::new(None),
             heard: Mutex::default(),
+            unread: Budget::new(self.options.unread_bytes_max),
         });
         known.push(Known { shown, guest: Arc::clone(&guest) });
         tokio::spawn(watch_over(
@@ -189,6 +191,8 @@ pub(super) struct Guest {
     ended: watch::Sender<Option<Fault>>,
     /// Its subscriptions: each is held by a stream, which is not looked at while its client does not read.
     heard: Mutex<Vec<SubscriptionEnd>>,
+    /// Long messages that are written for it and under way.
+    pub(super) unread: Budget,
 }
 
 /// A stream of a guest's, counted while it lasts.

@@ -10,6 +10,7 @@
 //! the business of sessions.
 
 mod action;
+mod budget;
 mod client;
 mod connection;
 mod fault;
@@ -49,6 +50,7 @@ pub use fault::Fault;
 use crate::access::Access;
 use crate::hub::Hub;
 use crate::session::SessionLimits;
+use budget::Tracking;
 use client::Clients;
 use proto::gateway_server::GatewayServer;
 use service::Service;
@@ -76,13 +78,19 @@ const RESETS_MAX: usize = 64;
 pub struct GrpcOptions {
     /// What a client may have at a time: one credential on one connection.
     pub session: SessionLimits,
+    /// Bytes of long messages that a client has not read yet though they were sent, of all its streams: further ones wait.
+    pub unread_bytes_max: usize,
     /// How often it is looked whether clients are still admitted.
     pub judge_interval: Duration,
 }
 
 impl Default for GrpcOptions {
     fn default() -> Self {
-        Self { session: SessionLimits::default(), judge_interval: Duration::from_secs(1) }
+        Self {
+            session: SessionLimits::default(),
+            unread_bytes_max: 4 * MESSAGE_BYTES_MAX,
+            judge_interval: Duration::from_secs(1),
+        }
     }
 }
 
@@ -116,7 +124,7 @@ impl Grpc {
             request.extensions_mut().insert(client);
             Ok(request)
         };
-        let admitted = InterceptedService::new(gateway, admit);
+        let admitted = InterceptedService::new(Tracking::new(gateway), admit);
         let described = || {
             tonic_reflection::server::Builder::configure()
                 .register_encoded_file_descriptor_set(proto::DESCRIPTOR)

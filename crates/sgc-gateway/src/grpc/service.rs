@@ -77,7 +77,7 @@ impl Gateway for Service {
         request: Request<SubscribeRequest>,
     ) -> Result<Response<Self::SubscribeStream>, Status> {
         let guest = Guest::of(&request)?;
-        Ok(Response::new(subscribe::subscribe(guest, request.into_inner()).await?))
+        Ok(subscribe::subscribe(guest, request.into_inner()).await?)
     }
 
     async fn call(&self, request: Request<CallRequest>) -> Result<Response<CallResponse>, Status> {

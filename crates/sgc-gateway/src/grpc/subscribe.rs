@@ -1,5 +1,5 @@
-//! `Subscribe`: a topic as a stream. Nothing is in between: the connection asks for a message once it has room for one, so
-//! what waits, waits in the subscription.
+//! `Subscribe`: a topic as a stream. Nothing is in between: the connection asks for a message while it has one at most that
+//! it cannot send, so what waits, waits in the subscription.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,8 +8,9 @@ use std::time::Duration;
 use futures_util::stream;
 use sgc_ros::Guid;
 use tokio::sync::watch;
-use tonic::Status;
+use tonic::{Response, Status};
 
+use super::budget::Slot;
 use super::client::{Guest, Place, Taken};
 use super::fault::Fault;
 use super::proto::subscribe_response::{Kind, Message, Subscribed, Unreadable};
@@ -37,6 +38,8 @@ struct Hearing {
     sources: Sources,
     /// What comes before the first message.
     first: Option<Subscribed>,
+    /// For the room that the next message takes.
+    slot: Slot,
 }
 
 /// What a client asks for.
@@ -67,7 +70,7 @@ fn wanted(request: SubscribeRequest) -> Result<(Subscribe, Form), Fault> {
 pub(super) async fn subscribe(
     guest: Arc<Guest>,
     request: SubscribeRequest,
-) -> Result<Responses<SubscribeResponse>, Fault> {
+) -> Result<Response<Responses<SubscribeResponse>>, Fault> {
     let (wanted, form) = wanted(request)?;
     let place = guest.take(Taken::Subscription)?;
     let subscribed = async { Ok(guest.session.subscribe(wanted).await?) };
@@ -78,14 +81,18 @@ pub(super) async fn subscribe(
         type_hash: subscription.layout().type_hash(),
     };
     let sources = Sources::new(guest.session.hub());
-    let hearing = Hearing { place, subscription, form, sources, first: Some(first) };
-    Ok(Box::pin(stream::unfold(Some(hearing), |hearing| async {
+    let slot = Slot::default();
+    let hearing = Hearing { place, subscription, form, sources, first: Some(first), slot: slot.clone() };
+    let responses: Responses<_> = Box::pin(stream::unfold(Some(hearing), |hearing| async {
         let mut hearing = hearing?;
         match hearing.next().await {
             Ok(kind) => Some((Ok(SubscribeResponse { kind: Some(kind) }), Some(hearing))),
             Err(why) => Some((Err(Status::from(why)), None)),
         }
-    })))
+    }));
+    let mut response = Response::new(responses);
+    response.extensions_mut().insert(slot);
+    Ok(response)
 }
 
 impl Hearing {
@@ -103,6 +110,9 @@ impl Hearing {
         };
         let node = message.writer.and_then(|writer| self.sources.node(self.subscription.topic(), &writer));
         let node = node.unwrap_or_default();
+        let guest = &self.place.guest;
+        let room = async { Ok(guest.unread.take(message.payload.len()).await) };
+        self.slot.put(guest.admitted(room).await?);
         Ok(match self.subscription.write(&message, self.form) {
             Ok(payload) => Kind::Message(Message {
                 payload,

@@ -589,6 +589,31 @@ async fn a_client_has_its_bounds_over_all_its_streams() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn long_messages_that_a_client_does_not_read_are_not_written_for_it() {
+    let gateway = Gateway::with(GrpcOptions { unread_bytes_max: 20 << 20, ..GrpcOptions::default() }).await;
+    let talker = gateway.site.writer("/image", RosQos::default());
+    gateway.site.knows("/image").await;
+    let mut client = gateway.client().await;
+    let wanted = SubscribeRequest { waits: true, depth: 1, ..hear("/image") };
+    let unread = subscribe(&mut client, wanted).await;
+    let image = string(&"x".repeat(13 << 20));
+    // The second returns once the first is taken: it fills the window of its stream, and of the room half and more.
+    for n in 1..=2 {
+        talker.write(SampleKind::Write, n, image.clone()).unwrap();
+    }
+    let mut heard = subscribe(&mut client, hear("/image")).await;
+    let mut other = subscribe(&mut gateway.client().await, hear("/image")).await;
+    talker.write(SampleKind::Write, 3, image.clone()).unwrap();
+    // Another client has its own, and what is short needs none.
+    assert_eq!(next(&mut other).await.payload, image);
+    assert!(client.get_graph(GetGraphRequest::default()).await.is_ok());
+    let waited = tokio::time::timeout(Duration::from_millis(300), heard.message()).await;
+    assert!(waited.is_err(), "there is room for one alone");
+    drop(unread);
+    assert_eq!(next(&mut heard).await.payload, image);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_gateway_that_stops_says_so_and_lets_its_connections_end() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/chatter", RosQos::default());
