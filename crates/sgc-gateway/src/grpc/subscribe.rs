@@ -110,19 +110,20 @@ impl Hearing {
         };
         let node = message.writer.and_then(|writer| self.sources.node(self.subscription.topic(), &writer));
         let node = node.unwrap_or_default();
+        let payload = match self.subscription.write(&message, self.form) {
+            Ok(payload) => payload,
+            Err(error) => return Ok(Kind::Unreadable(Unreadable { reason: error.to_string(), node })),
+        };
         let guest = &self.place.guest;
-        let room = async { Ok(guest.unread.take(message.payload.len()).await) };
+        let room = async { Ok(guest.unread.take(payload.len()).await) };
         self.slot.put(guest.admitted(room).await?);
-        Ok(match self.subscription.write(&message, self.form) {
-            Ok(payload) => Kind::Message(Message {
-                payload,
-                source_time_ns: message.source_timestamp_ns,
-                received_time_ns: message.received_ns,
-                node,
-                dropped,
-            }),
-            Err(error) => Kind::Unreadable(Unreadable { reason: error.to_string(), node }),
-        })
+        Ok(Kind::Message(Message {
+            payload,
+            source_time_ns: message.source_timestamp_ns,
+            received_time_ns: message.received_ns,
+            node,
+            dropped,
+        }))
     }
 }
 
