@@ -23,6 +23,8 @@ mod service;
 mod session;
 mod types;
 
+pub mod foxglove;
+
 pub use access::{Client, Right, Scope};
 pub use content::{Content, Form};
 pub use error::{ErrorKind, GatewayError};
