@@ -15,6 +15,7 @@ mod content;
 mod error;
 mod feed;
 mod graph;
+pub mod foxglove;
 pub mod grpc;
 mod hub;
 mod message;
