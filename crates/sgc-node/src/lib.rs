@@ -21,6 +21,7 @@ mod dataplane;
 mod file_watch;
 mod finding;
 mod fleet_file;
+mod gateway;
 pub mod graph;
 mod heart;
 mod labels;
@@ -38,6 +39,7 @@ mod replays;
 mod roaming;
 mod rules;
 mod shaper;
+pub mod shell;
 mod sinks;
 mod sources;
 mod state;
@@ -48,6 +50,7 @@ mod tell;
 
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
+pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };

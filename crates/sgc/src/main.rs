@@ -21,11 +21,13 @@ mod output;
 mod policy;
 mod reload;
 mod run;
+mod service;
 mod share_token;
 mod status;
 mod topic;
 mod use_token;
 mod why;
+mod yaml;
 
 use std::process::ExitCode;
 
@@ -57,6 +59,7 @@ enum Command {
     Check(check::CheckArgs),
     Status(status::StatusArgs),
     Topic(topic::TopicArgs),
+    Service(service::ServiceArgs),
     Why(why::WhyArgs),
     Reload(reload::ReloadArgs),
     Audit(audit::AuditArgs),
@@ -89,6 +92,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Check(args) => check::check(&args),
         Command::Why(args) => return why::why(&args),
         Command::Topic(args) => return topic::topic(&args),
+        Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
         Command::Reload(args) => reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),
