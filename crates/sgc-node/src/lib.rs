@@ -5,6 +5,7 @@
 //! beside it, on the tasks and threads that receive.
 #![forbid(unsafe_code)]
 
+mod access;
 pub mod admin;
 #[cfg(test)]
 mod allocations;
@@ -48,6 +49,7 @@ mod status;
 mod tap;
 mod tell;
 
+pub use access::{ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with};
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use gateway::{GatewayStartError, OpenLocalRos};

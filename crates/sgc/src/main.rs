@@ -24,6 +24,7 @@ mod run;
 mod service;
 mod share_token;
 mod status;
+mod token;
 mod topic;
 mod use_token;
 mod why;
@@ -64,6 +65,7 @@ enum Command {
     Reload(reload::ReloadArgs),
     Audit(audit::AuditArgs),
     Policy(policy::PolicyArgs),
+    Token(token::TokenArgs),
     ShareToken(share_token::ShareTokenArgs),
     Use(use_token::UseArgs),
     Name(name::NameArgs),
@@ -97,6 +99,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Reload(args) => reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),
+        Command::Token(args) => token::token(&args),
         Command::ShareToken(args) => share_token::share_token(&args),
         Command::Use(args) => use_token::use_token(&args),
         Command::Name(args) => name::name(&args),
