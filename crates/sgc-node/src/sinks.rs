@@ -842,8 +842,7 @@ mod tests {
     }
 
     fn message(seq: u64, bytes: usize) -> Message {
-        let head =
-            MessageHead { encoding: Default::default(), kind: MessageKind::Write, source_timestamp_ns: 1 };
+        let head = MessageHead::new(MessageKind::Write, 1);
         Message { source: SourceId([1; 16]), seq, head, reliable: true, payload: vec![0; bytes].into() }
     }
 

@@ -427,15 +427,12 @@ impl LocalShare {
             true => self.compress(sample.kind, sample.payload),
             false => (PayloadEncoding::Plain, sample.payload),
         };
-        let head = MessageHead {
-            encoding,
-            kind: match sample.kind {
-                SampleKind::Write => MessageKind::Write,
-                SampleKind::Dispose => MessageKind::Dispose,
-                SampleKind::Unregister => MessageKind::Unregister,
-            },
-            source_timestamp_ns: sample.source_timestamp_ns,
+        let kind = match sample.kind {
+            SampleKind::Write => MessageKind::Write,
+            SampleKind::Dispose => MessageKind::Dispose,
+            SampleKind::Unregister => MessageKind::Unregister,
         };
+        let head = MessageHead { encoding, ..MessageHead::new(kind, sample.source_timestamp_ns) };
         let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
             // Fragments leave as they are sealed: a large message is under way before its end is read.

@@ -200,6 +200,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)
+            | Event::Types { .. }
             | Event::Granted { .. } => {}
         }
     }
