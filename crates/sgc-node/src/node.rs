@@ -18,6 +18,7 @@ use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
 };
 use sgc_trust::{AnchorError, Identity, IdentityError};
+use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
@@ -161,6 +162,8 @@ pub struct RunOptions {
     pub reload: Option<mpsc::Receiver<()>>,
     /// The file that `source` reads, to be read again when it changes, if its configuration does not say otherwise.
     pub file: Option<PathBuf>,
+    /// Where the types of what is shared and used are kept, for others in this process that read messages of them.
+    pub types: Option<Arc<TypeStore>>,
     /// The port of mDNS, if not its own: so that tests have a local network each.
     pub mdns_port: Option<u16>,
 }
@@ -350,6 +353,8 @@ pub async fn run_on<N: RosNetwork>(
     let board = Board::default();
     let claims = Claims::default();
     let (core, requested) = Core::new(CoreParts {
+        types: options.types.unwrap_or_default(),
+        definitions: Definitions::from_env(config.ros.as_ref().map_or(&[], |ros| &ros.definitions)),
         board: board.clone(),
         patience,
         message_keys,

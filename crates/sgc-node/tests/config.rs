@@ -14,7 +14,7 @@ use sgc_node::config::{
 use sgc_transport::Congestion;
 use sgc_trust::Suite;
 use sgc_wire::Class;
-use sgc_wire::PayloadEncoding;
+use sgc_wire::{PayloadEncoding, PayloadForm};
 
 /// The least that every node needs.
 const NODE: &str = "identity = 'x'\nnode.routers = ['quic://r:7447']\n";
@@ -107,6 +107,7 @@ fn every_key_is_taken_over() {
         localhost_only = false
         static_peers = ["10.0.0.2", "arm-2.local", "fe80::1"]
         graph = false
+        definitions = ["share", "/opt/robot/share"]
         [[share]]
         topic = "/a__b/_c"
         to = ["*"]
@@ -138,6 +139,7 @@ fn every_key_is_taken_over() {
     assert_eq!((ros.domain_id, ros.discovery), (232, DiscoveryRange::Localhost));
     assert_eq!(ros.static_peers, ["10.0.0.2", "arm-2.local", "fe80::1"]);
     assert!(!ros.graph);
+    assert_eq!(ros.definitions, [Path::new("/etc/sgc/share"), Path::new("/opt/robot/share")]);
     let share = &config.shares[0];
     assert_eq!(texts(&share.to), ["*"]);
     assert_eq!(share.type_name.as_deref(), Some("sensor_msgs/msg/Image"));
@@ -188,7 +190,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
             &[
-                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `token`, `link`",
+                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `token`, `link`",
             ],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
@@ -348,6 +350,33 @@ fn what_leaves_may_be_compressed_and_nothing_else() {
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncompress = 'lz4'",
             &[
                 "node.toml:6: `compress` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn topics_that_leave_may_travel_as_json_and_nothing_else() {
+    for (word, form) in [("cdr", PayloadForm::Cdr), ("json", PayloadForm::Json)] {
+        let config = good(&format!(
+            "{NODE}[[share]]\ntopic = '/a'\nto = ['b']\nencoding = '{word}'\n\
+             [[use]]\nfrom = 'b'\ntopic = '/b'\npublish = true\nencoding = '{word}'"
+        ));
+        assert_eq!((config.shares[0].shaping.form, config.uses[0].shaping.form), (form, form));
+    }
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\nencoding = 'jsn'",
+            &["node.toml:6: `encoding` is \"jsn\"; did you mean \"json\"? It takes \"cdr\", \"json\""],
+        ),
+        (
+            "[[share]]\nservice = '/a'\nto = ['b']\nencoding = 'json'",
+            &["node.toml:6: `encoding` is for topics, and this is about `service`: take it out"],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/a'\nencoding = 'json'",
+            &[
+                "node.toml:6: `encoding` is for what this node publishes there: what comes here is written as the owner's share says, and every node reads both; set `publish = true`, or take it out",
             ],
         ),
     ]);

@@ -91,6 +91,7 @@ pub(super) struct RosDraft {
     /// The whole list is located too, since an empty one is a choice.
     pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
     pub(super) graph: Option<Located<bool>>,
+    pub(super) definitions: Option<Located<Vec<Located<String>>>>,
 }
 
 /// `[[share]]`. What is required is `None` only where an error has been recorded already.
@@ -129,6 +130,7 @@ pub(super) struct ShapingDraft {
     pub(super) max_bandwidth: Option<Located<String>>,
     pub(super) max_age: Option<Located<String>>,
     pub(super) compress: Option<Located<String>>,
+    pub(super) encoding: Option<Located<String>>,
 }
 
 /// `[[use]]`. What is required is `None` only where an error has been recorded already.

@@ -183,6 +183,11 @@ impl FileReader<'_> {
                 "an array of strings, such as [\"10.0.0.2\", \"arm-2.local\"]",
             ),
             graph: self.boolean(ros, "graph", "true or false"),
+            definitions: self.strings(
+                ros,
+                "definitions",
+                "an array of strings, such as [\"/opt/robot/share\"]",
+            ),
         }
     }
 
@@ -260,6 +265,7 @@ impl FileReader<'_> {
             max_bandwidth: self.string(topic, "max_bandwidth", "a string, such as \"2Mbps\""),
             max_age: self.string(topic, "max_age", "a string, such as \"500ms\""),
             compress: self.string(topic, "compress", "a string, \"zstd\", \"lz4\" or \"none\""),
+            encoding: self.string(topic, "encoding", "a string, \"cdr\" or \"json\""),
         }
     }
 

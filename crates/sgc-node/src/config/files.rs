@@ -13,8 +13,13 @@ use super::resolve::{FileChecks, IdentityFile};
 use crate::{partners, state};
 
 /// The checks of [`super::load`].
-pub(super) const FILES: FileChecks =
-    FileChecks { identity: check_identity, ca: check_ca, token: check_token, fleet: check_fleet };
+pub(super) const FILES: FileChecks = FileChecks {
+    identity: check_identity,
+    ca: check_ca,
+    token: check_token,
+    fleet: check_fleet,
+    directory: check_directory,
+};
 
 fn check_ca(key: &'static str, path: &Path) -> Result<(), Mistake> {
     const EXPECTED: &str = "a file of CA certificates in PEM, such as `sgc fleet show --ca` prints";
@@ -46,6 +51,15 @@ fn check_fleet(key: &'static str, path: &Path) -> Result<(), Mistake> {
         path: path.to_owned(),
         reason: error.to_string(),
         expected: "the file that `sgc fleet create` made, and that this user may read",
+    })
+}
+
+fn check_directory(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    fs::read_dir(path).map(drop).map_err(|error| Mistake::File {
+        key,
+        path: path.to_owned(),
+        reason: error.to_string(),
+        expected: "a directory with packages of ROS 2, and that this user may read",
     })
 }
 

@@ -87,7 +87,9 @@ impl Table {
             Self::Node => {
                 &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
             }
-            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph"],
+            Self::Ros => {
+                &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph", "definitions"]
+            }
             Self::Share => &[
                 "topic",
                 "service",
@@ -104,6 +106,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "link",
                 "suite",
                 "description",
@@ -130,6 +133,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "token",
                 "link",
             ],
@@ -156,8 +160,7 @@ impl Table {
             | Self::Rotation
             | Self::Audit
             | Self::Partner => &[],
-            Self::Share => &["encoding"],
-            Self::Use => &[],
+            Self::Share | Self::Use => &[],
         }
     }
 
