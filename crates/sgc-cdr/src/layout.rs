@@ -1,5 +1,6 @@
 //! A type with all that it contains, resolved.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::defaults::MemberDefault;
@@ -59,6 +60,31 @@ impl Layout {
     /// The type.
     pub fn name(&self) -> Option<&TypeName> {
         self.structs.last().map(|s| &s.name)
+    }
+
+    /// The layout of a type that this one contains, such as a service its request; of the type itself that is all of it.
+    pub fn part(&self, name: &TypeName) -> Option<Self> {
+        let place = self.structs.iter().position(|inner| inner.name == *name)?;
+        let mut structs = Vec::new();
+        self.copy(place, &mut structs, &mut BTreeMap::new());
+        Some(Self { structs })
+    }
+
+    /// Puts a copy of what is at a place behind copies of what it contains; gives its place there.
+    fn copy(&self, place: usize, into: &mut Vec<Struct>, places: &mut BTreeMap<usize, usize>) -> usize {
+        if let Some(there) = places.get(&place) {
+            return *there;
+        }
+        let Some(inner) = self.structs.get(place) else { return 0 };
+        let mut copy = inner.clone();
+        for member in &mut copy.members {
+            if let Element::Struct(contained) = &mut member.element {
+                *contained = self.copy(*contained, into, places);
+            }
+        }
+        into.push(copy);
+        places.insert(place, into.len() - 1);
+        into.len() - 1
     }
 
     /// Whether its first member is a `std_msgs/msg/Header`, whose stamp [`Layout::header_stamp_ns`] finds.

@@ -388,7 +388,7 @@ async fn types_that_nobody_knows_are_shown_and_what_to_do_is_said() {
     let channel = viewer.channel("/own").await;
     assert_eq!((&channel["schema"], &channel["schemaName"]), (&json!(""), &json!("mine/msg/Own")));
     let said = viewer.status("mine/msg/Own cannot be shown").await;
-    assert!(said["message"].as_str().unwrap().contains("msg_dirs") && said["level"] == 1, "{said}");
+    assert!(said["message"].as_str().unwrap().contains("definitions") && said["level"] == 1, "{said}");
     viewer.subscribe(1, &channel).await;
     viewer.status("no definition of mine/msg/Own").await;
 }

@@ -3,7 +3,7 @@
 //! One question a connection. Who asks nothing gets the status, as one JSON document; this is what the first version
 //! did. Otherwise one line, `sgc/1 WORD [ARGUMENT]`, is answered with `{"ok": …}` or `{"error": "…"}`, except for
 //! `status`, whose answer is the document itself, and for `tap`, whose answer is that line and then a stream of
-//! [`TapHead`]s with what is seen. What is asked is carried out elsewhere.
+//! [`TapHead`]s with what is seen; the line has the description of the type, if the node knows it. What is asked is carried out elsewhere.
 
 use std::fs;
 use std::io;
@@ -386,8 +386,17 @@ async fn begin_tap(wish: TapWish, events: &mpsc::Sender<CoreEvent>) -> Result<Ta
 /// Shows what goes by until nobody looks any more or there is no more.
 async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
     let begun = Instant::now();
+    let described = tap.described.as_ref().map(|described| {
+        let description = STANDARD.encode(described.description());
+        serde_json::json!({ "type_hash": described.type_hash(), "description": description })
+    });
     let what = serde_json::json!({
-        "ok": { "side": tap.side.label(), "type": tap.type_name, "type_hash": tap.type_hash }
+        "ok": {
+            "side": tap.side.label(),
+            "type": tap.type_name,
+            "type_hash": tap.type_hash,
+            "described": described,
+        }
     });
     let (mut gone, mut into) = stream.split();
     let write = async {

@@ -4,14 +4,24 @@
 //! What clients do is the business of `sgc-gateway`. Its part of the local network is one of its own, which the node's
 //! own sees as any program's: so shares and uses hold for its topics as for others.
 
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use rustls::sign::CertifiedKey;
+use sgc_cdr::{Layout, TypeName};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
-    Server, ServerError, ServerOptions, Session, SessionLimits, Types,
+    Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
 use sgc_ros::RosError;
+use sgc_trust::Identity;
+use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, OnceCell};
+use zeroize::Zeroizing;
+
+use crate::config::{GatewayConfig, GatewayScheme, GatewayUrl};
 
 /// Opens the gateway's part of the local network; may block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;
@@ -19,11 +29,27 @@ pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Se
 /// What the gateway's ROS 2 node is called, before the name of the SGC node.
 const NODE_PREFIX: &str = "sgc_gateway_";
 
+/// Definitions of types as this node finds them: in files, and as others described them.
+pub(crate) struct NodeDefinitions {
+    pub(crate) files: Definitions,
+    pub(crate) described: Arc<TypeStore>,
+}
+
+impl FindDefinitions for NodeDefinitions {
+    fn text(&self, file: &TypeName) -> Option<String> {
+        self.files.text(file)
+    }
+
+    fn described(&self, name: &TypeName, hash: Option<&str>) -> Option<Arc<Layout>> {
+        self.described.layout(name, hash)
+    }
+}
+
 /// What the sockets are to be.
 pub(crate) struct Sockets {
     pub(crate) listen: Vec<ListenAt>,
     pub(crate) access: Access,
-    pub(crate) key: Option<Arc<rustls::sign::CertifiedKey>>,
+    pub(crate) key: Arc<CertifiedKey>,
     pub(crate) clients_max: usize,
     pub(crate) client_bytes_max: usize,
 }
@@ -81,7 +107,7 @@ impl Gateway {
             SessionLimits { waiting_bytes_max: sockets.client_bytes_max, ..SessionLimits::default() };
         let Sockets { listen, access, key, clients_max, .. } = sockets;
         let name = format!("sgc {}", self.name);
-        let options = ServerOptions { name, listen, access, key, clients_max, limits };
+        let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
         *self.server.lock().await = Some(server);
         Ok(())
@@ -91,10 +117,10 @@ impl Gateway {
     pub(crate) async fn reconfigure(
         &self,
         access: Access,
-        key: Option<&Arc<rustls::sign::CertifiedKey>>,
+        key: &Arc<CertifiedKey>,
     ) -> Result<(), ServerError> {
         match &*self.server.lock().await {
-            Some(server) => server.reconfigure(access, key),
+            Some(server) => server.reconfigure(access, Some(key)),
             None => Ok(()),
         }
     }
@@ -122,4 +148,47 @@ pub enum GatewayStartError {
     /// Its sockets.
     #[error(transparent)]
     Server(#[from] ServerError),
+    /// Its certificate, or the key of that.
+    #[error("the gateway's {}: {source}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// They are not what TLS takes.
+    #[error("the gateway's {}: {source}", path.display())]
+    Certificate {
+        /// The certificate.
+        path: PathBuf,
+        /// What is wrong.
+        source: TlsError,
+    },
+}
+
+/// What the gateway shows within TLS: what the configuration names, else the node's own certificate. Reads files.
+pub(crate) fn key_of(
+    config: &GatewayConfig,
+    identity: &Identity,
+) -> Result<Arc<CertifiedKey>, GatewayStartError> {
+    let Some(tls) = &config.tls else { return Ok(identity.certified_key()) };
+    let read = |path: &Path| {
+        fs::read(path).map_err(|source| GatewayStartError::File { path: path.to_owned(), source })
+    };
+    let (certificate, key) = (read(&tls.certificate)?, Zeroizing::new(read(&tls.key)?));
+    certified_key(&certificate, &key)
+        .map_err(|source| GatewayStartError::Certificate { path: tls.certificate.clone(), source })
+}
+
+/// Where to listen, as the gateway has it.
+pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
+    let at = |url: &GatewayUrl| ListenAt {
+        protocol: match url.scheme {
+            GatewayScheme::Ws | GatewayScheme::Wss => Protocol::WebSocket,
+            GatewayScheme::Grpc | GatewayScheme::Grpcs => Protocol::Grpc,
+        },
+        is_encrypted: url.scheme.is_encrypted(),
+        addr: url.address,
+    };
+    config.listen.iter().map(at).collect()
 }

@@ -16,6 +16,7 @@ mod authority;
 pub mod benchmarks;
 mod calls;
 pub mod config;
+mod conversion;
 mod core;
 mod credentials;
 mod dataplane;

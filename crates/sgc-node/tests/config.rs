@@ -15,7 +15,7 @@ use sgc_node::config::{
 use sgc_transport::Congestion;
 use sgc_trust::Suite;
 use sgc_wire::Class;
-use sgc_wire::PayloadEncoding;
+use sgc_wire::{PayloadEncoding, PayloadForm};
 
 /// The least that every node needs.
 const NODE: &str = "identity = 'x'\nnode.routers = ['quic://r:7447']\n";
@@ -108,6 +108,7 @@ fn every_key_is_taken_over() {
         localhost_only = false
         static_peers = ["10.0.0.2", "arm-2.local", "fe80::1"]
         graph = false
+        definitions = ["share", "/opt/robot/share"]
         [[share]]
         topic = "/a__b/_c"
         to = ["*"]
@@ -139,6 +140,7 @@ fn every_key_is_taken_over() {
     assert_eq!((ros.domain_id, ros.discovery), (232, DiscoveryRange::Localhost));
     assert_eq!(ros.static_peers, ["10.0.0.2", "arm-2.local", "fe80::1"]);
     assert!(!ros.graph);
+    assert_eq!(ros.definitions, [Path::new("/etc/sgc/share"), Path::new("/opt/robot/share")]);
     let share = &config.shares[0];
     assert_eq!(texts(&share.to), ["*"]);
     assert_eq!(share.type_name.as_deref(), Some("sensor_msgs/msg/Image"));
@@ -189,7 +191,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
             &[
-                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `token`, `link`",
+                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `token`, `link`",
             ],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
@@ -349,6 +351,33 @@ fn what_leaves_may_be_compressed_and_nothing_else() {
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncompress = 'lz4'",
             &[
                 "node.toml:6: `compress` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn topics_that_leave_may_travel_as_json_and_nothing_else() {
+    for (word, form) in [("cdr", PayloadForm::Cdr), ("json", PayloadForm::Json)] {
+        let config = good(&format!(
+            "{NODE}[[share]]\ntopic = '/a'\nto = ['b']\nencoding = '{word}'\n\
+             [[use]]\nfrom = 'b'\ntopic = '/b'\npublish = true\nencoding = '{word}'"
+        ));
+        assert_eq!((config.shares[0].shaping.form, config.uses[0].shaping.form), (form, form));
+    }
+    check_all(&[
+        (
+            "[[share]]\ntopic = '/a'\nto = ['b']\nencoding = 'jsn'",
+            &["node.toml:6: `encoding` is \"jsn\"; did you mean \"json\"? It takes \"cdr\", \"json\""],
+        ),
+        (
+            "[[share]]\nservice = '/a'\nto = ['b']\nencoding = 'json'",
+            &["node.toml:6: `encoding` is for topics, and this is about `service`: take it out"],
+        ),
+        (
+            "[[use]]\nfrom = 'b'\ntopic = '/a'\nencoding = 'json'",
+            &[
+                "node.toml:6: `encoding` is for what this node publishes there: what comes here is written as the owner's share says, and every node reads both; set `publish = true`, or take it out",
             ],
         ),
     ]);
@@ -1285,7 +1314,6 @@ fn every_key_of_a_gateway_is_taken_over() {
         anonymous = "all"
         origins = ["https://Dash.example.org:443"]
         plain = true
-        msg_dirs = ["msgs", "/opt/msgs"]
         clients_max = 16
         client_bytes_max = "1MiB"
         [[gateway.client]]
@@ -1307,7 +1335,6 @@ fn every_key_of_a_gateway_is_taken_over() {
     );
     assert_eq!((gateway.anonymous, gateway.plain), (Anonymous::All, true));
     assert_eq!(texts(&gateway.origins), ["https://dash.example.org"]);
-    assert_eq!(gateway.msg_dirs, [PathBuf::from("/etc/sgc/msgs"), PathBuf::from("/opt/msgs")]);
     assert_eq!((gateway.clients_max, gateway.client_bytes_max), (16, 1 << 20));
     assert_eq!(gateway.clients.len(), 2);
     assert_eq!(texts(&gateway.clients[0].who), ["desk", "group:operators", "partner:acme"]);
@@ -1433,7 +1460,7 @@ fn mistakes_in_a_gateway_are_told() {
             "[gateway]\nport = 9090",
             &[
                 "node.toml:4: [gateway] has no key `port`; it has `listen`, `certificate`, `key`, `anonymous`, `origins`, `plain`, \
-             `msg_dirs`, `clients_max`, `client_bytes_max`, `client`",
+             `clients_max`, `client_bytes_max`, `client`",
             ],
         ),
     ]);
@@ -1450,7 +1477,7 @@ fn files_of_a_gateway_are_looked_at() {
     }
     fs::write(dir.path().join("robot.pem"), "nothing").unwrap();
     let gateway = "[gateway]\nlisten = ['wss://127.0.0.1']\ncertificate = 'robot.pem'\nkey = 'robot.key'\n";
-    fs::write(&file, format!("{NODE}{gateway}msg_dirs = ['msgs', 'robot.pem']")).unwrap();
+    fs::write(&file, format!("{NODE}{gateway}")).unwrap();
     let told = || -> Vec<String> {
         let place = dir.path().display().to_string();
         let errors = load(&file, &no_env).unwrap_err();
@@ -1458,10 +1485,9 @@ fn files_of_a_gateway_are_looked_at() {
     };
     let said = told();
     let lines: Vec<_> = said.iter().map(|line| &line[..16]).collect();
-    assert_eq!(lines, ["DIR/node.toml:5:", "DIR/node.toml:6:", "DIR/node.toml:7:", "DIR/node.toml:7:"]);
+    assert_eq!(lines, ["DIR/node.toml:5:", "DIR/node.toml:6:"]);
     assert!(said[0].contains("no certificate is in it"), "{}", said[0]);
     assert!(said[1].contains("no private key is in it"), "{}", said[1]);
-    assert!(said[2].contains("DIR/msgs: No such file") && said[3].contains("not a directory"), "{said:?}");
     fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
     assert!(told()[1].contains("its mode 0644 lets others at the gateway's private key"), "{}", told()[1]);
 }

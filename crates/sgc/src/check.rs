@@ -12,6 +12,8 @@ use sgc_node::config::{
     TokenSource,
 };
 use sgc_trust::Identity;
+use sgc_types::Definitions;
+use sgc_wire::PayloadForm;
 
 use crate::error::CliError;
 use crate::{name, output, run};
@@ -106,6 +108,9 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
             let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
             row("", format!("published on by {} besides", publish.join(", ")));
         }
+        if share.shaping.form == PayloadForm::Json {
+            row("", json(config, share.type_name.as_deref()));
+        }
         if let Some(name) = name_of(config, identity, share)? {
             row("", format!("named {name}"));
         }
@@ -113,6 +118,9 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     for one in &config.uses {
         let (what, type_name) = (called(one.interface, &one.topic), type_of(one.type_name.as_deref()));
         row("uses", format!("{what}{type_name} from {}{}", one.from, renamed(&one.naming, "here as")));
+        if one.shaping.form == PayloadForm::Json {
+            row("", json(config, one.type_name.as_deref()));
+        }
     }
     for token in &config.tokens {
         match &token.source {
@@ -169,6 +177,20 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     rows
 }
 
+/// What travels as JSON needs a definition.
+fn json(config: &Config, type_name: Option<&str>) -> String {
+    let dirs = config.ros.as_ref().map_or(&[][..], |ros| &ros.definitions);
+    let found =
+        type_name.and_then(|name| name.parse().ok()).map(|name| Definitions::from_env(dirs).layout(&name));
+    match found {
+        None => "as JSON, if a definition of its type is known here by then".to_owned(),
+        Some(Ok(_)) => "as JSON".to_owned(),
+        Some(Err(why)) => format!(
+            "as JSON, but nothing can be sent: {why}; name a directory that has it with `definitions` in [ros]"
+        ),
+    }
+}
+
 fn type_of(type_name: Option<&str>) -> String {
     type_name.map(|name| format!(" [{name}]")).unwrap_or_default()
 }
@@ -203,4 +225,18 @@ fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<
     }
     let name = name::name_of(identity, &config.identity, identity.node_name(), share)?;
     Ok(Some(name.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_travel_as_json_is_said() {
+        let said = |type_name| json(&Config::default(), type_name);
+        assert_eq!(said(Some("std_msgs/msg/String")), "as JSON");
+        assert!(said(None).contains("if a definition of its type is known"));
+        let unknown = said(Some("mine/msg/Thing"));
+        assert!(unknown.contains("nothing can be sent: no definition of mine/msg/Thing"), "{unknown}");
+    }
 }

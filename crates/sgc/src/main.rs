@@ -11,7 +11,6 @@
 mod audit;
 mod bench;
 mod check;
-mod definitions;
 mod demo;
 mod error;
 mod files;

@@ -92,6 +92,7 @@ pub(super) struct RosDraft {
     /// The whole list is located too, since an empty one is a choice.
     pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
     pub(super) graph: Option<Located<bool>>,
+    pub(super) definitions: Option<Located<Vec<Located<String>>>>,
 }
 
 /// `[[share]]`. What is required is `None` only where an error has been recorded already.
@@ -130,6 +131,7 @@ pub(super) struct ShapingDraft {
     pub(super) max_bandwidth: Option<Located<String>>,
     pub(super) max_age: Option<Located<String>>,
     pub(super) compress: Option<Located<String>>,
+    pub(super) encoding: Option<Located<String>>,
 }
 
 /// `[[use]]`. What is required is `None` only where an error has been recorded already.
@@ -183,7 +185,6 @@ pub(super) struct GatewayDraft {
     pub(super) anonymous: Option<Located<String>>,
     pub(super) origins: Vec<Located<String>>,
     pub(super) plain: Option<Located<bool>>,
-    pub(super) msg_dirs: Vec<Located<String>>,
     pub(super) clients_max: Option<Located<i64>>,
     pub(super) client_bytes_max: Option<Located<String>>,
     pub(super) clients: Vec<GatewayClientDraft>,

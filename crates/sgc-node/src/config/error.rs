@@ -843,6 +843,14 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
+    /// What comes from elsewhere is written in.
+    #[error(
+        "`{key}` is for what this node publishes there: what comes here is written as the owner's share says, and every node reads both; set `publish = true`, or take it out"
+    )]
+    EncodingOfOther {
+        /// The key.
+        key: &'static str,
+    },
     /// A setting of how much of a topic goes on.
     #[error("`{key}` is {value:?}; it takes {what}")]
     Shaping {

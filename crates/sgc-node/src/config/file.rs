@@ -185,6 +185,11 @@ impl FileReader<'_> {
                 "an array of strings, such as [\"10.0.0.2\", \"arm-2.local\"]",
             ),
             graph: self.boolean(ros, "graph", "true or false"),
+            definitions: self.strings(
+                ros,
+                "definitions",
+                "an array of strings, such as [\"/opt/robot/share\"]",
+            ),
         }
     }
 
@@ -262,6 +267,7 @@ impl FileReader<'_> {
             max_bandwidth: self.string(topic, "max_bandwidth", "a string, such as \"2Mbps\""),
             max_age: self.string(topic, "max_age", "a string, such as \"500ms\""),
             compress: self.string(topic, "compress", "a string, \"zstd\", \"lz4\" or \"none\""),
+            encoding: self.string(topic, "encoding", "a string, \"cdr\" or \"json\""),
         }
     }
 
@@ -332,11 +338,6 @@ impl FileReader<'_> {
                 "an array of strings, such as [\"https://dashboard.example.org\"]",
             ),
             plain: self.boolean(gateway, "plain", "true or false"),
-            msg_dirs: self.flat_strings(
-                gateway,
-                "msg_dirs",
-                "an array of strings, such as [\"/opt/our_msgs\"]",
-            ),
             clients_max: self.integer(gateway, "clients_max", "a number, such as 512"),
             client_bytes_max: self.string(gateway, "client_bytes_max", "a string, such as \"64MiB\""),
             clients,

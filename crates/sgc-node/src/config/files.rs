@@ -92,13 +92,12 @@ fn check_private_key(key: &'static str, path: &Path) -> Result<(), Mistake> {
 }
 
 fn check_directory(key: &'static str, path: &Path) -> Result<(), Mistake> {
-    let reason = match fs::metadata(path) {
-        Ok(found) if found.is_dir() => return Ok(()),
-        Ok(_) => "not a directory".to_owned(),
-        Err(error) => error.to_string(),
-    };
-    let expected = "a directory with message packages, such as PACKAGE/msg/NAME.msg";
-    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
+    fs::read_dir(path).map(drop).map_err(|error| Mistake::File {
+        key,
+        path: path.to_owned(),
+        reason: error.to_string(),
+        expected: "a directory with packages of ROS 2, and that this user may read",
+    })
 }
 
 fn private(key: &'static str, path: &Path, what: &'static str) -> Result<(), Mistake> {

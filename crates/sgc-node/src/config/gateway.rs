@@ -14,8 +14,6 @@ use super::error::Mistake;
 
 /// Origins of pages that one gateway admits.
 pub const ORIGINS_MAX: usize = 64;
-/// Directories with message packages that one gateway reads.
-pub const MSG_DIRS_MAX: usize = 64;
 /// `[[gateway.client]]` tables.
 pub const GATEWAY_CLIENTS_MAX: usize = 256;
 
@@ -38,8 +36,6 @@ pub struct GatewayConfig {
     pub origins: Vec<PageOrigin>,
     /// Whether it may be used unencrypted from other hosts.
     pub plain: bool,
-    /// Directories with message packages.
-    pub msg_dirs: Vec<PathBuf>,
     /// Clients that are connected at once; 1 to [`GatewayConfig::CLIENTS_MAX_MAX`].
     pub clients_max: usize,
     /// Bytes that wait for one client; [`GatewayConfig::CLIENT_BYTES_MIN`] to [`GatewayConfig::CLIENT_BYTES_MAX`].
@@ -116,7 +112,6 @@ impl Default for GatewayConfig {
             anonymous: Anonymous::default(),
             origins: Vec::new(),
             plain: false,
-            msg_dirs: Vec::new(),
             clients_max: 512,
             client_bytes_max: 64 * MIB,
             clients: Vec::new(),

@@ -96,7 +96,9 @@ impl Table {
             Self::Node => {
                 &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
             }
-            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph"],
+            Self::Ros => {
+                &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph", "definitions"]
+            }
             Self::Share => &[
                 "topic",
                 "service",
@@ -113,6 +115,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "link",
                 "suite",
                 "description",
@@ -139,6 +142,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "token",
                 "link",
             ],
@@ -156,7 +160,6 @@ impl Table {
                 "anonymous",
                 "origins",
                 "plain",
-                "msg_dirs",
                 "clients_max",
                 "client_bytes_max",
                 "client",
@@ -180,8 +183,7 @@ impl Table {
             | Self::Partner
             | Self::Gateway
             | Self::GatewayClient => &[],
-            Self::Share => &["encoding"],
-            Self::Use => &[],
+            Self::Share | Self::Use => &[],
         }
     }
 

@@ -16,6 +16,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Deserialize;
+use sgc_cdr::DESCRIPTION_BYTES_MAX;
 use sgc_node::admin::{AdminRequest, TapHead};
 use sgc_node::graph::{Graph, Side};
 
@@ -26,8 +27,8 @@ use crate::status;
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 /// How long making a local reader may take.
 const BEGIN_MAX: Duration = Duration::from_secs(30);
-/// Longest first line of what a tap says.
-const FIRST_LINE_BYTES_MAX: usize = 4096;
+/// Longest first line of what a tap says: a description in base64 fits.
+const FIRST_LINE_BYTES_MAX: usize = 4096 + DESCRIPTION_BYTES_MAX * 4 / 3;
 /// The largest message that is read: what a node carries is smaller.
 const MESSAGE_BYTES_MAX: u32 = 256 << 20;
 
@@ -155,6 +156,15 @@ struct Shown {
     #[serde(rename = "type")]
     type_name: String,
     type_hash: Option<String>,
+    described: Option<Told>,
+}
+
+/// What a node knows of a type.
+#[derive(Debug, Deserialize)]
+struct Told {
+    type_hash: String,
+    /// In base64.
+    description: String,
 }
 
 /// A topic that is shown.

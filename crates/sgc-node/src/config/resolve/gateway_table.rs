@@ -1,14 +1,12 @@
 //! `[gateway]`: the draft of one → its configuration.
 
-use std::path::PathBuf;
 
 use sgc_gateway::{Anonymous, Scope};
 
 use super::super::draft::{GatewayClientDraft, GatewayDraft, Located, PartnerDraft};
 use super::super::error::Mistake;
 use super::super::gateway::{
-    self, GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, MSG_DIRS_MAX,
-    ORIGINS_MAX,
+    self, GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
 };
 use super::super::names;
 use super::{LISTEN_MAX, Resolver, unknown_word};
@@ -42,7 +40,6 @@ impl Resolver<'_> {
                 .unwrap_or_default(),
             origins: self.addresses(&written.origins, gateway::origin, ORIGINS_MAX),
             plain,
-            msg_dirs: self.directories(&written.msg_dirs, MSG_DIRS_MAX),
             clients_max: clients_max.and_then(|n| n.try_into().ok()).unwrap_or(default.clients_max),
             client_bytes_max: client_bytes_max.unwrap_or(default.client_bytes_max),
             clients: clients.filter_map(|client| self.gateway_client(client, partners)).collect(),
@@ -127,28 +124,6 @@ impl Resolver<'_> {
             self.record(&written.origin, Mistake::Scope { fault });
         }
         who.map(|who| GatewayClientConfig { who, scope })
-    }
-
-    fn directories(&mut self, written: &[Located<String>], max: usize) -> Vec<PathBuf> {
-        if let Some(over) = written.get(max) {
-            let (key, count) = (over.key, written.len());
-            self.record(&over.origin, Mistake::TooManyEntries { key, count, max });
-        }
-        let mut valid = Vec::new();
-        for one in written.iter().take(max) {
-            let Some(path) = self.path(&one.clone().map(PathBuf::from), "\"/opt/our_msgs\"") else {
-                continue;
-            };
-            if let Some(Err(mistake)) = self.checks.map(|checks| (checks.directory)(one.key, &path)) {
-                self.record(&one.origin, mistake);
-            }
-            if valid.contains(&path) {
-                self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
-            } else {
-                valid.push(path);
-            }
-        }
-        valid
     }
 }
 
