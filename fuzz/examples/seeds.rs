@@ -11,9 +11,9 @@ use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
-    Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name, PayloadEncoding, Qos,
-    Recover, RefuseReason, RejectReason, Request, RosNode, SecretBytes, Signed, SinkId, SourceId, SourceOffer,
-    TopicGrant, UnixMillis,
+    DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name,
+    PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason, RejectReason, Request, RosNode, SecretBytes,
+    Signed, SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
 };
 
 /// The time of the targets.
@@ -103,14 +103,21 @@ fn bodies() -> Vec<Vec<u8>> {
     let contents = [
         GrantContent::Topic(TopicGrant { entry: Some(Box::new(entry.clone())), ..grant(Suite::Standard) }),
         GrantContent::Catalogue(Catalogue { version: 2, entries: vec![entry] }),
+        GrantContent::Types(vec![DescribedType {
+            name: NAME,
+            type_hash: "RIHS01_00".into(),
+            encoding: PayloadEncoding::Zstd,
+            description: Bytes::from_static(b"\0\0\x01\0packed"),
+        }]),
     ];
-    let head =
-        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+    let head = MessageHead::new(MessageKind::Write, 7);
     let mut all = vec![(0, advert.to_vec())];
     all.extend(joins.map(|j| (1, j.to_vec())));
     all.extend(answers.map(|a| (2, a.to_vec())));
     all.extend(contents.map(|c| (3, c.to_vec())));
-    all.extend([(4, metadata.to_vec()), (5, head.to_vec())]);
+    let json = MessageHead { form: PayloadForm::Json, ..head };
+    all.extend([(4, metadata.to_vec()), (5, head.to_vec()), (5, json.to_vec())]);
+    all.push((6, TypeQuestion { names: vec![NAME; 2] }.to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 
@@ -136,11 +143,7 @@ fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
         };
         let mut source =
             Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");
-        let head = MessageHead {
-            kind: MessageKind::Write,
-            encoding: PayloadEncoding::Plain,
-            source_timestamp_ns: 7,
-        };
+        let head = MessageHead::new(MessageKind::Write, 7);
         let mut emit = |packet: sgc_wire::Packet| {
             let mut bytes = packet.header.to_vec();
             packet.payload.copy_into(&mut bytes);

@@ -9,14 +9,12 @@ use libfuzzer_sys::fuzz_target;
 use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, Payload, PayloadEncoding, SecretBytes, SinkId, SourceId,
-    TopicGrant,
+    Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
 };
 
 const NAME: Name = Name([1; 32]);
 const SINK: SinkId = SinkId([9; 16]);
-const HEAD: MessageHead =
-    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
 fn key(suite: Suite) -> &'static MessageKey {
     static KEYS: OnceLock<Vec<(Suite, MessageKey)>> = OnceLock::new();

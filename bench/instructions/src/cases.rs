@@ -18,8 +18,8 @@ use sgc_node::benchmarks::Forwarding;
 use sgc_transport::benchmarks::Conversation;
 use sgc_trust::{Freshness, MessageKey, ReplayWindow, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, Label, MessageHead, MessageKind, Name, Packet, PacketHeader, PayloadEncoding,
-    SecretBytes, SinkId, SourceId, TopicGrant,
+    Class, HOP_LIMIT, Label, MessageHead, MessageKind, Name, Packet, PacketHeader, SecretBytes, SinkId,
+    SourceId, TopicGrant,
 };
 
 use crate::Counter;
@@ -66,8 +66,7 @@ pub(crate) const CASES: &[Case] = &[
 ];
 
 const NAME: Name = Name([1; 32]);
-const HEAD: MessageHead =
-    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 /// Names in the tables of the data path.
 const NAMES: u32 = 10_000;
 /// Packets that wait in a queue at once; fewer than it holds.

@@ -52,12 +52,16 @@ impl TypeName {
     /// Name of the file that defines it, without its extension: that of `SetBool_Request` is `SetBool`.
     pub fn file_stem(&self) -> &str {
         let suffixes: &[&str] = match self.kind {
-            "srv" => &["_Request", "_Response"],
+            "srv" => &["_Request", "_Response", "_Event"],
             "action" => &[
                 "_SendGoal_Request",
                 "_SendGoal_Response",
+                "_SendGoal_Event",
+                "_SendGoal",
                 "_GetResult_Request",
                 "_GetResult_Response",
+                "_GetResult_Event",
+                "_GetResult",
                 "_FeedbackMessage",
                 "_Goal",
                 "_Result",
@@ -66,6 +70,35 @@ impl TypeName {
             _ => &[],
         };
         suffixes.iter().find_map(|suffix| self.name.strip_suffix(suffix)).unwrap_or(&self.name)
+    }
+}
+
+/// The messages of a service.
+impl TypeName {
+    /// What it is asked with: `std_srvs/srv/SetBool_Request` of `std_srvs/srv/SetBool`.
+    pub fn request(&self) -> Self {
+        self.with("_Request")
+    }
+
+    /// What it answers with.
+    pub fn response(&self) -> Self {
+        self.with("_Response")
+    }
+
+    /// What is told of both to who looks (REP 2012).
+    pub(crate) fn event(&self) -> Self {
+        self.with("_Event")
+    }
+
+    /// The service that it is a message of, if it is one's.
+    pub fn service(&self) -> Option<Self> {
+        let suffixes = ["_Request", "_Response", "_Event"].iter();
+        let name = suffixes.filter(|_| self.kind != "msg").find_map(|s| self.name.strip_suffix(s))?;
+        Some(Self { name: name.to_owned(), ..self.clone() })
+    }
+
+    fn with(&self, suffix: &str) -> Self {
+        Self { name: format!("{}{suffix}", self.name), ..self.clone() }
     }
 }
 

@@ -29,7 +29,7 @@ const PRIMITIVES: [(u8, Primitive); 12] = [
 ];
 
 impl Layout {
-    /// The hash that rmw announces for a message of this definition: `RIHS01_` and 64 hexadecimal digits.
+    /// The hash that rmw announces for a message, or a service, of this definition: `RIHS01_` and 64 hexadecimal digits.
     pub fn type_hash(&self) -> String {
         let mut text = String::from("{\"type_description\": ");
         if let Some(this) = self.structs.last() {
@@ -112,6 +112,11 @@ mod tests {
             (
                 "rmw_dds_common/msg/ParticipantEntitiesInfo",
                 "91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",
+            ),
+            // A service.
+            (
+                "example_interfaces/srv/AddTwoInts",
+                "e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a",
             ),
         ] {
             let layout = Library::empty().layout(&name.parse().unwrap(), &mut |_| None).unwrap();

@@ -1,9 +1,10 @@
 //! A type with all that it contains, resolved.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::defaults::MemberDefault;
-use crate::definition::{FieldType, Primitive, Shape, TypeName};
+use crate::definition::{Constant, FieldType, Primitive, Shape, TypeName};
 
 /// How deep types may contain each other.
 pub const LAYOUT_DEPTH_MAX: usize = 32;
@@ -25,6 +26,8 @@ pub struct Layout {
 pub(crate) struct Struct {
     pub(crate) name: TypeName,
     pub(crate) members: Vec<Member>,
+    /// Those of its definition; a description that travels has none.
+    pub(crate) constants: Vec<Constant>,
 }
 
 /// A member of it.
@@ -57,6 +60,31 @@ impl Layout {
     /// The type.
     pub fn name(&self) -> Option<&TypeName> {
         self.structs.last().map(|s| &s.name)
+    }
+
+    /// The layout of a type that this one contains, such as a service its request; of the type itself that is all of it.
+    pub fn part(&self, name: &TypeName) -> Option<Self> {
+        let place = self.structs.iter().position(|inner| inner.name == *name)?;
+        let mut structs = Vec::new();
+        self.copy(place, &mut structs, &mut BTreeMap::new());
+        Some(Self { structs })
+    }
+
+    /// Puts a copy of what is at a place behind copies of what it contains; gives its place there.
+    fn copy(&self, place: usize, into: &mut Vec<Struct>, places: &mut BTreeMap<usize, usize>) -> usize {
+        if let Some(there) = places.get(&place) {
+            return *there;
+        }
+        let Some(inner) = self.structs.get(place) else { return 0 };
+        let mut copy = inner.clone();
+        for member in &mut copy.members {
+            if let Element::Struct(contained) = &mut member.element {
+                *contained = self.copy(*contained, into, places);
+            }
+        }
+        into.push(copy);
+        places.insert(place, into.len() - 1);
+        into.len() - 1
     }
 
     /// Whether its first member is a `std_msgs/msg/Header`, whose stamp [`Layout::header_stamp_ns`] finds.

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use crate::defaults::MemberDefault;
-use crate::definition::{Base, Definition, TypeName};
+use crate::definition::{Base, Definition, Field, FieldType, Shape, TypeName};
 use crate::idl::{is_idl, parse_idl};
 use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, Struct};
 use crate::parse::{ParseError, parse};
@@ -112,6 +112,9 @@ impl Library {
 
     /// What the CDR of a type looks like. Asks `look_up` for what is not known, and takes what ships where it has
     /// nothing.
+    ///
+    /// A service is a type, too, as type hashes and descriptions have it: one that contains its messages, and is never
+    /// serialised. [`Layout::part`] gives those.
     pub fn layout(&mut self, name: &TypeName, look_up: &mut LookUp<'_>) -> Result<Layout, TypeError> {
         let mut resolver = Resolver { library: self, look_up, structs: Vec::new(), places: BTreeMap::new() };
         resolver.resolve(name, None, &mut BTreeSet::new())?;
@@ -134,8 +137,38 @@ impl Library {
             } else {
                 self.add(&file, &text)?;
             }
+            self.define_service(&name.service().unwrap_or_else(|| name.clone()));
         }
         self.definitions.get(name).ok_or_else(unknown)
+    }
+
+    /// Adds what ROS 2 makes of a service's two messages (REP 2012, and `rosidl_generator_type_description`), if they are
+    /// known: the message that tells of both, and the service as a type.
+    fn define_service(&mut self, service: &TypeName) {
+        let (request, response) = (service.request(), service.response());
+        let is_known = |name| self.definitions.contains_key(name);
+        if service.kind() == "msg" || !is_known(&request) || !is_known(&response) {
+            return;
+        }
+        let Some(info) = TypeName::new("service_msgs", "msg", "ServiceEventInfo") else { return };
+        let field = |name: &str, of: &TypeName, shape| Field {
+            name: name.to_owned(),
+            field_type: FieldType { base: Base::Message(of.clone()), shape },
+            default: None,
+        };
+        let (event, at_most_one) = (service.event(), Shape::Sequence { bound: Some(1) });
+        let fields = vec![
+            field("info", &info, Shape::One),
+            field("request", &request, at_most_one),
+            field("response", &response, at_most_one),
+        ];
+        self.define(Definition { name: event.clone(), fields, constants: Vec::new() });
+        let fields = vec![
+            field("request_message", &request, Shape::One),
+            field("response_message", &response, Shape::One),
+            field("event_message", &event, Shape::One),
+        ];
+        self.define(Definition { name: service.clone(), fields, constants: Vec::new() });
     }
 }
 
@@ -186,7 +219,7 @@ impl Resolver<'_, '_> {
         if self.structs.len() >= LAYOUT_STRUCTS_MAX {
             return Err(TypeError::TooLarge { name: name.clone() });
         }
-        self.structs.push(Struct { name: name.clone(), members });
+        self.structs.push(Struct { name: name.clone(), members, constants: definition.constants });
         self.places.insert(name.clone(), self.structs.len() - 1);
         Ok(self.structs.len() - 1)
     }
@@ -208,6 +241,29 @@ mod tests {
             }
         }
         assert!(files > 200, "{files}");
+    }
+
+    #[test]
+    fn a_service_is_a_type_that_contains_its_messages() {
+        for (service, request, response) in [
+            ("std_srvs/srv/SetBool", "std_srvs/srv/SetBool_Request", "std_srvs/srv/SetBool_Response"),
+            (
+                "example_interfaces/action/Fibonacci_SendGoal",
+                "example_interfaces/action/Fibonacci_SendGoal_Request",
+                "example_interfaces/action/Fibonacci_SendGoal_Response",
+            ),
+        ] {
+            let [service, request, response] =
+                [service, request, response].map(|n| n.parse::<TypeName>().unwrap());
+            let of = |name| Library::empty().layout(name, &mut |_| None).unwrap();
+            let layout = of(&service);
+            for message in [&request, &response] {
+                let part = layout.part(message).unwrap();
+                assert_eq!((part.name(), message.service()), (Some(message), Some(service.clone())));
+                assert_eq!(part.type_hash(), of(message).type_hash());
+            }
+            assert!(layout.part(&"std_msgs/msg/String".parse().unwrap()).is_none());
+        }
     }
 
     #[test]

@@ -109,7 +109,7 @@ impl Way {
         let begin = Instant::now();
         let packed = self.compressor.compress(self.encoding, payload);
         let encoding = if packed.is_some() { self.encoding } else { PayloadEncoding::Plain };
-        let head = MessageHead { kind: MessageKind::Write, encoding, source_timestamp_ns: 7 };
+        let head = MessageHead { encoding, ..MessageHead::new(MessageKind::Write, 7) };
         let left = packed.unwrap_or_else(|| payload.clone());
         let bytes = left.len();
         self.source.publish(&head, left, false, |packet| packets.push(packet)).expect("it is not too large");

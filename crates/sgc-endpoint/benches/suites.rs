@@ -10,13 +10,10 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, PayloadEncoding, SecretBytes, SinkId, SourceId, TopicGrant,
-};
+use sgc_wire::{Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkId, SourceId, TopicGrant};
 
 const NAME: Name = Name([1; 32]);
-const HEAD: MessageHead =
-    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 /// How long one configuration is measured, of all suites together.
 const MEASURE: Duration = Duration::from_millis(1500);
 const ROUNDS_MIN: usize = 5;

@@ -11,12 +11,13 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
 use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, renewal_blind};
 use sgc_wire::{
-    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, Control, Credentials, Metadata, Name, NodeId, Now,
-    Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
+    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, Control, Credentials, DescribedType, Metadata, Name,
+    NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
 };
 
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
+use crate::types::{TypeAsker, types_name};
 
 /// How often it is looked for certificates that have ended, which happens without anything else.
 const ENFORCE_EVERY: Duration = Duration::from_secs(20);
@@ -176,6 +177,13 @@ pub enum Event {
         /// Why.
         reason: LostReason,
     },
+    /// What an owner says that types of its interfaces look like, of those that were asked for; not verified yet.
+    Types {
+        /// The owner.
+        owner: NodeId,
+        /// The types.
+        types: Vec<DescribedType>,
+    },
     /// A followed owner's catalogue, whenever it changes.
     Catalogue {
         /// The owner.
@@ -250,6 +258,11 @@ pub struct Endpoint {
     /// Where members ask this authority.
     pub(crate) renewal_name: Option<(Name, Blind)>,
     pub(crate) renewals: BTreeMap<SinkId, GrantedSink>,
+    /// Where this owner is asked what its types look like.
+    pub(crate) types_name: (Name, Blind),
+    /// True once it describes any.
+    pub(crate) describes: bool,
+    pub(crate) questions: BTreeMap<SinkId, TypeAsker>,
     pub(crate) shares: Shares,
     pub(crate) joins: BTreeMap<Name, Join>,
     /// Catalogue names of followed owners.
@@ -286,6 +299,9 @@ impl Endpoint {
             catalogue_names,
             renewal_name,
             renewals: BTreeMap::new(),
+            types_name: types_name(&own),
+            describes: false,
+            questions: BTreeMap::new(),
             shares: Shares::default(),
             joins: BTreeMap::new(),
             followed: BTreeMap::new(),
@@ -413,7 +429,8 @@ impl Endpoint {
     }
 
     pub(crate) fn advertise_all(&mut self) {
-        let fixed = self.catalogue_names.iter().chain(&self.renewal_name).map(|(_, b)| *b);
+        let types = self.describes.then_some(&self.types_name);
+        let fixed = self.catalogue_names.iter().chain(&self.renewal_name).chain(types).map(|(_, b)| *b);
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
     }
 

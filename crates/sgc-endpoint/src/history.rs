@@ -177,7 +177,6 @@ impl History {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::PayloadEncoding;
 
     use super::*;
 
@@ -187,7 +186,7 @@ mod tests {
 
     fn push(history: &mut History, kind: MessageKind, bytes: usize) {
         let seq = history.newest().map_or(history.oldest(), |m| m.seq + 1);
-        let head = MessageHead { kind, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
+        let head = MessageHead::new(kind, 0);
         history.push(Kept { seq, head, payload: vec![0; bytes].into() });
     }
 
@@ -241,11 +240,7 @@ mod tests {
         let mut history = history(3, 10_000, 5, 10_000);
         for n in 1..=6_i64 {
             let kind = if n == 2 { MessageKind::Mark } else { MessageKind::Write };
-            let head = MessageHead {
-                kind,
-                encoding: Default::default(),
-                source_timestamp_ns: if n == 2 { 0 } else { n * 10 },
-            };
+            let head = MessageHead::new(kind, if n == 2 { 0 } else { n * 10 });
             history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
         }
         assert_eq!((history.late_from(), history.oldest()), (4, 2));
@@ -255,8 +250,7 @@ mod tests {
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (6, 6, vec![6]));
         history.expire(i64::MAX);
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (7, 7, 0));
-        let head =
-            MessageHead { kind: MessageKind::Write, encoding: Default::default(), source_timestamp_ns: 70 };
+        let head = MessageHead::new(MessageKind::Write, 70);
         history.push(Kept { seq: 7, head, payload: vec![0; 8].into() });
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (7, 7, vec![7]));
     }
@@ -267,11 +261,7 @@ mod tests {
         for n in 1..4 {
             history.push(Kept {
                 seq: n,
-                head: MessageHead {
-                    kind: MessageKind::Write,
-                    encoding: PayloadEncoding::Plain,
-                    source_timestamp_ns: 0,
-                },
+                head: MessageHead::new(MessageKind::Write, 0),
                 payload: Bytes::from_static(b"x"),
             });
             assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (n + 1, n + 1, 0));

@@ -8,8 +8,8 @@ use sgc_trust::{
     Identity, Kem, ReplyKey, TopicSecret, VerifiedPeer, name_of, renewal_blind, verify_advert, verify_answer,
 };
 use sgc_wire::{
-    Answer, AnswerBody, Control, Decode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Recover,
-    RefuseReason, RejectReason, Signed, SinkId, SourceId,
+    Answer, AnswerBody, Control, Decode, DescribedType, GrantContent, JoinBody, Metadata, Name, NodeId, Now,
+    Recover, RefuseReason, RejectReason, Signed, SinkId, SourceId,
 };
 
 use crate::endpoint::{Dropped, Endpoint, Event, Output};
@@ -105,7 +105,7 @@ impl Endpoint {
             .joins
             .iter()
             .filter_map(|(name, join)| match &join.state {
-                JoinState::Granted { sink, reply_key, .. } if !matches!(join.wish, Wish::Renew(_)) => {
+                JoinState::Granted { sink, reply_key, .. } if !join.wish.is_question() => {
                     Some(self.join_frame(&identity, *name, *sink, &join.wish, reply_key.public().clone()))
                 }
                 _ => None,
@@ -163,8 +163,7 @@ impl Endpoint {
             return self.unexpected("reroute");
         };
         let asks = matches!((&join.state, &join.rerouting), (JoinState::Granted { .. }, Rerouting::No));
-        // An authority's answer is for good: there is nothing that flows.
-        if asks && !matches!(join.wish, Wish::Renew(_)) {
+        if asks && !join.wish.is_question() {
             self.ask_beside(name);
         }
     }
@@ -246,7 +245,7 @@ impl Endpoint {
     fn lost(&mut self, name: Name, reason: LostReason) {
         match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
             (Some(owner), _) => self.owner_lost(*owner, reason),
-            (None, Some(Wish::Renew(_))) => {}
+            (None, Some(Wish::Renew(_) | Wish::Types(_))) => {}
             (None, _) => self.event(Event::Lost { name, reason }),
         }
     }
@@ -267,6 +266,8 @@ impl Endpoint {
             (Some(owner), _) if self.hears(&owner) => {}
             (Some(owner), _) => self.event(Event::OwnerRefused { owner, by }),
             (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
+            // What is not described is not known; that is seen where it is needed.
+            (None, Some(Wish::Types(_))) => {}
             (None, _) => self.event(Event::Refused { name, by }),
         }
     }
@@ -406,6 +407,11 @@ impl Endpoint {
             }
             (GrantContent::Credentials(credentials), Some(Wish::Renew(_))) => {
                 self.event(Event::Renewed { credentials });
+            }
+            (GrantContent::Types(types), Some(Wish::Types(names))) => {
+                let asked = |t: &DescribedType| names.contains(&t.name);
+                let types: Vec<_> = types.into_iter().filter(asked).collect();
+                self.event(Event::Types { owner, types });
             }
             _ => self.unexpected("kind of grant"),
         }

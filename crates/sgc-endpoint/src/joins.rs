@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use rand_core::RngCore;
 use sgc_trust::{ReplyKey, VerifiedPeer};
-use sgc_wire::{NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer};
+use sgc_wire::{
+    Encode, Name, NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer, TypeQuestion,
+};
 
 /// Wait before asking again for what was granted until now: the way may be another by now.
 const RETRY_FIRST: Duration = Duration::from_millis(20);
@@ -65,6 +67,8 @@ pub enum Wish {
     Follow,
     /// A fresh certificate for this signing request (PKCS #10, DER).
     Renew(Bytes),
+    /// What the types of these interfaces of an owner look like.
+    Types(Vec<Name>),
 }
 
 impl Wish {
@@ -73,8 +77,17 @@ impl Wish {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
             Self::Follow => Request::Subscribe { describe: false },
             Self::Publish(offer) => Request::Publish { offer: offer.clone() },
-            Self::Renew(csr) => Request::Renew { csr: csr.clone() },
+            Self::Renew(csr) => Request::Ask { what: csr.clone() },
+            Self::Types(names) => {
+                let question = TypeQuestion { names: names.clone() };
+                Request::Ask { what: question.to_vec().into() }
+            }
         }
+    }
+
+    /// Whether an answer is for good: there is nothing that flows, and no better way to be looked for.
+    pub(crate) fn is_question(&self) -> bool {
+        matches!(self, Self::Renew(_) | Self::Types(_))
     }
 }
 

@@ -22,6 +22,7 @@ mod partial;
 mod shares;
 mod sink;
 mod source;
+mod types;
 
 pub use calls::{
     ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallRefused, CallStats,
@@ -36,3 +37,4 @@ pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
 pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};
+pub use types::{PackedType, unpack_type};

@@ -51,6 +51,7 @@ impl Endpoint {
             since: BTreeMap::new(),
             left: BTreeMap::new(),
             told_own: false,
+            described: None,
         };
         self.shares.shares.insert(name, share);
         self.withdrawn.remove(&blind);
@@ -121,6 +122,9 @@ impl Endpoint {
         self.unadvertised.remove(&share.blind);
         self.withdrawn.insert(share.blind);
         self.catalogue_dirty = true;
+        if self.shares.shares.values().all(|share| share.described.is_none()) {
+            self.withdraw_types();
+        }
     }
 
     /// Who publishes on a share: by source, the sink that what is for it is addressed to.
@@ -128,7 +132,7 @@ impl Endpoint {
         let sinks = self.shares.shares.get(name).into_iter().flat_map(|share| &share.sinks);
         let publishers = sinks.filter_map(|(sink, granted)| match &granted.request {
             Request::Publish { offer } => Some((offer.source, *sink)),
-            Request::Subscribe { .. } | Request::Renew { .. } => None,
+            Request::Subscribe { .. } | Request::Ask { .. } => None,
         });
         publishers.collect()
     }
@@ -161,6 +165,7 @@ impl Endpoint {
         if let Some((_, blind)) = self.renewal_name.take() {
             self.withdrawn.insert(blind);
         }
+        self.withdraw_types();
         self.renew_at = None;
         self.enforce_at = None;
         self.catalogue_rests = None;
@@ -190,7 +195,7 @@ impl Endpoint {
     /// Who asked this authority and is still there: sink, node, and signing request.
     pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.renewals.iter().filter_map(|(sink, asked)| match &asked.request {
-            Request::Renew { csr } => Some((*sink, &asked.peer, csr)),
+            Request::Ask { what: csr } => Some((*sink, &asked.peer, csr)),
             Request::Subscribe { .. } | Request::Publish { .. } => None,
         })
     }
@@ -251,6 +256,7 @@ impl Endpoint {
                 self.answer_renewal(self.now, sink, Err(reason));
             }
         }
+        self.enforce_types();
     }
 
     /// Who lost the right to a share begins anew if it gets it back.
@@ -266,7 +272,7 @@ impl Endpoint {
     }
 
     /// Why a peer whose certificate was good when it asked may not have anything any more.
-    fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
+    pub(crate) fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
         if self.anchors.is_peer_revoked(peer) {
             Some(RefuseReason::Revoked)
         } else if peer.not_after < self.now.unix {
@@ -428,7 +434,7 @@ impl Endpoint {
     }
 
     /// Answers yes; false if the request's reply key is unusable, which is answered with no.
-    fn grant(
+    pub(crate) fn grant(
         &mut self,
         name: Name,
         sink: SinkId,
@@ -449,7 +455,7 @@ impl Endpoint {
         }
     }
 
-    fn refuse(&mut self, name: Name, sink: SinkId, serial: u64, reason: RefuseReason) {
+    pub(crate) fn refuse(&mut self, name: Name, sink: SinkId, serial: u64, reason: RefuseReason) {
         self.answer(AnswerBody { name, sink, serial, answer: Answer::Refuse { reason } });
     }
 
@@ -475,7 +481,8 @@ impl Endpoint {
                 if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body)
                     && (self.shares.shares.contains_key(&name)
                         || self.is_catalogue(&name)
-                        || self.is_renewal(&name))
+                        || self.is_renewal(&name)
+                        || self.is_types(&name))
                 {
                     self.refuse(name, sink, 1, why.refuse_reason());
                 }
@@ -495,6 +502,8 @@ impl Endpoint {
             self.handle_follow(name, sink, asked);
         } else if self.is_renewal(&name) {
             self.handle_renew(name, sink, asked);
+        } else if self.is_types(&name) {
+            self.handle_type_question(name, sink, asked);
         } else {
             self.handle_subscribe_or_publish(name, sink, asked);
         }
@@ -560,7 +569,7 @@ impl Endpoint {
         let share = self.shares.shares.get(name).ok_or(RefuseReason::NotShared)?;
         share.spec.policy.permits(&asked.peer, asked.request.role()).map_err(refusal)?;
         match &asked.request {
-            Request::Renew { .. } => return Err(RefuseReason::RoleNotOffered),
+            Request::Ask { .. } => return Err(RefuseReason::RoleNotOffered),
             Request::Publish { offer } if offer.key.is_empty() == share.spec.suite.is_signed() => {
                 return Err(RefuseReason::NotVerified);
             }
@@ -584,7 +593,7 @@ impl Endpoint {
 
     fn handle_follow(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
-        let refused = if asked.request.role() != Role::Subscribe {
+        let refused = if !matches!(asked.request, Request::Subscribe { .. }) {
             Some(RefuseReason::RoleNotOffered)
         } else if !own_fleet {
             Some(RefuseReason::NotPermitted)
@@ -617,7 +626,7 @@ impl Endpoint {
 
     fn handle_renew(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
-        let Request::Renew { csr } = asked.request.clone() else {
+        let Request::Ask { what: csr } = asked.request.clone() else {
             return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
         };
         if !own_fleet {
@@ -643,6 +652,8 @@ impl Endpoint {
             self.shares.followers.remove(&(name, sink));
         } else if self.is_renewal(&name) {
             self.renewals.remove(&sink);
+        } else if self.is_types(&name) {
+            self.questions.remove(&sink);
         } else if let Some(share) = self.shares.shares.get_mut(&name)
             && let Some(granted) = share.sinks.remove(&sink)
         {

@@ -12,7 +12,7 @@ use sgc_wire::{
     Metadata, Name, NodeId, Qos, Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::{SinkProgress, SourceProgress};
+use crate::{PackedType, SinkProgress, SourceProgress};
 
 /// What to share.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -124,6 +124,8 @@ pub(crate) struct Share {
     pub(crate) since: BTreeMap<NodeId, Since>,
     /// Who left and still has the newest key. If one of them loses its right, that key has to go.
     pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
+    /// What its type looks like, if that is known.
+    pub(crate) described: Option<PackedType>,
 }
 
 impl Share {
@@ -143,7 +145,7 @@ impl Share {
             .values()
             .filter_map(|s| match &s.request {
                 Request::Publish { offer } => Some((offer.source, offer.key.clone())),
-                Request::Subscribe { .. } | Request::Renew { .. } => None,
+                Request::Subscribe { .. } | Request::Ask { .. } => None,
             })
             .collect();
         // They keep no history; what this node has heard of them is past to whoever is told of them now.

@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 use bytes::{Bytes, BytesMut};
 use sgc_trust::{Batch, MessageKey, SourceKey, Suite, sealed_bytes, trailer_bytes_max};
 use sgc_wire::{
-    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader,
-    PayloadEncoding, SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
+    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, SinkId, Slab,
+    SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::history::{History, Kept, RecoveryLimits};
@@ -285,11 +285,7 @@ impl Source {
         for (seq, head, payload) in asked {
             self.seal_fragments(Some(&key), seq, &head, &payload, &mut emit);
         }
-        let head = MessageHead {
-            kind: MessageKind::Synced,
-            encoding: PayloadEncoding::Plain,
-            source_timestamp_ns: 0,
-        };
+        let head = MessageHead::new(MessageKind::Synced, 0);
         self.seal_fragments(Some(&key), 0, &head, &[], &mut emit);
         self.flush(emit);
     }
@@ -346,8 +342,7 @@ impl Source {
     /// Publishes a mark; the caller has room for its number.
     fn seal_mark(&mut self, emit: &mut impl FnMut(Packet)) {
         self.seq += 1;
-        let head =
-            MessageHead { kind: MessageKind::Mark, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
+        let head = MessageHead::new(MessageKind::Mark, 0);
         // Its own place in the history may be that of the oldest: what it says is what is left then.
         self.keep(Kept { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
         let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());

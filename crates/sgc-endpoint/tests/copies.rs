@@ -11,8 +11,7 @@ use sgc_endpoint::{
 use sgc_testkit::{CountingAllocator, allocations};
 use sgc_trust::{MessageKey, Suite, trailer_bytes_max};
 use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, Payload, PayloadEncoding, SecretBytes, SinkId, SourceId,
-    TopicGrant,
+    Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
 };
 
 #[global_allocator]
@@ -25,8 +24,7 @@ fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
 }
 
 const NAME: Name = Name([1; 32]);
-const HEAD: MessageHead =
-    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
 /// So many small messages share a piece of memory at the source: with fewer than these it would count once too often, or
 /// not at all.

@@ -51,7 +51,7 @@ pub enum GatewayError {
         name: String,
     },
     /// The definition is not found, or not right.
-    #[error("no definition: {0}; name a directory that has it with `msg_dirs` in [gateway]")]
+    #[error("no definition: {0}; name a directory that has it with `definitions` in [ros]")]
     Definition(TypeError),
     /// What the client sent is no such message.
     #[error("not a message of that type: {0}")]

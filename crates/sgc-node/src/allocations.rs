@@ -14,8 +14,8 @@ use sgc_router::{FibEntry, LinkId, Tree};
 use sgc_testkit::{CountingAllocator, allocated_here, allocations};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, MessageHead, MessageKind, Name, Packet, PacketHeader, Payload, PayloadEncoding,
-    SecretBytes, SinkId, SourceId, TopicGrant,
+    Class, HOP_LIMIT, MessageHead, MessageKind, Name, Packet, PacketHeader, Payload, SecretBytes, SinkId,
+    SourceId, TopicGrant,
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
@@ -182,11 +182,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
         let queue = queue.expect("a thread");
         sink.set_writer(None, Some(queue));
         forwards(&data, LinkId(1), vec![(LinkId::LOCAL, Out::Local(sink.clone()))]);
-        let head = MessageHead {
-            kind: MessageKind::Write,
-            encoding: PayloadEncoding::Plain,
-            source_timestamp_ns: 0,
-        };
+        let head = MessageHead::new(MessageKind::Write, 0);
         let payload = Bytes::from(vec![7; MESSAGE_BYTES]);
         let mut packets = Vec::new();
         for n in 1..=WARM_UP + MESSAGES {

@@ -11,6 +11,7 @@ mod quality;
 mod ros;
 mod services;
 mod trust;
+mod types;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::PathBuf;
@@ -26,6 +27,7 @@ use sgc_ros::{
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
 use sgc_trust::{CrlError, Identity, TrustAnchors};
+use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Credentials, Name, NodeId, Now, RefuseReason, SinkId, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
@@ -34,6 +36,7 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::calls::Calls;
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
+use crate::core::types::{TypeOutcome, Types};
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
 use crate::finding::Board;
@@ -163,6 +166,8 @@ pub(crate) enum CoreEvent {
     },
     /// Keys that messages of these suites are signed with are made.
     MessageKeys(MessageKeys),
+    /// A type was looked for.
+    TypeLookedFor(TypeOutcome),
     /// Somebody asks how things are.
     Status(oneshot::Sender<Status>),
     /// Somebody asks what is there, and where it goes; also of a name that this node need not know.
@@ -256,6 +261,7 @@ pub(crate) struct Core<N: RosNetwork> {
     refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
     /// Who looks at the local network.
     local_taps: Vec<Arc<TapQueue>>,
+    types: Types,
 }
 
 /// What a [`Core`] is made of.
@@ -296,6 +302,10 @@ pub(crate) struct CoreParts<N> {
     pub(crate) board: Board,
     /// How often peers are asked that say nothing.
     pub(crate) patience: Patience,
+    /// Where types are kept that are known.
+    pub types: Arc<TypeStore>,
+    /// Where definitions of them are.
+    pub definitions: Definitions,
 }
 
 /// The present, by both clocks.
@@ -354,6 +364,7 @@ impl<N: RosNetwork> Core<N> {
             audit: parts.audit,
             board: parts.board,
             refused: BTreeMap::new(),
+            types: Types::new(parts.types, parts.definitions),
             local_taps: Vec::new(),
         };
         (core, requested)
@@ -485,6 +496,7 @@ impl<N: RosNetwork> Core<N> {
                 self.answer_renewals();
             }
             CoreEvent::MessageKeys(keys) => self.add_message_keys(keys),
+            CoreEvent::TypeLookedFor(outcome) => self.type_looked_for(outcome),
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }
@@ -685,12 +697,7 @@ impl<N: RosNetwork> Core<N> {
                     RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
                 })
                 .collect(),
-            problems: self
-                .routes
-                .iter()
-                .flat_map(|routes| routes.problems())
-                .map(ToString::to_string)
-                .collect(),
+            problems: self.problems(),
             names: names.collect(),
             drops,
             refused: sgc_transport::RefusalKind::ALL
@@ -704,6 +711,8 @@ impl<N: RosNetwork> Core<N> {
                 routed_names: router.routed_names,
                 branches: router.branches,
             },
+            // The core knows nothing of it.
+            gateway: None,
         }
     }
 }

@@ -299,6 +299,10 @@ pub struct ShareRoute {
     pub written: u64,
     /// Likewise.
     pub matched: u32,
+    /// Whether what is published here travels as JSON.
+    pub is_json: bool,
+    /// Whether messages travel as JSON, and what they look like is not known here.
+    pub lacks_definition: bool,
 }
 
 /// A rule of what is used.
@@ -366,6 +370,8 @@ pub struct UseRoute {
     pub is_read: bool,
     /// Messages given to the local network, or published.
     pub messages: u64,
+    /// Whether messages travel as JSON, and what they look like is not known here.
+    pub lacks_definition: bool,
 }
 
 /// What an owner lists for this node.

@@ -12,16 +12,19 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
+use sgc_gateway::LocalRos;
 use sgc_ros::{RosError, RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
 };
 use sgc_trust::{AnchorError, Identity, IdentityError};
+use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
+use crate::access::{AccessError, access_with};
 use crate::admin;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
@@ -29,6 +32,7 @@ use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
 use crate::file_watch::FileWatch;
 use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
+use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, key_of, listen_at};
 use crate::heart::Patience;
 use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
@@ -142,6 +146,12 @@ pub enum NodeError {
     /// The local network could not be joined.
     #[error(transparent)]
     Ros(#[from] RosError),
+    /// It cannot be said who may connect to the gateway.
+    #[error(transparent)]
+    Access(#[from] AccessError),
+    /// The gateway does not start.
+    #[error(transparent)]
+    Gateway(#[from] GatewayStartError),
     /// The local network's threads did not start, or no keys could be made.
     #[error("starting ended in a panic; this is a bug")]
     Panicked,
@@ -161,8 +171,12 @@ pub struct RunOptions {
     pub reload: Option<mpsc::Receiver<()>>,
     /// The file that `source` reads, to be read again when it changes, if its configuration does not say otherwise.
     pub file: Option<PathBuf>,
+    /// Where the types of what is shared and used are kept, for others in this process that read messages of them.
+    pub types: Option<Arc<TypeStore>>,
     /// The port of mDNS, if not its own: so that tests have a local network each.
     pub mdns_port: Option<u16>,
+    /// Opens the gateway's part of the local network; [`run`] sets it by itself.
+    pub gateway: Option<OpenLocalRos>,
 }
 
 /// Reads an identity file, which must be its owner's alone.
@@ -252,7 +266,12 @@ pub async fn run(
         Some(ros) => Some(Arc::new(CycloneNetwork::open(&dds_config(ros, &identity))?)),
         None => None,
     };
-    run_on(config, identity, network, options, shutdown).await
+    let gateway = config.ros.as_ref().map(|ros| -> OpenLocalRos {
+        // An ordinary participant, whose topics the node's own sees as any program's.
+        let config = DdsConfig { tag: None, ..dds_config(ros, &identity) };
+        Arc::new(move || CycloneNetwork::open(&config).map(|network| Arc::new(network) as Arc<dyn LocalRos>))
+    });
+    run_on(config, identity, network, RunOptions { gateway, ..options }, shutdown).await
 }
 
 /// [`run`] with an identity and a local network that are there already.
@@ -339,6 +358,24 @@ pub async fn run_on<N: RosNetwork>(
         Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
     });
 
+    let definitions = Definitions::from_env(config.ros.as_ref().map_or(&[], |ros| &ros.definitions));
+    let types = options.types.unwrap_or_default();
+    let found = NodeDefinitions { files: definitions.clone(), described: types.clone() };
+    let gateway = Gateway::new(options.gateway, identity.node_name().as_str(), found);
+    if let Some(wanted) = &config.gateway {
+        wanted.warnings().iter().for_each(|warning| warn!("{warning}"));
+        let access = access_with(&config, &identity, &rules.partners, state.as_deref(), now())?;
+        gateway
+            .listen(Sockets {
+                listen: listen_at(wanted),
+                access: access.unwrap_or_default(),
+                key: key_of(wanted, &identity)?,
+                clients_max: wanted.clients_max,
+                client_bytes_max: wanted.client_bytes_max.try_into().unwrap_or(usize::MAX),
+            })
+            .await?;
+    }
+
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
     let (alive, mut all_ended) = mpsc::channel(1);
@@ -350,6 +387,8 @@ pub async fn run_on<N: RosNetwork>(
     let board = Board::default();
     let claims = Claims::default();
     let (core, requested) = Core::new(CoreParts {
+        types,
+        definitions,
         board: board.clone(),
         patience,
         message_keys,
@@ -425,6 +464,7 @@ pub async fn run_on<N: RosNetwork>(
         audit: audit.clone(),
         events: events.clone(),
         has_ros: network.is_some(),
+        gateway: gateway.clone(),
         running: Mutex::new(Running { config, rules, suites }),
         changed: Notify::new(),
     });
@@ -443,7 +483,12 @@ pub async fn run_on<N: RosNetwork>(
         tasks.push(tokio::spawn(watch.run(reloader.clone())));
     }
     match admin::bind_socket(&socket) {
-        Ok(listener) => tasks.push(tokio::spawn(admin::serve(listener, events.clone(), reloader.clone()))),
+        Ok(listener) => tasks.push(tokio::spawn(admin::serve(
+            listener,
+            events.clone(),
+            reloader.clone(),
+            gateway.clone(),
+        ))),
         Err(error) => warn!(path = %socket.display(), %error, "no status socket"),
     }
     audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
@@ -456,6 +501,7 @@ pub async fn run_on<N: RosNetwork>(
     if let Some(local) = &local {
         local.say_goodbye().await;
     }
+    gateway.stop().await;
     let stop = async {
         let (reply, flows) = oneshot::channel();
         let _ = events.send(CoreEvent::Quiesce(reply)).await;

@@ -7,8 +7,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
+use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
@@ -16,10 +18,12 @@ use sgc_wire::{Kind, UnixMillis};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tracing::{info, warn};
 
+use crate::access::access_with;
 use crate::audit::{Audit, AuditEvent, AuditRecord};
-use crate::config::{Config, ConfigErrors};
+use crate::config::{Config, ConfigErrors, GatewayConfig};
 use crate::core::{CoreEvent, now};
 use crate::credentials::with_kept_crls;
+use crate::gateway::{Gateway, key_of};
 use crate::message_keys::{MessageKeys, make_for};
 use crate::node::NodeError;
 use crate::rules::Rules;
@@ -51,6 +55,7 @@ pub(crate) struct Reloader {
     pub(crate) events: mpsc::Sender<CoreEvent>,
     /// True if there is a local network to share with.
     pub(crate) has_ros: bool,
+    pub(crate) gateway: Arc<Gateway>,
     pub(crate) running: Mutex<Running>,
     /// Told when there is another time to wait for.
     pub(crate) changed: Notify,
@@ -71,6 +76,8 @@ struct Prepared {
     /// Whom to believe; nothing if that is as it was.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
+    /// Who may connect to the gateway, and what it shows them; nothing if there is none.
+    gateway: Option<(Access, Arc<CertifiedKey>)>,
 }
 
 impl Reloader {
@@ -139,10 +146,16 @@ impl Reloader {
                 )),
             };
             let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
-            Ok(Prepared { rules, anchors, message_keys })
+            let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
+            let gateway = match access.zip(wanted.gateway.as_ref()) {
+                Some((access, gateway)) => Some((access, key_of(gateway, &identity)?)),
+                None => None,
+            };
+            Ok(Prepared { rules, anchors, message_keys, gateway })
         });
         let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
-        let Prepared { rules, anchors, message_keys } = prepared.map_err(|error| error.to_string())?;
+        let Prepared { rules, anchors, message_keys, gateway } =
+            prepared.map_err(|error| error.to_string())?;
         running.suites.extend(message_keys.keys().copied());
         let mut report = ReloadReport {
             changed: changes(&running.rules, &rules),
@@ -151,6 +164,12 @@ impl Reloader {
         };
         // Before the control task looks at the links that are up.
         self.credentials.set_admitted(rules.partners.admitted.clone());
+        if let Some((access, key)) = gateway {
+            self.gateway.reconfigure(access, &key).await.map_err(|error| error.to_string())?;
+            if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
+                report.changed.push("who may connect to the gateway changed".to_owned());
+            }
+        }
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let event = CoreEvent::Reload { shares, uses, anchors, message_keys, reply };
@@ -159,8 +178,13 @@ impl Reloader {
         done.await.map_err(|_| stopping())?;
         self.audit.set_names(rules.names.clone());
         // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
-        let Config { shares, uses, tokens, partners, trust, accept, .. } = config;
-        running.config = Config { shares, uses, tokens, partners, trust, accept, ..running.config.clone() };
+        let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = config;
+        let before = running.config.clone();
+        let gateway = match (&before.gateway, gateway) {
+            (Some(before), Some(after)) => Some(restarted(before, &after)),
+            (before, _) => before.clone(),
+        };
+        running.config = Config { shares, uses, tokens, partners, trust, accept, gateway, ..before };
         running.rules = rules;
         report.changed.dedup();
         self.changed.notify_one();
@@ -199,6 +223,28 @@ impl Reloader {
                 }
             }
         }
+    }
+}
+
+/// What of a gateway may change while it runs.
+fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
+    restarted(&GatewayConfig::default(), gateway)
+}
+
+/// What runs of a gateway after a reload: sockets and bounds as they were, the rest as it is wanted.
+fn restarted(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
+    GatewayConfig {
+        listen: before.listen.clone(),
+        clients_max: before.clients_max,
+        client_bytes_max: before.client_bytes_max,
+        ..after.clone()
+    }
+}
+
+fn needs_other_sockets(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
+    match (before, after) {
+        (Some(before), Some(after)) => restarted(before, after) != *after,
+        (before, after) => before.is_some() != after.is_some(),
     }
 }
 
@@ -303,6 +349,7 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.announce != config.announce, "`announce` in [router]"),
         // Shares and uses join the default network where the file says nothing of it.
         (now.ros != config.ros, "[ros]"),
+        (needs_other_sockets(now.gateway.as_ref(), config.gateway.as_ref()), "[gateway]"),
         (now.state != config.state, "`state`"),
         (now.watch != config.watch, "`watch`"),
         (now.authority != config.authority, "[authority]"),

@@ -61,11 +61,11 @@ impl Shaper {
         }
     }
 
-    /// What went turned out to be so much shorter.
-    pub(crate) fn gives_back(&mut self, bytes: usize) {
+    /// What went was of another length than what was taken, once it was written as it leaves.
+    pub(crate) fn corrects(&mut self, taken: usize, left: usize) {
         if let (Some(due), Some(bits_per_s)) = (&mut self.bandwidth_due, self.shaping.bits_per_s) {
-            let took = Duration::from_secs_f64(bytes as f64 * 8.0 / bits_per_s.max(1) as f64);
-            *due = due.checked_sub(took).unwrap_or(*due);
+            let took = Duration::from_secs_f64(taken.abs_diff(left) as f64 * 8.0 / bits_per_s.max(1) as f64);
+            *due = if left > taken { *due + took } else { due.checked_sub(took).unwrap_or(*due) };
         }
     }
 
@@ -160,8 +160,11 @@ mod tests {
     fn a_bandwidth_counts_what_leaves() {
         let (mut shaper, now) = shaper(Shaping { bits_per_s: Some(8000), ..Shaping::default() });
         shaper.takes(now, 1000);
-        shaper.gives_back(900);
+        shaper.corrects(1000, 100);
         assert_eq!(shaper.due(), Some(now + ms(100)));
+        // JSON may be longer than what it was made of.
+        shaper.corrects(100, 300);
+        assert_eq!(shaper.due(), Some(now + ms(300)));
     }
 
     #[test]

@@ -16,11 +16,12 @@ use sgc_ros::{
     EndpointSpec, Guid, RosError, RosWriter, SampleKind, Shaping, of_all_instances, prefix_frames,
 };
 use sgc_router::LinkId;
-use sgc_wire::{History, MessageHead, MessageKind, Name, Packet, SinkId, SourceId, TopicGrant};
+use sgc_wire::{History, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
 use tokio::sync::mpsc;
 use tokio::time::{sleep_until, timeout_at};
 use tracing::{debug, warn};
 
+use crate::conversion::{self, KnownType, TYPE_WAIT_MAX, TypeSlot};
 use crate::dataplane::DataPlane;
 use crate::queue::Queue;
 use crate::shaper::Shaper;
@@ -74,6 +75,9 @@ pub(crate) struct LocalSink {
     shaping: Mutex<Shaping>,
     taps: Taps,
     frames: FramePrefix,
+    types: Arc<TypeSlot>,
+    /// Whether messages come as JSON.
+    takes_json: AtomicBool,
 }
 
 /// What the names of frames get in front, if anything; shared with the writers.
@@ -93,6 +97,8 @@ impl LocalSink {
             shaping: Mutex::default(),
             taps: Taps::default(),
             frames: FramePrefix::default(),
+            types: Arc::default(),
+            takes_json: AtomicBool::new(false),
         }
     }
 
@@ -245,8 +251,22 @@ impl LocalSink {
         self.frames.clone()
     }
 
+    /// What is known of the type of what comes.
+    pub(crate) fn types(&self) -> &Arc<TypeSlot> {
+        &self.types
+    }
+
+    /// Whether messages come as JSON that nobody here can read, for want of a definition.
+    pub(crate) fn lacks_definition(&self) -> bool {
+        self.takes_json.load(Relaxed) && self.types.now().layout().is_none()
+    }
+
     /// Ends all writers after what is queued.
     pub(crate) fn close(&self) {
+        // Nobody tells any more.
+        if self.types.now().layout().is_none() {
+            self.types.set(KnownType::Lacking);
+        }
         self.writers.load().values().for_each(|w| w.close());
         self.taps.close();
     }
@@ -327,7 +347,7 @@ impl LocalSink {
         let Some(writer) = self.writer(&message.source) else { return Some((DataDrop::NoWriter, 1)) };
         let (bytes, head) = (message.payload.len(), message.head);
         self.delivered.fetch_add(1, Relaxed);
-        self.taps.offer(|| Tapped::of_message(&message));
+        self.taps.offer(|| self.tapped(&message));
         match writer.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await {
             Ok(()) => {
                 writer.remember(&head);
@@ -341,12 +361,21 @@ impl LocalSink {
     fn write_now(&self, message: Message) -> Result<Option<(DataDrop, u64)>, Message> {
         let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
         let (bytes, head) = (message.payload.len(), message.head);
+        if head.form == PayloadForm::Json {
+            self.takes_json.store(true, Relaxed);
+            if matches!(self.types.now(), KnownType::Lacking) {
+                return Ok(Some((DataDrop::NoDefinition, 1)));
+            }
+        }
         if writer.has_written(&head) {
             return Ok(Some((DataDrop::Repeated, 1)));
         }
         let mut evicted = 0;
-        let tapped = self.taps.is_any().then(|| Tapped::of_message(&message));
-        if let Some(mut take) = writer.at_once(bytes, head.source_timestamp_ns) {
+        let tapped = self.taps.is_any().then(|| self.tapped(&message));
+        // Converting takes a while, and may have to wait for its type.
+        let at_once = head.form == PayloadForm::Cdr;
+        let at_once = at_once.then(|| writer.at_once(bytes, head.source_timestamp_ns)).flatten();
+        if let Some(mut take) = at_once {
             take(message, Next::Nothing);
         } else if message.reliable {
             writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
@@ -359,6 +388,10 @@ impl LocalSink {
             self.taps.offer(|| tapped);
         }
         Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
+    }
+
+    fn tapped(&self, message: &Message) -> Tapped {
+        Tapped::of_message(message, self.types.now().layout())
     }
 
     fn has_writer(&self, source: &SourceId) -> bool {
@@ -449,12 +482,14 @@ impl Recent {
 }
 
 impl WriterQueue {
-    /// Starts the thread; it ends, and the writer with it, once the queue is closed and empty. `frames` is for tf messages.
+    /// Starts the thread; it ends, and the writer with it, once the queue is closed and empty. `frames` is for tf messages,
+    /// `types` for what comes as JSON.
     pub(crate) fn spawn<W: RosWriter>(
         writer: W,
         spec: &EndpointSpec,
         shaping: Shaping,
         frames: Option<FramePrefix>,
+        types: Arc<TypeSlot>,
         failures: Arc<Drops>,
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<Arc<Self>> {
@@ -475,7 +510,7 @@ impl WriterQueue {
         });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
-        let mut decompressor = Decompressor::default();
+        let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let kind = match message.head.kind {
                 MessageKind::Write => SampleKind::Write,
@@ -491,6 +526,24 @@ impl WriterQueue {
                         warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
                     }
                     return None;
+                }
+            };
+            let payload = match message.head.form {
+                PayloadForm::Cdr => payload,
+                PayloadForm::Json => {
+                    let Some(layout) = types.wait(TYPE_WAIT_MAX) else {
+                        counted.count("json_unknown_type");
+                        return None;
+                    };
+                    match conversion::from_json(&layout, &payload, offered) {
+                        Ok(payload) => payload,
+                        Err(error) => {
+                            if counted.count("json_refused") {
+                                warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                            }
+                            return None;
+                        }
+                    }
                 }
             };
             let prefix = frames.as_ref().and_then(|frames| frames.load_full());
@@ -842,8 +895,7 @@ mod tests {
     }
 
     fn message(seq: u64, bytes: usize) -> Message {
-        let head =
-            MessageHead { encoding: Default::default(), kind: MessageKind::Write, source_timestamp_ns: 1 };
+        let head = MessageHead::new(MessageKind::Write, 1);
         Message { source: SourceId([1; 16]), seq, head, reliable: true, payload: vec![0; bytes].into() }
     }
 

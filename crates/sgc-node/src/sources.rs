@@ -18,12 +18,14 @@ use sgc_ros::{Guid, HandleSamples, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
 use sgc_transport::prompt::{self, AtHand};
 use sgc_wire::{
-    MessageHead, MessageKind, Name, Packet, PayloadEncoding, Recover, SinkId, SourceId, TopicGrant,
+    MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
+    TopicGrant,
 };
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
-use tracing::warn;
+use tracing::{debug, warn};
 
+use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
 use crate::shaper::Shaper;
 use crate::stats::DataDrop;
@@ -46,7 +48,7 @@ impl HandleSamples for Publisher {
     }
 }
 
-/// Samples that may wait for their writer to be discovered.
+/// Samples that may wait for their writer to be discovered, or for what their type looks like.
 const EARLY_SAMPLES_MAX: usize = 256;
 
 /// The longest message that the reader's thread sends itself, if nothing comes behind it.
@@ -128,7 +130,7 @@ struct Compression {
 #[derive(Default)]
 struct Inbox {
     /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before
-    /// it tells who wrote it.
+    /// it tells who wrote it. Also those that become JSON, while their type is looked for.
     early: VecDeque<Sample>,
     /// Sources that were told that more follows, and wait for it with what they have.
     open: Vec<SourceSlot>,
@@ -149,6 +151,9 @@ pub(crate) struct LocalShare {
     is_shaped: AtomicBool,
     /// Whether anything is set of how it goes out, compression included.
     is_altered: AtomicBool,
+    /// Whether messages leave as JSON.
+    is_json: AtomicBool,
+    types: TypeSlot,
     held: Mutex<Held>,
     compression: Compression,
     /// Told when it is closed, for who waits for his time.
@@ -197,6 +202,8 @@ impl LocalShare {
             inbox: Mutex::default(),
             is_shaped: AtomicBool::new(false),
             is_altered: AtomicBool::new(false),
+            is_json: AtomicBool::new(false),
+            types: TypeSlot::default(),
             held: Mutex::default(),
             compression: Compression::default(),
             ended: Condvar::new(),
@@ -224,8 +231,16 @@ impl LocalShare {
         lock(&self.held).shaper.set(shaping);
         lock(&self.compression.encoding).0 = shaping.compression;
         self.is_altered.store(shaping != Shaping::default(), SeqCst);
-        let limits = Shaping { compression: PayloadEncoding::Plain, ..shaping };
+        let (compression, form) = (PayloadEncoding::Plain, PayloadForm::Cdr);
+        let limits = Shaping { compression, form, ..shaping };
         self.is_shaped.store(limits != Shaping::default(), SeqCst);
+        self.is_json.store(shaping.form == PayloadForm::Json, SeqCst);
+    }
+
+    /// What its messages look like is known now, or is not; what waited for that is published, or dropped.
+    pub(crate) fn set_type(self: &Arc<Self>, known: KnownType) {
+        self.types.set(known);
+        self.publish_waiting();
     }
 
     /// How much goes out.
@@ -351,6 +366,11 @@ impl LocalShare {
     /// Puts new sources in place, and publishes what waited for them.
     pub(crate) fn set_map(self: &Arc<Self>, map: SourceMap) {
         self.map.store(Arc::new(map));
+        self.publish_waiting();
+    }
+
+    /// Publishes what waited and need not any more, on a thread of its own.
+    fn publish_waiting(self: &Arc<Self>) {
         fence(SeqCst);
         if self.waiting.load(SeqCst) == 0 {
             return;
@@ -377,11 +397,13 @@ impl LocalShare {
         self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Publishes a sample, or gives it back if its writer's source is not known yet. With `more` the source
-    /// may be left with packets that wait for others; then it is in `open`.
+    /// Publishes a sample, or gives it back if its writer's source, or what it is converted by, is not known yet. With
+    /// `more` the source may be left with packets that wait for others; then it is in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
+        let awaits_type = self.is_json.load(Relaxed) && matches!(self.types.now(), KnownType::Awaited);
         match self.slot_of(sample.writer) {
             Err(NotListed) => return Err(sample),
+            Ok(Some(_)) if awaits_type => return Err(sample),
             Ok(None) => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
             Ok(Some(slot)) => {
                 let is_open = self.publish_of(&slot, None, sample, more);
@@ -423,19 +445,23 @@ impl LocalShare {
         }
         self.taps.offer(|| Tapped::of_sample(&sample));
         // What may never leave is not worth the time.
-        let (encoding, payload) = match wanted || slot.keeps_history {
-            true => self.compress(sample.kind, sample.payload),
-            false => (PayloadEncoding::Plain, sample.payload),
+        let written = match wanted || slot.keeps_history {
+            true => self.write(sample.kind, sample.payload),
+            false => Ok((PayloadForm::Cdr, PayloadEncoding::Plain, sample.payload)),
         };
-        let head = MessageHead {
-            encoding,
-            kind: match sample.kind {
-                SampleKind::Write => MessageKind::Write,
-                SampleKind::Dispose => MessageKind::Dispose,
-                SampleKind::Unregister => MessageKind::Unregister,
-            },
-            source_timestamp_ns: sample.source_timestamp_ns,
+        let (form, encoding, payload) = match written {
+            Ok(written) => written,
+            Err(reason) => {
+                self.data.count(LinkId::LOCAL, &self.name, reason);
+                return more;
+            }
         };
+        let kind = match sample.kind {
+            SampleKind::Write => MessageKind::Write,
+            SampleKind::Dispose => MessageKind::Dispose,
+            SampleKind::Unregister => MessageKind::Unregister,
+        };
+        let head = MessageHead { form, encoding, ..MessageHead::new(kind, sample.source_timestamp_ns) };
         let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
             // Fragments leave as they are sealed: a large message is under way before its end is read.
@@ -488,11 +514,43 @@ impl LocalShare {
         }
     }
 
-    /// The payload as it leaves, and what that is written in.
-    fn compress(&self, kind: SampleKind, payload: Bytes) -> (PayloadEncoding, Bytes) {
+    /// The payload as it leaves: converted, then compressed.
+    fn write(
+        &self,
+        kind: SampleKind,
+        payload: Bytes,
+    ) -> Result<(PayloadForm, PayloadEncoding, Bytes), DataDrop> {
+        if !self.is_altered.load(Relaxed) || kind != SampleKind::Write {
+            return Ok((PayloadForm::Cdr, PayloadEncoding::Plain, payload));
+        }
+        let taken = payload.len();
+        let (form, payload) = self.convert(payload)?;
+        let (encoding, payload) = self.compress(payload);
+        if self.is_shaped.load(Relaxed) {
+            lock(&self.held).shaper.corrects(taken, payload.len());
+        }
+        Ok((form, encoding, payload))
+    }
+
+    fn convert(&self, payload: Bytes) -> Result<(PayloadForm, Bytes), DataDrop> {
+        if !self.is_json.load(Relaxed) {
+            return Ok((PayloadForm::Cdr, payload));
+        }
+        let known = self.types.now();
+        let layout = known.layout().ok_or(DataDrop::NoDefinition)?;
+        match conversion::to_json(layout, &payload) {
+            Ok(json) => Ok((PayloadForm::Json, json)),
+            Err(error) => {
+                debug!(name = %self.name.short(), %error, "a message is not sent");
+                Err(DataDrop::NotConverted)
+            }
+        }
+    }
+
+    fn compress(&self, payload: Bytes) -> (PayloadEncoding, Bytes) {
         let mut compression = lock(&self.compression.encoding);
         let (encoding, compressor) = &mut *compression;
-        if *encoding == PayloadEncoding::Plain || kind != SampleKind::Write {
+        if *encoding == PayloadEncoding::Plain {
             return (PayloadEncoding::Plain, payload);
         }
         let packed = compressor.compress(*encoding, &payload);
@@ -501,9 +559,6 @@ impl LocalShare {
         let left = packed.unwrap_or_else(|| payload.clone());
         self.compression.before.fetch_add(payload.len() as u64, Relaxed);
         self.compression.after.fetch_add(left.len() as u64, Relaxed);
-        if self.is_shaped.load(Relaxed) {
-            lock(&self.held).shaper.gives_back(payload.len() - left.len());
-        }
         (encoding, left)
     }
 
@@ -622,6 +677,11 @@ impl LocalShare {
     /// Signatures that its present sources made: one for each batch of packets.
     pub(crate) fn signatures(&self) -> u64 {
         self.map.load().slots().map(|slot| slot.progress.signatures()).sum()
+    }
+
+    /// Whether messages are to leave as JSON and cannot, for want of a definition.
+    pub(crate) fn lacks_definition(&self) -> bool {
+        self.is_json.load(Relaxed) && matches!(self.types.now(), KnownType::Lacking)
     }
 
     /// Messages published.

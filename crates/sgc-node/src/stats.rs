@@ -77,11 +77,15 @@ pub(crate) enum DataDrop {
     Repeated,
     /// A local publisher writes faster than this node can send: newer ones took its place.
     Overrun,
+    /// It is, or was to become, JSON, and what its type looks like is not known here.
+    NoDefinition,
+    /// It was to become JSON, and is not what its type says.
+    NotConverted,
 }
 
 impl DataDrop {
     /// All, in the order of their numbers.
-    const ALL: [Self; 17] = [
+    const ALL: [Self; 19] = [
         Self::NoTree,
         Self::WrongWay,
         Self::HopLimit,
@@ -99,6 +103,8 @@ impl DataDrop {
         Self::TooOld,
         Self::Repeated,
         Self::Overrun,
+        Self::NoDefinition,
+        Self::NotConverted,
     ];
 
     /// A short, stable name for counters.
@@ -121,6 +127,8 @@ impl DataDrop {
             Self::TooOld => "too_old",
             Self::Repeated => "repeated",
             Self::Overrun => "overrun",
+            Self::NoDefinition => "no_definition",
+            Self::NotConverted => "not_converted",
         }
     }
 }
@@ -193,7 +201,7 @@ mod tests {
         }
         let reasons = stats.reasons();
         assert_eq!(reasons.len(), DataDrop::ALL.len());
-        assert_eq!(reasons["overrun"], DataDrop::ALL.len() as u64);
+        assert_eq!(reasons["not_converted"], DataDrop::ALL.len() as u64);
     }
 
     #[test]

@@ -9,11 +9,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
+use sgc_cdr::Layout;
 use sgc_endpoint::{Decompressor, Message};
 use sgc_ros::{Sample, SampleKind};
-use sgc_wire::MessageKind;
+use sgc_types::Described;
+use sgc_wire::{MessageKind, PayloadForm, Representations};
 use tokio::sync::Notify;
 
+use crate::conversion;
 use crate::graph::Side;
 
 /// Messages that wait for who looks.
@@ -43,7 +46,8 @@ impl Tapped {
         Self::now(sample.kind, sample.source_timestamp_ns, sample.payload.clone())
     }
 
-    pub(crate) fn of_message(message: &Message) -> Self {
+    /// What came as JSON is shown as the local network gets it, if what it looks like is known.
+    pub(crate) fn of_message(message: &Message, layout: Option<&Arc<Layout>>) -> Self {
         let kind = match message.head.kind {
             MessageKind::Dispose => SampleKind::Dispose,
             MessageKind::Unregister => SampleKind::Unregister,
@@ -53,6 +57,11 @@ impl Tapped {
         // Whoever looks pays for it; what cannot be read is shown as it is.
         let plain = Decompressor::default().decompress(message.head.encoding, message.payload.clone());
         let payload = plain.unwrap_or_else(|_| message.payload.clone());
+        let cdr = |layout| conversion::from_json(layout, &payload, Representations::XCDR1).ok();
+        let payload = match (message.head.form, layout) {
+            (PayloadForm::Json, Some(layout)) => cdr(layout).unwrap_or(payload),
+            _ => payload,
+        };
         Self::now(kind, message.head.source_timestamp_ns, payload)
     }
 
@@ -194,6 +203,8 @@ pub(crate) struct Tap {
     pub type_name: String,
     /// `RIHS01_…`, if it is known.
     pub type_hash: Option<String>,
+    /// What its messages look like, if that is known.
+    pub described: Option<Arc<Described>>,
     /// What goes by.
     pub queue: Arc<TapQueue>,
     /// A local reader that is there for this alone.

@@ -293,7 +293,8 @@ fn status_names_links_and_routes() {
     assert_eq!(status["node"], "robot");
     let never = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == "/never").unwrap();
     assert_eq!(never["state"], "waits for a local publisher");
-    wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 2);
+    // With the catalogue, and where the robot is asked for its types.
+    wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 3);
     // The document is what `Status` says.
     let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
 }

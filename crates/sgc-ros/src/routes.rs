@@ -29,8 +29,8 @@ use rand_core::RngCore;
 use sgc_endpoint::{RefusedBy, ShareSpec};
 use sgc_trust::{FleetSecret, Policy, Suite};
 use sgc_wire::{
-    Catalogue, CatalogueEntry, Class, Kind, Metadata, Name, NodeId, PayloadEncoding, Qos, RosNode, SinkId,
-    SourceId,
+    Catalogue, CatalogueEntry, Class, Kind, Metadata, Name, NodeId, PayloadEncoding, PayloadForm, Qos,
+    RosNode, SinkId, SourceId,
 };
 
 use crate::names::ros_type;
@@ -87,8 +87,10 @@ pub struct Shaping {
     pub bits_per_s: Option<u64>,
     /// How old a best-effort message may be when it leaves.
     pub max_age: Option<Duration>,
-    /// What messages are written in when they leave, if that makes them shorter.
+    /// How messages are compressed when they leave, if that makes them shorter.
     pub compression: PayloadEncoding,
+    /// What messages are written in when they leave.
+    pub form: PayloadForm,
 }
 
 /// Which way messages go.

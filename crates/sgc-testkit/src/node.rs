@@ -18,7 +18,7 @@ use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, Ro
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
 use sgc_wire::{
     Catalogue, CatalogueSource, Class, Control, Durability, History, MessageHead, MessageKind, Metadata,
-    Name, NodeId, Now, Packet, PayloadEncoding, Qos, Reliability, SourceId,
+    Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
 };
 
 use crate::cast::{Member, identity};
@@ -708,8 +708,7 @@ impl Running {
 pub(crate) fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Packet> {
     let mut payload = id.0.to_be_bytes().to_vec();
     payload.resize(bytes.max(8), 0x5a);
-    let head =
-        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
+    let head = MessageHead::new(MessageKind::Write, 0);
     let mut packets = Vec::new();
     source.publish(&head, payload.into(), false, |p| packets.push(p)).expect("tests publish what fits");
     packets

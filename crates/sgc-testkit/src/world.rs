@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{Event, JoinStatus, Wish};
+use bytes::Bytes;
+use sgc_endpoint::{Event, JoinStatus, PackedType, Wish};
 use sgc_router::{LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
@@ -411,6 +412,28 @@ impl World {
         if let Some(running) = &mut self.nodes[node.0].running {
             // As with a token, which says nothing of the topic but its name.
             running.endpoint.join(now, name, id, Wish::Subscribe { describe: true });
+        }
+        self.settle(node);
+    }
+
+    /// Tells a node's endpoint what the type of a topic that it shares looks like.
+    pub fn describe(&mut self, node: NodeKey, topic: &str, type_hash: &str, description: &Bytes) {
+        self.note(format!("describe {node:?} {topic}"));
+        let (now, name) = (self.now_at(node), self.name(node, topic));
+        let packed = PackedType::new(type_hash, description).expect("within the bounds");
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.describe(now, &name, packed);
+        }
+        self.settle(node);
+    }
+
+    /// Asks an owner what the types of these topics look like, and of no others any more.
+    pub fn ask_types(&mut self, node: NodeKey, owner: NodeKey, topics: &[&str]) {
+        self.note(format!("ask types {node:?} {owner:?}:{topics:?}"));
+        let (now, id) = (self.now_at(node), self.identity(owner).node_id());
+        let names = topics.iter().map(|topic| self.name(owner, topic)).collect();
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.ask_types(now, id, names);
         }
         self.settle(node);
     }

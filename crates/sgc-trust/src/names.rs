@@ -83,6 +83,17 @@ pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
     Blind(out)
 }
 
+/// The blind under which an owner is asked what the types of its interfaces look like: known to all who know the owner,
+/// also to partners, which cannot derive its catalogue's.
+pub fn types_blind(owner: &NodeId) -> Blind {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc types v1");
+    context.update(&owner.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Blind(out)
+}
+
 /// The name of an interface, by one who holds the fleet secret.
 pub fn derive_name(fleet: &FleetSecret, owner: &NodeId, metadata: &Metadata) -> Name {
     name_of(owner, &TopicSecret::derive(fleet, metadata).blind())

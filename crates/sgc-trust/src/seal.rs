@@ -173,7 +173,7 @@ fn nonce(header: &PacketHeader) -> Nonce {
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::{Class, Decode, MessageKind, PayloadEncoding, SecretBytes};
+    use sgc_wire::{Class, Decode, MessageKind, SecretBytes};
 
     use super::*;
 
@@ -211,8 +211,7 @@ mod tests {
         }
     }
 
-    const HEAD: MessageHead =
-        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 99 };
+    const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 99);
 
     fn sealed(h: &PacketHeader) -> Vec<u8> {
         let mut out = vec![0; sealed_bytes(h)];

@@ -80,6 +80,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &renewal_blind(&ca)).to_string(),
         "3d8e6a2cd48f7918a009a78f8c0ba2cc2ce2f3f5dd728d4fc34edc9aa74775a5"
     );
+    assert_eq!(
+        types_blind(&owner).to_string(),
+        "fd92810b48e39dd4a076573b4418575b788a5f19529a381762edf7525aa49e1c"
+    );
+    assert_eq!(
+        name_of(&owner, &types_blind(&owner)).to_string(),
+        "828a47618f81d5ed681ad75af94f07541a24253de14f409ec53ef1c6582055bd"
+    );
 }
 
 #[test]

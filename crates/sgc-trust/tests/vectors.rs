@@ -7,7 +7,7 @@ use sgc_trust::{
 };
 use sgc_wire::{
     Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader,
-    PayloadEncoding, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 const NAME: Name = Name([0xaa; 32]);
@@ -62,16 +62,8 @@ fn plain(header: &PacketHeader) -> (Vec<u8>, MessageHead) {
     let byte = |i: usize| ((i as u64 * 7 + header.seq) % 251) as u8;
     let fragment = (start..start + header.fragment_bytes()).map(byte).collect();
     let head = match header.to {
-        Some(_) => MessageHead {
-            kind: MessageKind::Synced,
-            encoding: PayloadEncoding::Plain,
-            source_timestamp_ns: 0,
-        },
-        None => MessageHead {
-            kind: MessageKind::Write,
-            encoding: PayloadEncoding::Plain,
-            source_timestamp_ns: 1_795_391_999_000_000_000,
-        },
+        Some(_) => MessageHead::new(MessageKind::Synced, 0),
+        None => MessageHead::new(MessageKind::Write, 1_795_391_999_000_000_000),
     };
     (fragment, head)
 }

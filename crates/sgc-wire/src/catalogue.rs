@@ -1,4 +1,4 @@
-//! What a grant holds once it is unsealed: a topic's key, or an owner's catalogue.
+//! What a grant holds once it is unsealed: a topic's key, an owner's catalogue, or what was asked for.
 
 use bytes::Bytes;
 
@@ -9,6 +9,7 @@ use crate::metadata::Metadata;
 use crate::packet::Class;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
+use crate::types::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
 
 /// Most entries of one catalogue.
 pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
@@ -29,6 +30,8 @@ pub enum GrantContent {
     Catalogue(Catalogue),
     /// What a member needs to stay one; from its fleet's authority.
     Credentials(Credentials),
+    /// What the types of interfaces look like, as far as it was asked for and is known.
+    Types(Vec<DescribedType>),
 }
 
 /// One epoch of one topic.
@@ -167,6 +170,10 @@ impl Encode for GrantContent {
                     s.secret.encode(w);
                 });
             }
+            Self::Types(types) => {
+                w.u8(3);
+                w.list(types, |w, t| t.encode(w));
+            }
         }
     }
 }
@@ -193,6 +200,7 @@ impl Decode for GrantContent {
                     Ok(SecretGeneration { generation: r.u32()?, secret: SecretBytes::decode(r)? })
                 })?,
             })),
+            3 => Ok(Self::Types(r.list("types", TYPES_PER_QUESTION_MAX, DescribedType::decode)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }
@@ -248,7 +256,7 @@ impl Decode for CatalogueEntry {
             publish: r.bool("publish")?,
             suite: r.u8()?,
             keyless: r.bool("keyless")?,
-            type_hash: r.option("type hash", |r| r.str("type hash", 128))?,
+            type_hash: r.option("type hash", |r| r.str("type hash", TYPE_HASH_BYTES_MAX))?,
             qos: Qos::decode(r)?,
             class: Class::decode(r)?,
             sources: r.list("sources", ENTRY_SOURCES_MAX, |r| {
@@ -265,6 +273,8 @@ impl Decode for CatalogueEntry {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ids::Name;
+    use crate::message::PayloadEncoding;
 
     #[test]
     fn grants_round_trip_and_keys_stay_out_of_debug() {
@@ -310,6 +320,12 @@ mod tests {
             GrantContent::Topic(topic),
             GrantContent::Catalogue(Catalogue { version: 8, entries: vec![entry] }),
             GrantContent::Credentials(credentials),
+            GrantContent::Types(vec![DescribedType {
+                name: Name([3; 32]),
+                type_hash: "RIHS01_00".into(),
+                encoding: PayloadEncoding::Zstd,
+                description: Bytes::from_static(b"packed"),
+            }]),
         ] {
             assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));
         }

@@ -31,6 +31,8 @@ pub const REPLY_KEY_BYTES_MAX: usize = 2048;
 pub const CRL_BYTES_MAX: usize = 256 * 1024;
 /// Longest certificate signing request, bytes.
 pub const CSR_BYTES_MAX: usize = 4096;
+/// Longest question to an owner, bytes: a signing request is one.
+pub const ASK_BYTES_MAX: usize = CSR_BYTES_MAX;
 /// Longest public key that messages are signed with, bytes (SubjectPublicKeyInfo of RSA 4096).
 pub const SOURCE_KEY_BYTES_MAX: usize = 640;
 /// Longest sealed content of an answer, bytes.
@@ -296,10 +298,11 @@ pub enum Request {
         /// The source that it will publish as.
         offer: SourceOffer,
     },
-    /// A fresh certificate, and whatever else a member needs; of a fleet's authority.
-    Renew {
-        /// Certificate signing request (PKCS #10), DER.
-        csr: Bytes,
+    /// To be answered. What is asked, the name says: that of a fleet's authority takes certificate signing requests
+    /// (PKCS #10, DER), that of an owner's types a [`TypeQuestion`](crate::TypeQuestion).
+    Ask {
+        /// The question.
+        what: Bytes,
     },
 }
 
@@ -308,7 +311,7 @@ impl Request {
     pub fn role(&self) -> Role {
         match self {
             Self::Publish { .. } => Role::Publish,
-            Self::Subscribe { .. } | Self::Renew { .. } => Role::Subscribe,
+            Self::Subscribe { .. } | Self::Ask { .. } => Role::Subscribe,
         }
     }
 }
@@ -512,9 +515,9 @@ impl Encode for Request {
                 offer.source.encode(w);
                 w.bytes(&offer.key);
             }
-            Self::Renew { csr } => {
+            Self::Ask { what } => {
                 w.u8(2);
-                w.bytes(csr);
+                w.bytes(what);
             }
         }
     }
@@ -530,7 +533,7 @@ impl Decode for Request {
                     key: blob(r, "source key", SOURCE_KEY_BYTES_MAX)?,
                 },
             },
-            2 => Self::Renew { csr: blob(r, "signing request", CSR_BYTES_MAX)? },
+            2 => Self::Ask { what: blob(r, "question", ASK_BYTES_MAX)? },
             v => return Err(DecodeError::value("request", v.into())),
         })
     }
@@ -894,7 +897,7 @@ mod tests {
         for request in [
             Request::Subscribe { describe: true },
             Request::Publish { offer },
-            Request::Renew { csr: Bytes::from_static(b"csr") },
+            Request::Ask { what: Bytes::from_static(b"csr") },
         ] {
             let join = JoinBody {
                 name: Name([1; 32]),

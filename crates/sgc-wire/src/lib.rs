@@ -15,6 +15,7 @@ mod packet;
 mod qos;
 mod ros_node;
 mod slab;
+mod types;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
@@ -22,16 +23,17 @@ pub use catalogue::{
 };
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
-    ADJACENCIES_MAX, ADVERT_NAMES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer, AnswerBody,
-    CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX, Control, Hello,
-    JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover, RefuseReason, RejectReason,
-    Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed, SourceOffer,
+    ADJACENCIES_MAX, ADVERT_NAMES_MAX, ASK_BYTES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer,
+    AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX,
+    Control, Hello, JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover, RefuseReason,
+    RejectReason, Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed,
+    SourceOffer,
 };
 pub use ids::{
     Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,
     SecretBytes, SinkId, SourceId, UnixMillis,
 };
-pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding};
+pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding, PayloadForm};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use packet::{
     AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, LABEL_SAVES_BYTES, MESSAGE_BYTES_MAX,
@@ -40,3 +42,6 @@ pub use packet::{
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
 pub use ros_node::RosNode;
 pub use slab::Slab;
+pub use types::{
+    DescribedType, TYPE_DESCRIPTION_BYTES_MAX, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX, TypeQuestion,
+};

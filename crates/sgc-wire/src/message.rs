@@ -33,10 +33,20 @@ pub enum MessageKind {
     Gone,
 }
 
-/// What a payload is written in, before it is sealed.
+/// What a message is written in, before it is compressed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum PayloadForm {
+    /// As the local network has it: CDR with its encapsulation header.
+    #[default]
+    Cdr,
+    /// JSON (docs/spec/json.md).
+    Json,
+}
+
+/// How a payload is compressed, before it is sealed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum PayloadEncoding {
-    /// As the local network has it: CDR with its encapsulation header.
+    /// Not at all.
     #[default]
     Plain,
     /// Its length (4 bytes, big-endian), and a frame of Zstandard (RFC 8878).
@@ -50,17 +60,24 @@ pub enum PayloadEncoding {
 pub struct MessageHead {
     /// Data, or the end of an instance.
     pub kind: MessageKind,
-    /// What the payload is written in.
+    /// How the payload is compressed.
     pub encoding: PayloadEncoding,
+    /// What it is written in.
+    pub form: PayloadForm,
     /// Source time stamp, nanoseconds since the Unix epoch. Of the kinds from [`MessageKind::Request`] on, the number
     /// of the call at its source.
     pub source_timestamp_ns: i64,
 }
 
 impl MessageHead {
+    /// The head of a message in CDR that is not compressed.
+    pub const fn new(kind: MessageKind, source_timestamp_ns: i64) -> Self {
+        Self { kind, encoding: PayloadEncoding::Plain, form: PayloadForm::Cdr, source_timestamp_ns }
+    }
+
     /// The head of a message that is about a call.
     pub fn of_call(kind: MessageKind, number: u64) -> Self {
-        Self { kind, encoding: PayloadEncoding::Plain, source_timestamp_ns: number as i64 }
+        Self::new(kind, number as i64)
     }
 
     /// The encoding.
@@ -68,6 +85,7 @@ impl MessageHead {
         let mut out = [0; MESSAGE_HEAD_BYTES];
         out[0] = self.kind as u8;
         out[1] = self.encoding as u8;
+        out[2] = self.form as u8;
         out[4..].copy_from_slice(&self.source_timestamp_ns.to_be_bytes());
         out
     }
@@ -107,8 +125,14 @@ impl Decode for MessageHead {
             (2, MessageKind::Write) => PayloadEncoding::Lz4,
             (v, _) => return Err(DecodeError::value("payload encoding", v.into())),
         };
-        match r.u16()? {
-            0 => Ok(Self { kind, encoding, source_timestamp_ns: r.u64()? as i64 }),
+        let form = match (r.u8()?, kind) {
+            (0, _) => PayloadForm::Cdr,
+            // Keys and marks are no messages.
+            (1, MessageKind::Write) => PayloadForm::Json,
+            (v, _) => return Err(DecodeError::value("payload form", v.into())),
+        };
+        match r.u8()? {
+            0 => Ok(Self { kind, encoding, form, source_timestamp_ns: r.u64()? as i64 }),
             reserved => Err(DecodeError::value("reserved", reserved.into())),
         }
     }
@@ -120,12 +144,13 @@ mod tests {
 
     #[test]
     fn head_has_its_fixed_length_and_round_trips() {
-        for (kind, encoding) in [
-            (MessageKind::Dispose, PayloadEncoding::Plain),
-            (MessageKind::Write, PayloadEncoding::Zstd),
-            (MessageKind::Write, PayloadEncoding::Lz4),
+        for (kind, encoding, form) in [
+            (MessageKind::Dispose, PayloadEncoding::Plain, PayloadForm::Cdr),
+            (MessageKind::Write, PayloadEncoding::Zstd, PayloadForm::Cdr),
+            (MessageKind::Write, PayloadEncoding::Plain, PayloadForm::Json),
+            (MessageKind::Write, PayloadEncoding::Lz4, PayloadForm::Json),
         ] {
-            let head = MessageHead { kind, encoding, source_timestamp_ns: -5 };
+            let head = MessageHead { kind, encoding, form, source_timestamp_ns: -5 };
             let bytes = head.to_vec();
             assert_eq!(bytes.len(), MESSAGE_HEAD_BYTES);
             assert_eq!(MessageHead::from_slice(&bytes), Ok(head));
@@ -133,13 +158,16 @@ mod tests {
     }
 
     #[test]
-    fn only_messages_with_data_are_compressed() {
-        let decode =
-            |kind: u8, encoding: u8| MessageHead::from_slice(&[kind, encoding, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
-        for kind in 1..=4 {
-            assert!(decode(kind, 0).is_ok() && decode(kind, 1).is_err() && decode(kind, 2).is_err());
+    fn only_messages_with_data_are_compressed_or_json() {
+        let decode = |kind: u8, encoding: u8, form: u8| {
+            MessageHead::from_slice(&[kind, encoding, form, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+        };
+        for kind in 1..=10 {
+            assert!(decode(kind, 0, 0).is_ok() && decode(kind, 1, 0).is_err() && decode(kind, 2, 0).is_err());
+            assert!(decode(kind, 0, 1).is_err());
         }
-        assert!(decode(0, 2).is_ok() && decode(0, 3).is_err());
+        assert!(decode(0, 2, 0).is_ok() && decode(0, 3, 0).is_err());
+        assert!(decode(0, 2, 1).is_ok() && decode(0, 0, 2).is_err());
     }
 
     /// The bytes are normative.

@@ -6,10 +6,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use sgc_gateway::Anonymous;
 use sgc_node::config::{
-    self, Config, DiscoveryRange, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
+    self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
+    TokenSource,
 };
 use sgc_trust::Identity;
+use sgc_types::Definitions;
+use sgc_wire::PayloadForm;
 
 use crate::error::CliError;
 use crate::{name, output, run};
@@ -104,6 +108,9 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
             let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
             row("", format!("published on by {} besides", publish.join(", ")));
         }
+        if share.shaping.form == PayloadForm::Json {
+            row("", json(config, share.type_name.as_deref()));
+        }
         if let Some(name) = name_of(config, identity, share)? {
             row("", format!("named {name}"));
         }
@@ -111,6 +118,9 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     for one in &config.uses {
         let (what, type_name) = (called(one.interface, &one.topic), type_of(one.type_name.as_deref()));
         row("uses", format!("{what}{type_name} from {}{}", one.from, renamed(&one.naming, "here as")));
+        if one.shaping.form == PayloadForm::Json {
+            row("", json(config, one.type_name.as_deref()));
+        }
     }
     for token in &config.tokens {
         match &token.source {
@@ -127,7 +137,58 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
         };
         row("partner", format!("{}, {nodes}, CA in {}", partner.name, partner.ca.display()));
     }
+    if let Some(gateway) = &config.gateway {
+        rows.extend(gateway_rows(gateway));
+    }
     Ok(rows)
+}
+
+/// Where programs without ROS connect, who they may be, and what of it an operator should know.
+fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
+    let mut rows = Vec::new();
+    let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
+    let listen: Vec<_> = gateway.listen.iter().map(ToString::to_string).collect();
+    row("gateway", listen.join(", "));
+    if let Some(tls) = &gateway.tls {
+        row("", format!("shows the certificate in {}", tls.certificate.display()));
+    }
+    row(
+        "",
+        match gateway.anonymous {
+            Anonymous::Local => {
+                "programs of this host may do everything; others show a token or a certificate"
+            }
+            Anonymous::None => "programs show a token or a certificate, those of this host too",
+            Anonymous::All => "whoever reaches it may do everything",
+        }
+        .to_owned(),
+    );
+    if !gateway.origins.is_empty() {
+        let origins: Vec<_> = gateway.origins.iter().map(ToString::to_string).collect();
+        row("", format!("pages of {} may connect without a token", origins.join(", ")));
+    }
+    for client in &gateway.clients {
+        let who: Vec<_> = client.who.iter().map(ToString::to_string).collect();
+        row("", format!("certificates of {}: {}", who.join(", "), client.scope));
+    }
+    for warning in gateway.warnings() {
+        row("warning", warning);
+    }
+    rows
+}
+
+/// What travels as JSON needs a definition.
+fn json(config: &Config, type_name: Option<&str>) -> String {
+    let dirs = config.ros.as_ref().map_or(&[][..], |ros| &ros.definitions);
+    let found =
+        type_name.and_then(|name| name.parse().ok()).map(|name| Definitions::from_env(dirs).layout(&name));
+    match found {
+        None => "as JSON, if a definition of its type is known here by then".to_owned(),
+        Some(Ok(_)) => "as JSON".to_owned(),
+        Some(Err(why)) => format!(
+            "as JSON, but nothing can be sent: {why}; name a directory that has it with `definitions` in [ros]"
+        ),
+    }
 }
 
 fn type_of(type_name: Option<&str>) -> String {
@@ -164,4 +225,18 @@ fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<
     }
     let name = name::name_of(identity, &config.identity, identity.node_name(), share)?;
     Ok(Some(name.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_travel_as_json_is_said() {
+        let said = |type_name| json(&Config::default(), type_name);
+        assert_eq!(said(Some("std_msgs/msg/String")), "as JSON");
+        assert!(said(None).contains("if a definition of its type is known"));
+        let unknown = said(Some("mine/msg/Thing"));
+        assert!(unknown.contains("nothing can be sent: no definition of mine/msg/Thing"), "{unknown}");
+    }
 }

@@ -15,14 +15,12 @@ use sgc_endpoint::{
 };
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, PayloadEncoding, SecretBytes, SinkId, SourceAnnounce,
-    SourceId, TopicGrant,
+    Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
 };
 
 const NAME: Name = Name([1; 32]);
 const SINK: SinkId = SinkId([9; 16]);
-const HEAD: MessageHead =
-    MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 7 };
+const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
 /// A key that the suite signs with; made once, since RSA keys take their time.
 fn message_key(suite: Suite) -> MessageKey {

@@ -207,8 +207,7 @@ fn the_mark_of_synchrony_is_no_message_and_no_message_is_the_mark() {
     let mut source = source(Suite::Group, 1);
     let announced = grant(Suite::Group, 1, &[source.announce()]);
     let mut sink = Sink::new(NAME, SINK, announced, true, SinkLimits::default());
-    let head =
-        MessageHead { kind: MessageKind::Synced, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
+    let head = MessageHead::new(MessageKind::Synced, 0);
     source.publish(&head, Bytes::new(), false, |_| {}).unwrap();
     let history = replayed(&mut source);
     assert_eq!(sink.handle_packet(&history[0]), Err(SinkDrop::Head));

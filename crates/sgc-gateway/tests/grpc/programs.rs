@@ -147,7 +147,7 @@ async fn python_does_all_that_there_is() {
 async fn node_needs_nothing_but_the_proto() {
     let scene = Scene::new().await;
     let mut node = Command::new("node");
-    node.arg(repository("tests/js/grpc.js"));
+    node.arg(repository("tests/js/grpc.cjs"));
     node.arg(repository("crates/sgc-gateway/proto/sgc/gateway/v1/gateway.proto"));
     let said = scene.run(node).await;
     assert!(said.ends_with("all is well\n"), "{said}");

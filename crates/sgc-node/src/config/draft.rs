@@ -69,6 +69,7 @@ pub(super) struct Draft {
     pub(super) audit: AuditDraft,
     pub(super) transport: TransportDraft,
     pub(super) partners: Vec<PartnerDraft>,
+    pub(super) gateway: Option<GatewayDraft>,
 }
 
 /// How a source of configuration names the settings that an error may ask for.
@@ -91,6 +92,7 @@ pub(super) struct RosDraft {
     /// The whole list is located too, since an empty one is a choice.
     pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
     pub(super) graph: Option<Located<bool>>,
+    pub(super) definitions: Option<Located<Vec<Located<String>>>>,
 }
 
 /// `[[share]]`. What is required is `None` only where an error has been recorded already.
@@ -129,6 +131,7 @@ pub(super) struct ShapingDraft {
     pub(super) max_bandwidth: Option<Located<String>>,
     pub(super) max_age: Option<Located<String>>,
     pub(super) compress: Option<Located<String>>,
+    pub(super) encoding: Option<Located<String>>,
 }
 
 /// `[[use]]`. What is required is `None` only where an error has been recorded already.
@@ -170,6 +173,35 @@ pub(super) struct TransportDraft {
     pub(super) mtu_discovery: Option<Located<bool>>,
     pub(super) dscp: Option<Located<String>>,
     pub(super) lane_dscp: Option<Located<String>>,
+}
+
+/// `[gateway]`.
+#[derive(Debug, Default)]
+pub(super) struct GatewayDraft {
+    /// The whole list is located too, since an empty one would be a mistake.
+    pub(super) listen: Option<Located<Vec<Located<String>>>>,
+    pub(super) certificate: Option<Located<PathBuf>>,
+    pub(super) key: Option<Located<PathBuf>>,
+    pub(super) anonymous: Option<Located<String>>,
+    pub(super) origins: Vec<Located<String>>,
+    pub(super) plain: Option<Located<bool>>,
+    pub(super) clients_max: Option<Located<i64>>,
+    pub(super) client_bytes_max: Option<Located<String>>,
+    pub(super) clients: Vec<GatewayClientDraft>,
+}
+
+/// `[[gateway.client]]`. What is required is `None` only where an error has been recorded already.
+#[derive(Debug)]
+pub(super) struct GatewayClientDraft {
+    /// The place of what is missing.
+    pub(super) origin: Origin,
+    pub(super) who: Option<Located<Vec<Located<String>>>>,
+    pub(super) subscribe: Vec<Located<String>>,
+    pub(super) publish: Vec<Located<String>>,
+    pub(super) call: Vec<Located<String>>,
+    pub(super) serve: Vec<Located<String>>,
+    /// A list of patterns is there, but could not be read.
+    pub(super) is_broken: bool,
 }
 
 /// `[[partner]]`. What is required is `None` only where an error has been recorded already.

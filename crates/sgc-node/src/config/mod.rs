@@ -13,6 +13,7 @@ mod draft;
 mod error;
 mod file;
 mod files;
+mod gateway;
 mod names;
 mod resolve;
 mod ros_env;
@@ -34,12 +35,16 @@ use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
+pub use gateway::{
+    GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls, GatewayUrl,
+    GatewayUrlError, ORIGINS_MAX,
+};
 pub use names::{
     FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, Recipient, TYPE_BYTES_MAX, parse_duration, parse_rate,
 };
 pub use resolve::{
-    ACCEPT_MAX, EXCEPT_MAX, LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX, SHARES_MAX,
-    SOCKET_PATH_BYTES_MAX, SUITES, TRUST_MAX, USES_MAX,
+    ACCEPT_MAX, DEFINITIONS_MAX, EXCEPT_MAX, LISTEN_MAX, PARTNERS_MAX, RECIPIENTS_MAX, ROUTERS_MAX,
+    SHARES_MAX, SOCKET_PATH_BYTES_MAX, SUITES, TRUST_MAX, USES_MAX,
 };
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
 pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain, WAYS_MAX};
@@ -110,6 +115,8 @@ pub struct Config {
     pub audit: AuditConfig,
     /// How links are made.
     pub transport: TransportConfig,
+    /// Programs without ROS on this node's network; none without `[gateway]`. Where it is there, so is `ros`.
+    pub gateway: Option<GatewayConfig>,
     /// Where the status socket goes, if not in its usual place.
     pub admin_socket: Option<PathBuf>,
 }
@@ -147,6 +154,8 @@ pub struct RosConfig {
     pub static_peers: Vec<String>,
     /// Whether far nodes appear in the local ROS graph, and local ones in far ones.
     pub graph: bool,
+    /// Directories with packages that define types, looked into before `AMENT_PREFIX_PATH` and what ships inside.
+    pub definitions: Vec<PathBuf>,
     /// `CYCLONEDDS_URI` as it is: what users of that middleware have set for their network holds here too.
     pub cyclonedds_uri: Option<String>,
 }
@@ -154,7 +163,8 @@ pub struct RosConfig {
 impl Default for RosConfig {
     fn default() -> Self {
         let (discovery, static_peers) = (DiscoveryRange::default(), Vec::new());
-        Self { domain_id: 0, discovery, static_peers, graph: true, cyclonedds_uri: None }
+        let (definitions, cyclonedds_uri) = (Vec::new(), None);
+        Self { domain_id: 0, discovery, static_peers, graph: true, definitions, cyclonedds_uri }
     }
 }
 

@@ -3,6 +3,8 @@
 //! All mistakes are collected. One that follows from another is not reported: a value that is wrong in itself
 //! takes no part in comparisons.
 
+mod gateway_table;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -10,7 +12,7 @@ use sgc_ros::{Interface, Naming, Rename, Shaping, is_pattern, matches};
 use sgc_router::MappingKind;
 use sgc_transport::Congestion;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
-use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX, PayloadEncoding};
+use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX, PayloadEncoding, PayloadForm};
 
 use super::draft::{
     Draft, Located, NamingDraft, PartnerDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
@@ -19,8 +21,9 @@ use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
 use super::schema::nearest;
 use super::{
-    AuditConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig, RotationConfig,
-    ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig, ros_env,
+    AuditConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig, RosConfig,
+    RotationConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
+    ros_env,
 };
 
 /// Shares of one node.
@@ -41,6 +44,8 @@ pub const LISTEN_MAX: usize = 16;
 pub const PARTNERS_MAX: usize = 32;
 /// Files with more CAs that one node trusts.
 pub const TRUST_MAX: usize = 16;
+/// Directories with definitions.
+pub const DEFINITIONS_MAX: usize = 64;
 /// Path of a Unix socket: `sun_path` less its terminator.
 pub const SOCKET_PATH_BYTES_MAX: usize = 107;
 
@@ -72,6 +77,9 @@ pub(super) struct FileChecks {
     pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
     pub(super) token: fn(&'static str, &Path) -> Result<ShareToken, Mistake>,
     pub(super) fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) chain: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
 
 /// Judges a draft whose reader found `errors` already. Relative paths are taken from `base_dir`.
@@ -102,10 +110,13 @@ pub(super) fn resolve(
         let (dial, listen) = (draft.words.dial, draft.words.listen);
         resolver.record(&draft.origin, Mistake::ConnectsToNobody { dial, listen });
     }
-    let touches_ros = draft.ros.is_some() || !draft.shares.is_empty() || !draft.uses.is_empty();
+    let has_rules = !draft.shares.is_empty() || !draft.uses.is_empty();
+    let touches_ros = draft.ros.is_some() || has_rules || draft.gateway.is_some();
     let ros = touches_ros.then(|| {
         let nothing = RosDraft::default();
-        ros_env::resolve(draft.ros.as_ref().unwrap_or(&nothing), env, &mut resolver.errors)
+        let written = draft.ros.as_ref().unwrap_or(&nothing);
+        let ros = ros_env::resolve(written, env, &mut resolver.errors);
+        RosConfig { definitions: resolver.definitions(written), ..ros }
     });
     let partners = resolver.partners(draft);
     let shares = resolver.shares(draft, node_name.as_ref());
@@ -117,6 +128,7 @@ pub(super) fn resolve(
     let rotation = resolver.rotation(draft);
     let audit = resolver.audit(draft);
     let transport = resolver.transport(draft);
+    let gateway = draft.gateway.as_ref().map(|written| resolver.gateway(written, &draft.partners));
     let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket));
     match identity {
         Some(identity) if resolver.errors.is_empty() => Ok(Config {
@@ -142,6 +154,7 @@ pub(super) fn resolve(
             rotation,
             audit,
             transport,
+            gateway,
             admin_socket,
         }),
         _ => Err(resolver.errors),
@@ -461,6 +474,26 @@ impl Resolver<'_> {
         Some(self.base_dir.join(&written.value))
     }
 
+    fn definitions(&mut self, written: &RosDraft) -> Vec<PathBuf> {
+        let Some(written) = &written.definitions else { return Vec::new() };
+        let count = written.value.len();
+        if count > DEFINITIONS_MAX {
+            let (key, max) = (written.key, DEFINITIONS_MAX);
+            self.record(&written.origin, Mistake::TooManyEntries { key, count, max });
+        }
+        let mut valid = Vec::new();
+        for one in written.value.iter().take(DEFINITIONS_MAX) {
+            let path = self.path(&one.clone().map(PathBuf::from), "\"/opt/robot/share\"");
+            if let Some(Err(mistake)) =
+                path.as_ref().and_then(|path| Some((self.checks?.directory)(one.key, path)))
+            {
+                self.record(&one.origin, mistake);
+            }
+            valid.extend(path);
+        }
+        valid
+    }
+
     fn rotation(&mut self, draft: &Draft) -> RotationConfig {
         let bounds = (RotationConfig::EVERY_MIN, RotationConfig::EVERY_MAX);
         let written = &draft.rotation;
@@ -531,6 +564,7 @@ impl Resolver<'_> {
                 &one.shaping.max_bandwidth,
                 &one.shaping.max_age,
                 &one.shaping.compress,
+                &one.shaping.encoding,
             ]
             .into_iter()
             .flatten()
@@ -648,6 +682,9 @@ impl Resolver<'_> {
         if let Some(written) = one.shaping.compress.as_ref().filter(|_| !publish) {
             self.record(&written.origin, Mistake::CompressionOfOther { key: written.key });
         }
+        if let Some(written) = one.shaping.encoding.as_ref().filter(|_| !publish) {
+            self.record(&written.origin, Mistake::EncodingOfOther { key: written.key });
+        }
         let priority = one.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
         let shaping = self.shaping(&one.shaping);
         let dedicated = self.dedicated(one.link.as_ref());
@@ -745,7 +782,7 @@ impl Resolver<'_> {
         if interface == Interface::Topic {
             return;
         }
-        let shaping = [&shaping.max_rate, &shaping.max_bandwidth, &shaping.max_age];
+        let shaping = [&shaping.max_rate, &shaping.max_bandwidth, &shaping.max_age, &shaping.encoding];
         let written = shaping.into_iter().flatten().map(|one| (one.key, &one.origin));
         for (key, origin) in publish.into_iter().chain(written) {
             self.record(origin, Mistake::TopicsOnly { key, interface: interface.key() });
@@ -762,6 +799,7 @@ impl Resolver<'_> {
                 .as_ref()
                 .and_then(|c| self.keep(c, compression))
                 .unwrap_or_default(),
+            form: written.encoding.as_ref().and_then(|e| self.keep(e, encoding)).unwrap_or_default(),
         }
     }
 
@@ -800,6 +838,14 @@ fn compression(key: &'static str, value: &str) -> Result<PayloadEncoding, Mistak
         "lz4" => Ok(PayloadEncoding::Lz4),
         "none" => Ok(PayloadEncoding::Plain),
         _ => Err(unknown_word(key, value, &["zstd", "lz4", "none"])),
+    }
+}
+
+fn encoding(key: &'static str, value: &str) -> Result<PayloadForm, Mistake> {
+    match value {
+        "cdr" => Ok(PayloadForm::Cdr),
+        "json" => Ok(PayloadForm::Json),
+        _ => Err(unknown_word(key, value, &["cdr", "json"])),
     }
 }
 

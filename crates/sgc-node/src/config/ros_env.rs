@@ -53,6 +53,8 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         discovery: range.value,
         static_peers,
         graph: ros.graph.as_ref().is_none_or(|graph| graph.value),
+        // Where paths are taken from is not known here.
+        definitions: Vec::new(),
         cyclonedds_uri: variable(env, CYCLONEDDS_URI),
     }
 }

@@ -30,17 +30,23 @@ pub enum Table {
     Audit,
     /// `[[partner]]`
     Partner,
+    /// `[gateway]`
+    Gateway,
+    /// `[[gateway.client]]`
+    GatewayClient,
 }
 
 impl Table {
     /// All of them, in the order in which the reference lists them.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::Top,
         Self::Node,
         Self::Ros,
         Self::Share,
         Self::Use,
         Self::Partner,
+        Self::Gateway,
+        Self::GatewayClient,
         Self::Router,
         Self::Transport,
         Self::Authority,
@@ -64,6 +70,8 @@ impl Table {
             Self::Rotation => "[rotation]",
             Self::Audit => "[audit]",
             Self::Partner => "[[partner]]",
+            Self::Gateway => "[gateway]",
+            Self::GatewayClient => "[[gateway.client]]",
         }
     }
 
@@ -77,6 +85,7 @@ impl Table {
                 "share",
                 "use",
                 "partner",
+                "gateway",
                 "router",
                 "transport",
                 "authority",
@@ -87,7 +96,9 @@ impl Table {
             Self::Node => {
                 &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
             }
-            Self::Ros => &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph"],
+            Self::Ros => {
+                &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph", "definitions"]
+            }
             Self::Share => &[
                 "topic",
                 "service",
@@ -104,6 +115,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "link",
                 "suite",
                 "description",
@@ -130,6 +142,7 @@ impl Table {
                 "max_bandwidth",
                 "max_age",
                 "compress",
+                "encoding",
                 "token",
                 "link",
             ],
@@ -140,13 +153,25 @@ impl Table {
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "off"],
             Self::Partner => &["name", "ca", "node"],
+            Self::Gateway => &[
+                "listen",
+                "certificate",
+                "key",
+                "anonymous",
+                "origins",
+                "plain",
+                "clients_max",
+                "client_bytes_max",
+                "client",
+            ],
+            Self::GatewayClient => &["who", "subscribe", "publish", "call", "serve"],
         }
     }
 
     /// The keys that the design names and a later version brings.
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
-            Self::Top => &["gateway", "profile"],
+            Self::Top => &["profile"],
             Self::Ros => &["enclave", "security_root"],
             Self::Node
             | Self::Router
@@ -155,9 +180,10 @@ impl Table {
             | Self::Authority
             | Self::Rotation
             | Self::Audit
-            | Self::Partner => &[],
-            Self::Share => &["encoding"],
-            Self::Use => &[],
+            | Self::Partner
+            | Self::Gateway
+            | Self::GatewayClient => &[],
+            Self::Share | Self::Use => &[],
         }
     }
 

@@ -11,7 +11,7 @@ use sgc_ros::{
 };
 use sgc_transport::Link as _;
 use sgc_trust::Grantees;
-use sgc_wire::{CatalogueEntry, Kind, Name, NodeId};
+use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm};
 use tokio::sync::oneshot;
 
 use super::Core;
@@ -101,7 +101,7 @@ impl<N: RosNetwork> Core<N> {
                 .and_then(|topic| routes.shared_by(Kind::Topic, topic, &ros_type(&e.type_name))),
         };
         graph.endpoints = routes.local_endpoints().take(GRAPH_ENDPOINTS_MAX).map(endpoint).collect();
-        graph.problems = routes.problems().map(ToString::to_string).collect();
+        graph.problems = self.problems();
         for view in routes.share_views() {
             let is_service = view.metadata.kind == Kind::Service;
             let mut share = Share {
@@ -136,6 +136,8 @@ impl<N: RosNetwork> Core<N> {
                     messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
                     written: sink.map_or(0, |sink| sink.delivered()),
                     matched: sink.map_or(0, |sink| sink.matched()),
+                    is_json: route.form == PayloadForm::Json,
+                    lacks_definition: self.lacks_definition(&route.name, route.form),
                 });
             }
             graph.shares.push(share);
@@ -181,6 +183,7 @@ impl<N: RosNetwork> Core<N> {
                     matched: sink.map_or(0, |sink| sink.matched()),
                     publishers: route.publishers,
                     is_read: route.is_read,
+                    lacks_definition: self.lacks_definition(&route.name, route.form),
                     messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
                 });
             }
@@ -200,6 +203,31 @@ impl<N: RosNetwork> Core<N> {
             is_used: offer.is_used,
         };
         graph.offers = routes.offers().map(offer).collect();
+    }
+
+    /// Whether messages of an interface would be JSON, or come as JSON, and what they look like is not known here.
+    fn lacks_definition(&self, name: &Name, form: PayloadForm) -> bool {
+        let writes = form == PayloadForm::Json && self.shares.get(name).is_some_and(|s| s.lacks_definition());
+        writes || self.sinks.get(name).is_some_and(|sink| sink.lacks_definition())
+    }
+
+    /// Everything that the user should know.
+    pub(super) fn problems(&self) -> Vec<String> {
+        let Some(routes) = &self.routes else { return Vec::new() };
+        let mut problems: Vec<_> = routes.problems().map(ToString::to_string).collect();
+        let of_share = routes.share_views().into_iter().flat_map(|view| view.routes);
+        let of_share = of_share.map(|route| (route.local_name, route.type_name, route.name, route.form));
+        let of_use = routes.use_views().into_iter().flat_map(|view| view.routes);
+        let of_use = of_use.map(|r| (r.local_name, r.entry.metadata.type_name.clone(), r.name, r.form));
+        for (topic, type_name, name, form) in of_share.chain(of_use) {
+            if self.lacks_definition(&name, form) {
+                problems.push(format!(
+                    "{topic}: its messages travel as JSON, and no definition of {type_name} is known here; none get \
+                     through. Name a directory that has it with `definitions` in [ros]"
+                ));
+            }
+        }
+        problems
     }
 
     fn name_line(&self, name: &Name) -> NameLine {
@@ -239,10 +267,11 @@ impl<N: RosNetwork> Core<N> {
         let shares = routes.share_views();
         let shared = shares.iter().flat_map(|view| &view.routes).find(|route| route.local_name == topic);
         let not_there = |why| Err(TapError::NotThere { topic: topic.clone(), why });
-        let of = |taps: &Taps, side, type_name: &str, type_hash: Option<&String>| match taps.add() {
+        let of = |name, taps: &Taps, side, type_name: &str, type_hash: Option<&String>| match taps.add() {
             Some(queue) => {
+                let described = self.types.described(Some(name), type_name, type_hash.map(String::as_str));
                 let (type_name, type_hash) = (type_name.to_owned(), type_hash.cloned());
-                Ok(Tap { side, type_name, type_hash, queue, reader: None })
+                Ok(Tap { side, type_name, type_hash, described, queue, reader: None })
             }
             None => Err(TapError::TooMany { topic: topic.clone() }),
         };
@@ -250,12 +279,13 @@ impl<N: RosNetwork> Core<N> {
             (Some(Side::Far) | None, Some(route)) => match self.sinks.get(&route.name) {
                 Some(sink) => {
                     let metadata = &route.entry.metadata;
-                    of(sink.taps(), Side::Far, &metadata.type_name, route.entry.type_hash.as_ref())
+                    let type_hash = route.entry.type_hash.as_ref();
+                    of(&route.name, sink.taps(), Side::Far, &metadata.type_name, type_hash)
                 }
                 None => not_there("it does not come from another node yet"),
             },
             (Some(Side::Far), None) => match shared.and_then(|r| Some((r, self.sinks.get(&r.name)?))) {
-                Some((route, sink)) => of(sink.taps(), Side::Far, &route.type_name, None),
+                Some((route, sink)) => of(&route.name, sink.taps(), Side::Far, &route.type_name, None),
                 None => not_there("this node does not bring it from another"),
             },
             (Some(Side::Sent), _) => {
@@ -263,8 +293,8 @@ impl<N: RosNetwork> Core<N> {
                 let published = published.flat_map(|v| &v.routes).find(|route| route.local_name == topic);
                 let published = published.map(|r| (r.name, r.entry.metadata.type_name.as_str()));
                 let sent = shared.map(|r| (r.name, r.type_name.as_str())).or(published);
-                match sent.and_then(|(name, type_name)| Some((self.shares.get(&name)?, type_name))) {
-                    Some((share, type_name)) => of(share.taps(), Side::Sent, type_name, None),
+                match sent.and_then(|(name, type_name)| Some((name, self.shares.get(&name)?, type_name))) {
+                    Some((name, share, type_name)) => of(&name, share.taps(), Side::Sent, type_name, None),
                     None => not_there("this node does not send it to others"),
                 }
             }
@@ -295,6 +325,7 @@ impl<N: RosNetwork> Core<N> {
             type_hash: first.type_hash.clone(),
             qos: reader_for(&offer, same.len()),
         };
+        let described = self.types.described(None, &type_name, first.type_hash.as_deref());
         let alive = self.alive.clone();
         let queue = Arc::new(TapQueue::default());
         self.local_taps.retain(|tap| !tap.is_closed());
@@ -306,7 +337,7 @@ impl<N: RosNetwork> Core<N> {
             let type_hash = spec.type_hash.clone();
             let tap = network.create_reader(&spec, handler).map(|reader| {
                 let reader: Box<dyn std::any::Any + Send> = Box::new((reader, alive));
-                Tap { side: Side::Local, type_name, type_hash, queue, reader: Some(reader) }
+                Tap { side: Side::Local, type_name, type_hash, described, queue, reader: Some(reader) }
             });
             // Who asked may have gone; then the reader ends here, where it may block.
             let _ = reply.send(tap.map_err(|why| TapError::Network(why.to_string())));

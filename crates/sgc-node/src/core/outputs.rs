@@ -118,6 +118,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Types { owner, types } => self.types_told(owner, types),
             Event::Recover(recover) => {
                 if let Some(share) = self.shares.get(&recover.name)
                     && !self.replays.ask(share.clone(), recover)
@@ -138,6 +139,7 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(routes) = &mut self.routes {
                     routes.handle_granted(&name, entry);
                 }
+                self.need_type_of_used(name);
                 self.ask_histories(name);
             }
             event => self.route_event(now, event),
@@ -200,6 +202,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)
+            | Event::Types { .. }
             | Event::Granted { .. } => {}
         }
     }

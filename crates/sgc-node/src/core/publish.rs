@@ -158,6 +158,7 @@ impl<N: RosNetwork> Core<N> {
             .entry(name)
             .or_insert_with(|| Arc::new(LocalSink::new(name, false, self.requests.clone())))
             .clone();
+        self.apply_type(&name);
         // What this node publishes itself does not come back to it: it is nobody's sink but its own.
         sink.grant(SinkId([0; 16]), grant, &self.data);
         if let Some(progress) = sink.progress() {

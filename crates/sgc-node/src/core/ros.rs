@@ -30,6 +30,7 @@ impl<N: RosNetwork> Core<N> {
         match command {
             Command::Share(spec) => {
                 let topic = spec.metadata.ros_name.clone();
+                let (metadata, type_hash) = (spec.metadata.clone(), spec.type_hash.clone());
                 let is_service = spec.metadata.kind == Kind::Service;
                 match self.endpoint.share(now, spec) {
                     Ok(name) => {
@@ -42,6 +43,7 @@ impl<N: RosNetwork> Core<N> {
                             self.epoch_over.clone(),
                         );
                         self.shares.insert(name, Arc::new(share));
+                        self.need_type(name, &metadata, type_hash, None);
                         if is_service {
                             self.begin_served(name);
                         }
@@ -75,6 +77,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::Unshare { name } => {
                 self.endpoint.unshare(now, &name);
+                self.forget_type(&name);
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();
                 }
@@ -122,6 +125,7 @@ impl<N: RosNetwork> Core<N> {
             Command::CloseServer { name } => self.close_service_end(&name),
             Command::Leave { name } => {
                 self.endpoint.leave(now, &name);
+                self.forget_type(&name);
                 self.stop_publishing(&name);
                 self.end_calls(&name);
                 if let Some(sink) = self.sinks.remove(&name) {
@@ -240,9 +244,10 @@ impl<N: RosNetwork> Core<N> {
         let failures = self.ros_failures.clone();
         let shaping = self.sinks.get(&name).map(|sink| sink.shaping()).unwrap_or_default();
         let frames = self.sinks.get(&name).map(|sink| sink.frames()).filter(|_| spec.type_name == TF_MESSAGE);
+        let types = self.sinks.get(&name).map(|sink| sink.types().clone()).unwrap_or_default();
         tokio::task::spawn_blocking(move || {
             let writer = network.create_writer(&spec).map_err(|e| e.to_string()).and_then(|writer| {
-                WriterQueue::spawn(writer, &spec, shaping, frames, failures.clone(), alive)
+                WriterQueue::spawn(writer, &spec, shaping, frames, types, failures.clone(), alive)
                     .map_err(|e| e.to_string())
             });
             let writer = writer

@@ -18,6 +18,7 @@ use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, FleetName, Identity, NodeName, Suite};
+use sgc_types::TypeStore;
 use sgc_wire::{Class, Durability, History, Qos, UnixMillis};
 use tokio::sync::oneshot;
 
@@ -50,6 +51,8 @@ pub struct Node {
     ended: Receiver<()>,
     pub addr: Option<SocketAddr>,
     socket: std::path::PathBuf,
+    /// The types that it knows.
+    pub types: Arc<TypeStore>,
     /// What a reload reads.
     config: Arc<Mutex<Config>>,
 }
@@ -101,7 +104,8 @@ impl Node {
         let (done, ended) = channel();
         let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
-        let options = RunOptions { ready: Some(ready), ..options };
+        let types = Arc::new(TypeStore::default());
+        let options = RunOptions { ready: Some(ready), types: Some(types.clone()), ..options };
         runtime.spawn(async move {
             let stopped = async {
                 let _ = stopped.await;
@@ -111,7 +115,7 @@ impl Node {
         });
         let listening = runtime.block_on(is_ready).unwrap();
         let addr = listening.first().map(|l| l.addr);
-        Self { runtime: Some(runtime), stop: Some(stop), ended, addr, socket, config: file }
+        Self { runtime: Some(runtime), stop: Some(stop), ended, addr, socket, types, config: file }
     }
 
     /// As SIGTERM does.
@@ -138,6 +142,21 @@ impl Node {
         stream.write_all(request.to_line().as_bytes()).unwrap();
         stream.read_to_string(&mut text).unwrap();
         serde_json::from_str(&text).unwrap()
+    }
+
+    /// Asks at the status socket for something whose answer goes on; the first line of it.
+    pub fn begin(&self, request: &AdminRequest) -> serde_json::Value {
+        use std::io::{BufRead, BufReader, Write};
+        let mut stream = std::os::unix::net::UnixStream::connect(&self.socket).unwrap();
+        stream.write_all(request.to_line().as_bytes()).unwrap();
+        let mut line = String::new();
+        BufReader::new(stream).read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap()
+    }
+
+    /// How many were dropped for this reason.
+    pub fn drops(&self, reason: &str) -> u64 {
+        self.status()["drops"][reason].as_u64().unwrap_or(0)
     }
 
     /// Changes the configuration and has it read again; what the report says changed.
@@ -238,18 +257,9 @@ impl Trio {
     pub fn robot_in(&self, suite: Suite, topics: &[&str], to: &str) -> Node {
         let shares = topics
             .iter()
-            .map(|topic| ShareConfig {
-                interface: Default::default(),
-                topic: (*topic).into(),
-                naming: Default::default(),
-                type_name: None,
-                to: vec![Recipient::Node(to.parse().unwrap())],
-                publish: vec![],
-                priority: Class::Default,
-                shaping: Shaping::default(),
-                dedicated: false,
-                suite,
-                metadata: ShareMetadata::default(),
+            .map(|topic| {
+                let to = vec![Recipient::Node(to.parse().unwrap())];
+                ShareConfig { to, suite, ..shared_topic(topic) }
             })
             .collect();
         let config = Config { shares, ..self.config() };
@@ -261,23 +271,42 @@ impl Trio {
     }
 
     pub fn desk_on(&self, topics: &[&str], net: &FakeDomain) -> Node {
-        let uses = topics
-            .iter()
-            .map(|topic| UseConfig {
-                interface: Default::default(),
-                publish: false,
-                from: "robot".parse().unwrap(),
-                topic: (*topic).into(),
-                naming: Default::default(),
-                frame_prefix: None,
-                type_name: None,
-                priority: None,
-                shaping: Shaping::default(),
-                dedicated: false,
-            })
-            .collect();
+        let uses = topics.iter().map(|topic| used_topic(topic)).collect();
         let config = Config { uses, ..self.config() };
         Node::start(config, identity("desk", false), Some(net))
+    }
+}
+
+/// A topic that a robot shares with the desk.
+pub fn shared_topic(topic: &str) -> ShareConfig {
+    ShareConfig {
+        interface: Default::default(),
+        topic: topic.into(),
+        naming: Default::default(),
+        type_name: None,
+        to: vec![Recipient::Node("desk".parse().unwrap())],
+        publish: vec![],
+        priority: Class::Default,
+        shaping: Shaping::default(),
+        dedicated: false,
+        suite: Suite::Group,
+        metadata: ShareMetadata::default(),
+    }
+}
+
+/// A topic of the robot that a desk uses.
+pub fn used_topic(topic: &str) -> UseConfig {
+    UseConfig {
+        interface: Default::default(),
+        publish: false,
+        from: "robot".parse().unwrap(),
+        topic: topic.into(),
+        naming: Default::default(),
+        frame_prefix: None,
+        type_name: None,
+        priority: None,
+        shaping: Shaping::default(),
+        dedicated: false,
     }
 }
 
@@ -303,8 +332,12 @@ pub struct Talker {
 
 impl Talker {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        Self::of(domain, &spec(topic, qos))
+    }
+
+    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
-        Self { writer: net.create_writer(&spec(topic, qos)).unwrap(), _net: net }
+        Self { writer: net.create_writer(spec).unwrap(), _net: net }
     }
 
     pub fn say(&self, payload: impl Into<Bytes>) {
@@ -326,10 +359,14 @@ pub struct Listener {
 
 impl Listener {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
+        Self::of(domain, &spec(topic, qos))
+    }
+
+    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
         let (sender, samples) = channel();
         let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));
-        let reader = net.create_reader(&spec(topic, qos), handler).unwrap();
+        let reader = net.create_reader(spec, handler).unwrap();
         Self { samples, _reader: reader, _net: net }
     }
 

@@ -2,7 +2,7 @@
 
 use sgc_endpoint::RefusedBy;
 use sgc_trust::{Policy, name_of};
-use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, Qos};
+use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, PayloadForm, Qos};
 
 use super::{Direction, Routes};
 use crate::names::ros_type;
@@ -39,6 +39,8 @@ pub struct ShareRouteView {
     pub is_written: bool,
     /// What the local publishers offer together.
     pub qos: Option<Qos>,
+    /// What their messages are written in on their way.
+    pub form: PayloadForm,
 }
 
 /// A rule of what is used, and what runs of it.
@@ -77,6 +79,8 @@ pub struct UseRouteView<'a> {
     pub entry: &'a CatalogueEntry,
     /// Its name.
     pub name: Name,
+    /// What this node's messages on it are written in, if it publishes.
+    pub form: PayloadForm,
     /// Whether its owner granted it.
     pub is_granted: bool,
     /// Who refused it, and why.
@@ -114,9 +118,16 @@ impl<R> Routes<R> {
         by_type.or_else(|| self.share_rule(kind, local_name, None))
     }
 
+    /// An interface that is used, as its owner lists it, and the rule's word for whose it is.
+    pub fn used_entry(&self, name: &Name) -> Option<(NodeId, &CatalogueEntry)> {
+        let route = self.uses.get(name)?;
+        Some((self.use_rules[route.rule].owner, &route.entry))
+    }
+
     /// Every rule of what is shared.
     pub fn share_views(&self) -> Vec<ShareView<'_>> {
         let view = |(index, rule)| {
+            let rule: &super::ShareRule = rule;
             let of_rule = self.shares.values().filter(move |share| share.rule == index);
             let routes = of_rule.map(|share| ShareRouteView {
                 local_name: share.local_name.clone(),
@@ -127,8 +138,8 @@ impl<R> Routes<R> {
                 is_read: share.reader.is_some(),
                 is_written: share.writer.is_some() || share.client.is_some(),
                 qos: weakest(share.writers.values().map(|w| &w.qos)),
+                form: rule.shaping.form,
             });
-            let rule: &super::ShareRule = rule;
             ShareView { metadata: &rule.metadata, policy: &rule.policy, routes: routes.collect() }
         };
         self.share_rules.iter().enumerate().map(view).collect()
@@ -143,6 +154,7 @@ impl<R> Routes<R> {
                 local_name: route.local_name.clone(),
                 entry: &route.entry,
                 name: *name,
+                form: rule.shaping.form,
                 is_granted: route.granted,
                 refused: route.refused,
                 writers: route.writers.len() + usize::from(route.server.is_some()),

@@ -13,6 +13,7 @@ mod publishers;
 mod replay;
 mod revocation;
 mod rotation;
+mod types;
 
 use std::collections::BTreeMap;
 use std::time::Duration;

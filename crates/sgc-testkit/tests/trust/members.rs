@@ -5,8 +5,7 @@ use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, RecoveryLimits, Source, Sourc
 use sgc_testkit::{DataDrop, Member, NodeKey, World, WorldConfig, identity};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    AdvertBody, Class, Control, Decode, Hello, MessageHead, MessageKind, Packet, PayloadEncoding, SourceId,
-    TopicGrant,
+    AdvertBody, Class, Control, Decode, Hello, MessageHead, MessageKind, Packet, SourceId, TopicGrant,
 };
 
 use crate::{
@@ -27,8 +26,7 @@ fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, f
     };
     let suite = Suite::from_id(grant.suite).expect("a suite of this build");
     let mut source = Source::new(config, grant, MessageKey::generate(suite)).expect("a key that fits");
-    let head =
-        MessageHead { kind: MessageKind::Write, encoding: PayloadEncoding::Plain, source_timestamp_ns: 0 };
+    let head = MessageHead::new(MessageKind::Write, 0);
     let mut packets = Vec::new();
     for _ in 0..from + 10 {
         let command = Bytes::from_static(&[0xff; 8]);

@@ -5,11 +5,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use sgc_cdr::{Layout, TypeName, YamlStyle};
+use sgc_types::{Definitions, Described};
 
 use super::{Tap, TapArgs};
-use crate::definitions::Definitions;
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::output;
 
@@ -18,7 +20,8 @@ const RAW_LINE_BYTES: usize = 32;
 
 /// Show messages of a topic, decoded
 ///
-/// Definitions are looked for in `--msg-dir`, then in AMENT_PREFIX_PATH; the common interfaces of ROS 2 ship inside. Looking
+/// Definitions are looked for in `--msg-dir`, then in AMENT_PREFIX_PATH; the common interfaces of ROS 2 ship inside; what is
+/// found nowhere, or is another there, the node knows from who shares the topic. Looking
 /// slows nothing down: what is not shown in time is left out, and counted.
 #[derive(Debug, Args)]
 pub(crate) struct EchoArgs {
@@ -117,8 +120,15 @@ pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
     let type_name = &tap.shown.type_name;
     let unknown = |why: String| CliError::NoDefinition { type_name: type_name.clone(), why };
     let name: TypeName = type_name.parse().map_err(|why| unknown(format!("{why}")))?;
-    let layout = Definitions::new(dirs).layout(&name).map_err(|why| unknown(why.to_string()))?;
-    let differs = tap.shown.type_hash.as_ref().filter(|announced| **announced != layout.type_hash());
+    let found = Definitions::from_env(dirs).layout(&name);
+    let announced = tap.shown.type_hash.as_deref();
+    let is_theirs = |layout: &Layout| announced.is_none_or(|announced| announced == layout.type_hash());
+    let layout = match (found, told(tap, &name)) {
+        (Ok(layout), _) if is_theirs(&layout) => layout,
+        (_, Some(described)) => Layout::clone(described.layout()),
+        (found, None) => found.map_err(|why| unknown(why.to_string()))?,
+    };
+    let differs = tap.shown.type_hash.as_ref().filter(|_| !is_theirs(&layout));
     if let Some(announced) = differs {
         output::diagnostic(&format!(
             "sgc: the publisher has another definition of {type_name} ({announced}) than was found here ({}); \
@@ -127,6 +137,14 @@ pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
         ));
     }
     Ok(layout)
+}
+
+/// What the node was told that the type looks like.
+fn told(tap: &Tap, name: &TypeName) -> Option<Described> {
+    let told = tap.shown.described.as_ref()?;
+    let description = STANDARD.decode(&told.description).ok()?;
+    let expected = tap.shown.type_hash.as_deref().unwrap_or(&told.type_hash);
+    Described::read(description.into(), name, expected).ok()
 }
 
 fn hex(payload: &[u8]) -> String {
@@ -139,4 +157,48 @@ fn hex(payload: &[u8]) -> String {
     }
     out.push_str("---\n");
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::net::UnixStream;
+
+    use sgc_cdr::Library;
+
+    use super::super::{Shown, Told};
+    use super::*;
+
+    /// A type that is installed nowhere.
+    fn thing() -> Described {
+        let mut text = |_: &TypeName| Some("int8 a".to_owned());
+        let layout = Library::empty().layout(&"mine/msg/Thing".parse().unwrap(), &mut text).unwrap();
+        Described::of(layout).unwrap()
+    }
+
+    fn tap(type_name: &str, type_hash: Option<&str>, told: Option<&Described>) -> Tap {
+        let described = told.map(|told| Told {
+            type_hash: told.type_hash().to_owned(),
+            description: STANDARD.encode(told.description()),
+        });
+        let (type_name, type_hash) = (type_name.to_owned(), type_hash.map(str::to_owned));
+        let (stream, _) = UnixStream::pair().unwrap();
+        Tap { socket: PathBuf::new(), stream, shown: Shown { type_name, type_hash, described } }
+    }
+
+    #[test]
+    fn what_is_not_installed_is_decoded_by_what_the_node_was_told() {
+        let thing = thing();
+        for announced in [None, Some(thing.type_hash())] {
+            let layout = layout(&tap("mine/msg/Thing", announced, Some(&thing)), &[]).unwrap();
+            assert_eq!(layout.type_hash(), thing.type_hash());
+        }
+        // It is not believed for another hash, or another type.
+        let other = tap("mine/msg/Thing", Some("RIHS01_00"), Some(&thing));
+        assert!(matches!(layout(&other, &[]), Err(CliError::NoDefinition { .. })));
+        let other = tap("mine/msg/Other", None, Some(&thing));
+        assert!(matches!(layout(&other, &[]), Err(CliError::NoDefinition { .. })));
+        assert!(layout(&tap("mine/msg/Thing", None, None), &[]).is_err());
+        // What ships needs nobody to tell, as long as it is what is announced.
+        assert!(layout(&tap("std_msgs/msg/String", None, None), &[]).is_ok());
+    }
 }

@@ -302,6 +302,10 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
         None => String::new(),
     };
     steps.push(Step::fine(format!("granted to {}{refused}", route.granted.join(", "))));
+    if route.lacks_definition {
+        steps.push(no_definition(&route.type_name));
+        return;
+    }
     let line = graph.names.get(&route.name).cloned().unwrap_or_default();
     if !line.has_branch {
         steps.push(Step::wrong(
@@ -501,6 +505,10 @@ fn walk_use_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk)
         return;
     }
     steps.push(Step::fine(format!("{owner} granted it [{}]", route.type_name)));
+    if route.lacks_definition {
+        steps.push(no_definition(&route.type_name));
+        return;
+    }
     let line = graph.names.get(&route.name).cloned().unwrap_or_default();
     if let Some((link, cost)) = line.way {
         if graph.links.iter().any(|l| l.id == link && l.silent) {
@@ -736,6 +744,16 @@ fn traffic(line: &NameLine, what: &str, steps: &mut Walk) {
     });
 }
 
+fn no_definition(type_name: &str) -> Step {
+    Step::wrong(
+        format!(
+            "its messages travel as JSON, and no definition of {type_name} is known here: none get through"
+        ),
+        "name a directory with packages that define it with `definitions` in [ros], or start the node where ROS 2 is sourced; \
+         or take `encoding = \"json\"` out of the [[share]]",
+    )
+}
+
 fn drop_reason(reason: &str) -> (&'static str, &'static str) {
     match reason {
         "wrong_way" => {
@@ -769,6 +787,14 @@ fn drop_reason(reason: &str) -> (&'static str, &'static str) {
         "overrun" => (
             "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
             "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
+        ),
+        "no_definition" => (
+            "its messages travel as JSON, and what its type looks like was not known",
+            "name a directory that defines it with `definitions` in [ros]; a few when a topic begins are no fault",
+        ),
+        "not_converted" => (
+            "a publisher wrote something else than its type says, so that it could not become JSON",
+            "build the publisher and the definitions that this node finds from one version of the package",
         ),
         "too_old" => ("older than max_age", "raise max_age, or compare the clocks of the hosts"),
         _ => ("for another reason", "`sgc status` shows all drops"),

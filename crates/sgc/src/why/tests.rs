@@ -150,6 +150,9 @@ fn each_fault_of_an_owner_is_named() {
         ("says type x/msg/Y, and the publishers have std_msgs/msg/String", |g| {
             g.shares[0].wanted_type = Some("x/msg/Y".into());
         }),
+        ("travel as JSON, and no definition of std_msgs/msg/String is known here", |g| {
+            g.shares[0].routes[0].lacks_definition = true;
+        }),
         ("have different definitions of std_msgs/msg/String: RIHS01_a and RIHS01_b", |g| {
             g.endpoints.push(g.endpoints[0].clone());
             g.endpoints[0].type_hash = Some("RIHS01_a".into());
@@ -230,6 +233,9 @@ fn each_fault_of_a_user_is_named() {
         ("arm refuses it: revoked", |g| {
             g.uses[0].routes[0].is_granted = false;
             g.uses[0].routes[0].refused = Some("revoked".into());
+        }),
+        ("travel as JSON, and no definition of std_msgs/msg/String is known here", |g| {
+            g.uses[0].routes[0].lacks_definition = true;
         }),
         ("no way leads to it now", |g| {
             g.uses[0].routes[0].is_granted = false;

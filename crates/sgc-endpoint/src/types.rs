@@ -1,0 +1,235 @@
+//! Types over the wire: an owner says what the types of its interfaces look like to those who ask and may have them, once.
+//!
+//! An owner is asked at a name of its own; what it does not know yet it says when it does. Descriptions are bytes here,
+//! packed: whether one describes the type that it is said to is for who reads it.
+
+use std::collections::BTreeSet;
+
+use bytes::Bytes;
+use sgc_trust::{name_of, types_blind};
+use sgc_wire::{
+    Blind, Decode, DescribedType, Encode, GrantContent, Name, NodeId, Now, PayloadEncoding, RefuseReason,
+    Request, Role, SEALED_BYTES_MAX, SinkId, TYPE_DESCRIPTION_BYTES_MAX, TYPE_HASH_BYTES_MAX,
+    TYPES_PER_QUESTION_MAX, TypeQuestion,
+};
+
+use crate::Endpoint;
+use crate::compression::{CompressionError, Compressor, Decompressor};
+use crate::joins::Wish;
+use crate::shares::GrantedSink;
+
+/// What the length before a compressed description takes.
+const LENGTH_BYTES: usize = 4;
+/// Room for descriptions in one answer, bytes.
+const ANSWER_BYTES_MAX: usize = SEALED_BYTES_MAX - 1024;
+
+/// The description of a type as it travels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PackedType {
+    /// `RIHS01_…` hash of what is described.
+    type_hash: String,
+    encoding: PayloadEncoding,
+    bytes: Bytes,
+}
+
+impl PackedType {
+    /// Packs a description; `None` if it, or the hash, is too long.
+    pub fn new(type_hash: &str, description: &Bytes) -> Option<Self> {
+        if description.len() > TYPE_DESCRIPTION_BYTES_MAX || type_hash.len() > TYPE_HASH_BYTES_MAX {
+            return None;
+        }
+        let packed = Compressor::default().compress(PayloadEncoding::Zstd, description);
+        let (encoding, bytes) = match packed {
+            Some(packed) => (PayloadEncoding::Zstd, packed),
+            None => (PayloadEncoding::Plain, description.clone()),
+        };
+        Some(Self { type_hash: type_hash.to_owned(), encoding, bytes })
+    }
+
+    fn of(&self, name: Name) -> DescribedType {
+        let (encoding, description) = (self.encoding, self.bytes.clone());
+        DescribedType { name, type_hash: self.type_hash.clone(), encoding, description }
+    }
+}
+
+/// The description that came, as it was. It takes no more memory than a description may have.
+pub fn unpack_type(described: &DescribedType) -> Result<Bytes, CompressionError> {
+    let packed = described.description.clone();
+    if described.encoding != PayloadEncoding::Plain {
+        let length = packed.first_chunk::<LENGTH_BYTES>().ok_or(CompressionError::Malformed)?;
+        let claimed = u32::from_be_bytes(*length);
+        if claimed as usize > TYPE_DESCRIPTION_BYTES_MAX {
+            return Err(CompressionError::TooLong(claimed));
+        }
+    }
+    Decompressor::default().decompress(described.encoding, packed)
+}
+
+/// One who asked what types look like.
+#[derive(Debug)]
+pub(crate) struct TypeAsker {
+    asker: GrantedSink,
+    /// What it has not been told.
+    names: BTreeSet<Name>,
+}
+
+/// Where an owner is asked what its types look like.
+pub(crate) fn types_name(owner: &NodeId) -> (Name, Blind) {
+    let blind = types_blind(owner);
+    (name_of(owner, &blind), blind)
+}
+
+/// As an owner.
+impl Endpoint {
+    /// What the type of a share looks like. Those who asked are told.
+    pub fn describe(&mut self, now: Now, name: &Name, described: PackedType) {
+        self.now = now;
+        let Some(share) = self.shares.shares.get_mut(name) else { return };
+        share.described = Some(described);
+        if !std::mem::replace(&mut self.describes, true) {
+            self.withdrawn.remove(&self.types_name.1);
+            self.unadvertised.insert(self.types_name.1);
+        }
+        let waiting = self.questions.iter().filter(|(_, asked)| asked.names.contains(name));
+        for sink in waiting.map(|(sink, _)| *sink).collect::<Vec<_>>() {
+            self.answer_types(sink, false);
+        }
+    }
+
+    pub(crate) fn is_types(&self, name: &Name) -> bool {
+        self.types_name.0 == *name
+    }
+
+    /// Whoever may know the owner may ask; what it is told is what it may have.
+    pub(crate) fn handle_type_question(&mut self, name: Name, sink: SinkId, asker: GrantedSink) {
+        let Request::Ask { what } = &asker.request else {
+            return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+        };
+        let Ok(question) = TypeQuestion::from_slice(what) else {
+            return self.refuse(name, sink, 1, RefuseReason::NotVerified);
+        };
+        let peer = asker.peer.node_id;
+        let known = self.questions.get(&sink).map(|asked| (asked.asker.peer.node_id, asked.asker.serial));
+        let of_peer = self.questions.values().filter(|asked| asked.asker.peer.node_id == peer).count();
+        let limits = &self.config.limits;
+        let has_room =
+            self.questions.len() < limits.sinks_per_name_max && of_peer < limits.sinks_per_peer_max;
+        let serial = match known {
+            Some((known, serial)) if known == peer => serial,
+            None if has_room => 0,
+            Some(_) | None => return self.refuse(name, sink, 1, RefuseReason::Limit),
+        };
+        let names = question.names.into_iter().collect();
+        self.questions.insert(sink, TypeAsker { asker: GrantedSink { serial, ..asker }, names });
+        self.answer_types(sink, true);
+    }
+
+    /// Tells one who asked what it was not told yet and is known; with `at_least`, also that there is nothing. What has no
+    /// room in one answer is asked for again.
+    fn answer_types(&mut self, sink: SinkId, at_least: bool) {
+        let Some(asked) = self.questions.get_mut(&sink) else { return };
+        let (mut types, mut bytes) = (Vec::new(), 0);
+        for name in &asked.names {
+            let Some(share) = self.shares.shares.get(name) else { continue };
+            let policy = &share.spec.policy;
+            let may = |role| policy.permits(&asked.asker.peer, role).is_ok();
+            let Some(described) =
+                share.described.as_ref().filter(|_| may(Role::Subscribe) || may(Role::Publish))
+            else {
+                continue;
+            };
+            let described = described.of(*name);
+            let more = described.to_vec().len();
+            if bytes + more <= ANSWER_BYTES_MAX {
+                bytes += more;
+                types.push(described);
+            }
+        }
+        if types.is_empty() && !at_least {
+            return;
+        }
+        asked.names.retain(|name| types.iter().all(|told| told.name != *name));
+        asked.asker.serial += 1;
+        let (serial, reply_key) = (asked.asker.serial, asked.asker.reply_key.clone());
+        if !self.grant(self.types_name.0, sink, serial, &reply_key, &GrantContent::Types(types)) {
+            self.questions.remove(&sink);
+        }
+    }
+
+    /// Cuts those who lost their certificate.
+    pub(crate) fn enforce_types(&mut self) {
+        let lost = |(sink, asked): (&SinkId, &TypeAsker)| {
+            self.standing(&asked.asker.peer).map(|reason| (*sink, asked.asker.serial + 1, reason))
+        };
+        let lost: Vec<_> = self.questions.iter().filter_map(lost).collect();
+        for (sink, serial, reason) in lost {
+            self.questions.remove(&sink);
+            self.refuse(self.types_name.0, sink, serial, reason);
+        }
+    }
+
+    pub(crate) fn withdraw_types(&mut self) {
+        if std::mem::take(&mut self.describes) {
+            self.unadvertised.remove(&self.types_name.1);
+            self.withdrawn.insert(self.types_name.1);
+        }
+        self.questions.clear();
+    }
+}
+
+/// As one who asks.
+impl Endpoint {
+    /// Asks an owner what the types of these interfaces look like, the first [`TYPES_PER_QUESTION_MAX`] of them, until it is
+    /// asked for others, or for none. An owner that describes none, or is of a version that cannot, does not advertise the
+    /// name that it is asked at: then nothing happens.
+    pub fn ask_types(&mut self, now: Now, owner: NodeId, mut names: Vec<Name>) {
+        self.now = now;
+        names.truncate(TYPES_PER_QUESTION_MAX);
+        let (name, _) = types_name(&owner);
+        let wish = Wish::Types(names);
+        if self.joins.get(&name).is_some_and(|join| join.wish == wish) {
+            return;
+        }
+        self.leave(now, &name);
+        if wish != Wish::Types(Vec::new()) {
+            self.join(now, name, owner, wish);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn described(encoding: PayloadEncoding, description: impl Into<Bytes>) -> DescribedType {
+        DescribedType {
+            name: Name([1; 32]),
+            type_hash: "RIHS01_00".into(),
+            encoding,
+            description: description.into(),
+        }
+    }
+
+    #[test]
+    fn a_description_comes_back_whether_it_shrinks_or_not() {
+        for bytes in [Bytes::from_static(b"short"), vec![7; TYPE_DESCRIPTION_BYTES_MAX].into()] {
+            let packed = PackedType::new("RIHS01_00", &bytes).unwrap();
+            assert_eq!(unpack_type(&packed.of(Name([1; 32]))), Ok(bytes));
+        }
+        let long = Bytes::from(vec![0; TYPE_DESCRIPTION_BYTES_MAX + 1]);
+        assert_eq!(PackedType::new("RIHS01_00", &long), None);
+        assert_eq!(PackedType::new(&"x".repeat(TYPE_HASH_BYTES_MAX + 1), &Bytes::new()), None);
+    }
+
+    #[test]
+    fn a_bomb_is_refused_by_what_it_claims() {
+        let bomb = Compressor::default().compress(PayloadEncoding::Zstd, &vec![0; 8 << 20]).unwrap();
+        let refused = unpack_type(&described(PayloadEncoding::Zstd, bomb.clone()));
+        assert_eq!(refused, Err(CompressionError::TooLong(8 << 20)));
+        let mut lies = bomb.to_vec();
+        lies[..LENGTH_BYTES].copy_from_slice(&1000_u32.to_be_bytes());
+        assert_eq!(unpack_type(&described(PayloadEncoding::Zstd, lies)), Err(CompressionError::Malformed));
+        let cut = unpack_type(&described(PayloadEncoding::Zstd, &b"abc"[..]));
+        assert_eq!(cut, Err(CompressionError::Malformed));
+    }
+}

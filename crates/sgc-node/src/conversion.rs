@@ -1,0 +1,169 @@
+//! Messages that travel as JSON: CDR to JSON before they are sealed, and back behind the seal.
+//!
+//! Both need to know what messages of the type look like, which may become known later than the first of them comes. What
+//! JSON of a message is, `sgc-cdr` says (docs/spec/json.md).
+
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use sgc_cdr::{CdrVersion, DecodeError, Encoding, Layout, ValueError};
+use sgc_wire::Representations;
+
+/// How long what came waits for its type to be known: as long as an owner may take to be asked.
+pub(crate) const TYPE_WAIT_MAX: Duration = Duration::from_secs(5);
+
+/// What is known of a type.
+#[derive(Clone, Debug, Default)]
+pub(crate) enum KnownType {
+    /// It is being found out.
+    #[default]
+    Awaited,
+    /// What its messages look like.
+    Known(Arc<Layout>),
+    /// It is not known: there is no definition here, and nobody told one.
+    Lacking,
+}
+
+impl KnownType {
+    /// What messages look like, if that is known.
+    pub(crate) fn layout(&self) -> Option<&Arc<Layout>> {
+        match self {
+            Self::Known(layout) => Some(layout),
+            Self::Awaited | Self::Lacking => None,
+        }
+    }
+}
+
+/// What is known of the type of an interface, for its end at this node.
+#[derive(Debug, Default)]
+pub(crate) struct TypeSlot {
+    known: Mutex<KnownType>,
+    changed: Condvar,
+}
+
+impl TypeSlot {
+    /// Tells those who wait for it. What is known stays so until it is something else.
+    pub(crate) fn set(&self, known: KnownType) {
+        let mut slot = self.lock();
+        // That somebody is asked again makes nobody wait a second time.
+        if !matches!((&*slot, &known), (KnownType::Lacking, KnownType::Awaited)) {
+            *slot = known;
+        }
+        self.changed.notify_all();
+    }
+
+    /// What is known now.
+    pub(crate) fn now(&self) -> KnownType {
+        self.lock().clone()
+    }
+
+    /// What messages look like, as soon as it is known. Blocks; whoever waited in vain has nobody wait again.
+    pub(crate) fn wait(&self, max: Duration) -> Option<Arc<Layout>> {
+        let deadline = Instant::now() + max;
+        let mut slot = self.lock();
+        while matches!(*slot, KnownType::Awaited) {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                *slot = KnownType::Lacking;
+            } else {
+                slot = self.changed.wait_timeout(slot, left).unwrap_or_else(PoisonError::into_inner).0;
+            }
+        }
+        slot.layout().cloned()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, KnownType> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Why a message was not converted.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum ConversionError {
+    /// A local publisher wrote something else than its type says.
+    #[error("the message is not what its type says: {0}")]
+    FromCdr(#[from] DecodeError),
+    /// What came is not JSON of the type.
+    #[error("the JSON is none of the type: {0}")]
+    FromJson(#[from] ValueError),
+}
+
+/// The JSON of a message.
+pub(crate) fn to_json(layout: &Layout, payload: &Bytes) -> Result<Bytes, ConversionError> {
+    Ok(layout.decode(payload)?.to_json().into())
+}
+
+/// The message of a JSON, as a writer that offers this representation writes it.
+pub(crate) fn from_json(
+    layout: &Layout,
+    json: &[u8],
+    offered: Representations,
+) -> Result<Bytes, ConversionError> {
+    let version = if Representations::XCDR1.meets(offered) { CdrVersion::One } else { CdrVersion::Two };
+    let value = layout.from_json(json)?;
+    Ok(layout.encode_as(&value, Encoding { version, ..Encoding::default() })?.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use sgc_cdr::Library;
+
+    use super::*;
+
+    fn layout() -> Layout {
+        let mut text = |_: &sgc_cdr::TypeName| Some("string a\nfloat64 b".to_owned());
+        Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text).unwrap()
+    }
+
+    #[test]
+    fn a_message_comes_back_in_the_representation_of_the_writer() {
+        let layout = layout();
+        let cdr = |version, text: &str| -> Bytes {
+            let value = layout.from_json(text.as_bytes()).unwrap();
+            layout.encode_as(&value, Encoding { version, ..Encoding::default() }).unwrap().into()
+        };
+        let text = r#"{"a":"é","b":"NaN"}"#;
+        let (one, two) = (cdr(CdrVersion::One, text), cdr(CdrVersion::Two, text));
+        assert_ne!(one, two);
+        for written in [&one, &two] {
+            let json = to_json(&layout, written).unwrap();
+            assert_eq!(json, text);
+            for (offered, expected) in [
+                (Representations::XCDR1, &one),
+                (Representations::BOTH, &one),
+                (Representations::XCDR2, &two),
+            ] {
+                assert_eq!(&from_json(&layout, &json, offered).unwrap(), expected, "{offered:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_of_the_type_is_refused() {
+        let layout = layout();
+        let cut = to_json(&layout, &Bytes::from_static(b"\0\x01\0\0\x09\0\0\0abc")).unwrap_err();
+        assert!(matches!(cut, ConversionError::FromCdr(_)), "{cut}");
+        for json in [&b"{\"c\": 1}"[..], b"{", b"[]", b"\0\x01\0\0"] {
+            let refused = from_json(&layout, json, Representations::XCDR1).unwrap_err();
+            assert!(matches!(refused, ConversionError::FromJson(_)), "{refused}");
+        }
+    }
+
+    #[test]
+    fn who_waits_for_a_type_gets_it_or_gives_up_once() {
+        let slot = Arc::new(TypeSlot::default());
+        let waits = {
+            let slot = slot.clone();
+            std::thread::spawn(move || slot.wait(Duration::from_secs(60)))
+        };
+        slot.set(KnownType::Known(Arc::new(layout())));
+        assert!(waits.join().unwrap().is_some());
+        let slot = TypeSlot::default();
+        assert!(slot.wait(Duration::from_millis(1)).is_none());
+        slot.set(KnownType::Awaited);
+        assert!(slot.wait(Duration::from_secs(60)).is_none(), "and not at the end of a minute");
+        slot.set(KnownType::Known(Arc::new(layout())));
+        assert!(slot.wait(Duration::ZERO).is_some());
+    }
+}

@@ -1,0 +1,118 @@
+//! A type that is known, with the description that others can be given (REP 2011).
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sgc_cdr::{DescriptionError, Layout, TypeName};
+
+/// A type that is known: a message's, or a service's with its messages.
+#[derive(Clone, Debug)]
+pub struct Described {
+    name: TypeName,
+    type_hash: String,
+    description: Bytes,
+    layout: Arc<Layout>,
+}
+
+/// Why a description is not believed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NotBelieved {
+    /// It is none, or one of another type than the one of the hash.
+    #[error(transparent)]
+    Description(#[from] DescriptionError),
+    /// It is one of a type with another name.
+    #[error("the description is one of {found}, not of {expected}")]
+    Name {
+        /// What it describes.
+        found: String,
+        /// What was asked for.
+        expected: String,
+    },
+}
+
+impl Described {
+    /// Describes a type.
+    pub fn of(layout: Layout) -> Result<Self, DescriptionError> {
+        let description = layout.describe()?.into();
+        Self::new(layout, description).ok_or_else(nameless)
+    }
+
+    /// Reads a description that somebody else made of the type of this name and hash.
+    pub fn read(description: Bytes, name: &TypeName, type_hash: &str) -> Result<Self, NotBelieved> {
+        let layout = Layout::from_description(&description, type_hash)?;
+        let this = Self::new(layout, description).ok_or_else(nameless)?;
+        if this.name != *name {
+            return Err(NotBelieved::Name { found: this.name.to_string(), expected: name.to_string() });
+        }
+        Ok(this)
+    }
+
+    fn new(layout: Layout, description: Bytes) -> Option<Self> {
+        let (name, type_hash) = (layout.name()?.clone(), layout.type_hash());
+        Some(Self { name, type_hash, description, layout: Arc::new(layout) })
+    }
+
+    /// The type.
+    pub fn name(&self) -> &TypeName {
+        &self.name
+    }
+
+    /// Its hash: `RIHS01_` and 64 hexadecimal digits.
+    pub fn type_hash(&self) -> &str {
+        &self.type_hash
+    }
+
+    /// A serialised `type_description_interfaces/msg/TypeDescription`.
+    pub fn description(&self) -> &Bytes {
+        &self.description
+    }
+
+    /// What its messages look like.
+    pub fn layout(&self) -> &Arc<Layout> {
+        &self.layout
+    }
+}
+
+/// No library makes a layout of nothing.
+fn nameless() -> DescriptionError {
+    DescriptionError::Content { what: "name of a type", found: String::new() }
+}
+
+#[cfg(test)]
+mod tests {
+    use sgc_cdr::{DESCRIPTION_BYTES_MAX, Library};
+
+    use super::*;
+
+    fn described(name: &str) -> Described {
+        Described::of(Library::empty().layout(&name.parse().unwrap(), &mut |_| None).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn what_is_described_is_read_again_also_of_services() {
+        for name in ["geometry_msgs/msg/Twist", "std_srvs/srv/SetBool"] {
+            let ours = described(name);
+            let read = Described::read(ours.description().clone(), ours.name(), ours.type_hash()).unwrap();
+            assert_eq!((read.name(), read.type_hash()), (ours.name(), ours.type_hash()));
+            assert_eq!(read.layout().type_hash(), ours.type_hash());
+        }
+    }
+
+    #[test]
+    fn another_hash_another_name_and_too_much_are_not_believed() {
+        let (twist, string) = (described("geometry_msgs/msg/Twist"), described("std_msgs/msg/String"));
+        let read = |description: &Bytes, name: &TypeName, hash: &str| {
+            Described::read(description.clone(), name, hash).map(|_| ()).unwrap_err()
+        };
+        let other_hash = read(twist.description(), twist.name(), string.type_hash());
+        assert!(
+            matches!(other_hash, NotBelieved::Description(DescriptionError::Hash { .. })),
+            "{other_hash}"
+        );
+        let other_name = read(twist.description(), string.name(), twist.type_hash());
+        assert!(matches!(other_name, NotBelieved::Name { .. }), "{other_name}");
+        let long = vec![0; DESCRIPTION_BYTES_MAX + 1].into();
+        let too_long = read(&long, twist.name(), twist.type_hash());
+        assert!(matches!(too_long, NotBelieved::Description(DescriptionError::TooLong { .. })), "{too_long}");
+    }
+}
