@@ -52,10 +52,11 @@ deps-bench:
 peers:
 	@scripts/build-peers.sh
 
-# The golden vectors of names, identities, tokens, sealing and grants, and CDR, against implementations that are not ours.
+# The golden vectors of names, identities, tokens of both kinds, sealing and grants, and CDR, against implementations that are not ours.
 vectors: peers
 	.venv/bin/python -B scripts/check-vectors.py
 	.venv/bin/python -B scripts/trust-vectors.py
+	.venv/bin/python -B scripts/access-vectors.py
 	.venv/bin/python -B scripts/cdr-vectors.py
 
 lint: fmt clippy

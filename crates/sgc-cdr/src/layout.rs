@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::defaults::MemberDefault;
-use crate::definition::{FieldType, Primitive, Shape, TypeName};
+use crate::definition::{Constant, FieldType, Primitive, Shape, TypeName};
 
 /// How deep types may contain each other.
 pub const LAYOUT_DEPTH_MAX: usize = 32;
@@ -25,6 +25,8 @@ pub struct Layout {
 pub(crate) struct Struct {
     pub(crate) name: TypeName,
     pub(crate) members: Vec<Member>,
+    /// Those of its definition; a description that travels has none.
+    pub(crate) constants: Vec<Constant>,
 }
 
 /// A member of it.

@@ -27,6 +27,7 @@ mod library;
 mod number;
 mod parse;
 mod path;
+mod ros2msg;
 #[cfg(test)]
 mod testing;
 mod value;

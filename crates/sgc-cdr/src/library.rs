@@ -186,7 +186,7 @@ impl Resolver<'_, '_> {
         if self.structs.len() >= LAYOUT_STRUCTS_MAX {
             return Err(TypeError::TooLarge { name: name.clone() });
         }
-        self.structs.push(Struct { name: name.clone(), members });
+        self.structs.push(Struct { name: name.clone(), members, constants: definition.constants });
         self.places.insert(name.clone(), self.structs.len() - 1);
         Ok(self.structs.len() - 1)
     }

@@ -12,8 +12,10 @@
 mod access;
 mod action;
 mod content;
+mod door;
 mod error;
 mod feed;
+pub mod foxglove;
 mod graph;
 pub mod grpc;
 mod hub;
@@ -22,9 +24,12 @@ mod publisher;
 mod queue;
 mod ros;
 pub mod rosbridge;
+mod server;
 mod service;
 mod session;
+mod tls;
 mod types;
+mod ws;
 
 pub use access::{
     ACCESS_LABEL_BYTES_MAX, ACCESS_TOKEN_PREFIX, ACCESS_TOKEN_TEXT_BYTES_MAX, ACCESS_VALID_MS_MAX, Access,
@@ -36,6 +41,7 @@ pub use action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
 };
 pub use content::{Content, Form};
+pub use door::{ClientStatus, GatewayStatus};
 pub use error::{ErrorKind, GatewayError};
 pub use feed::{Delivery, Subscription};
 pub use graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, TopicInfo, is_hidden};
@@ -43,6 +49,8 @@ pub use hub::{Hub, HubOptions};
 pub use message::Message;
 pub use publisher::Publication;
 pub use ros::{LocalReader, LocalRos};
+pub use server::{ListenAt, Protocol, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, SessionLimits, Subscribe};
+pub use tls::{TlsError, certified_key};
 pub use types::{FindDefinitions, InterfaceType, Shipped, Types};

@@ -142,6 +142,7 @@ impl Queue {
     /// Forgets what waits.
     pub(crate) fn clear(&self) {
         let mut state = self.lock();
+        self.waiting.fetch_sub(state.bytes, Ordering::Relaxed);
         (state.messages, state.bytes) = (VecDeque::new(), 0);
     }
 

@@ -252,6 +252,6 @@ impl Session {
 }
 
 /// The action that a topic or service is a part of; any other is itself.
-fn action_of(name: &str) -> &str {
+pub(crate) fn action_of(name: &str) -> &str {
     name.split_once("/_action/").map_or(name, |(action, _)| action)
 }

@@ -1,10 +1,18 @@
 //! What is generated from `gateway.proto` and committed is what its text says. Run with `SGC_GENERATE=1` it is made anew.
 
+#![allow(clippy::unwrap_used)]
+
 use std::fs;
 use std::path::Path;
 
 const PROTO: &str = "sgc/gateway/v1/gateway.proto";
-const FILES: [&str; 2] = ["sgc.gateway.v1.rs", "descriptor.bin"];
+/// What is made, and where it is committed: the Python client takes the description as it is.
+const FILES: [(&str, &str); 3] = [
+    ("sgc.gateway.v1.rs", "src/grpc/generated/sgc.gateway.v1.rs"),
+    (DESCRIPTOR, "src/grpc/generated/descriptor.bin"),
+    (DESCRIPTOR, "../../clients/python/src/sgc/gateway.binpb"),
+];
+const DESCRIPTOR: &str = "descriptor.bin";
 
 #[test]
 fn what_is_generated_is_what_the_proto_says() {
@@ -20,11 +28,10 @@ fn what_is_generated_is_what_the_proto_says() {
         .unwrap();
     // Comments are of no use to who asks by reflection, and three quarters of it.
     compiler.include_source_info(false);
-    fs::write(made.path().join(FILES[1]), compiler.encode_file_descriptor_set()).unwrap();
+    fs::write(made.path().join(DESCRIPTOR), compiler.encode_file_descriptor_set()).unwrap();
 
-    let committed = here.join("src/grpc/generated");
-    for file in FILES {
-        let (made, committed) = (fs::read(made.path().join(file)).unwrap(), committed.join(file));
+    for (file, committed) in FILES {
+        let (made, committed) = (fs::read(made.path().join(file)).unwrap(), here.join(committed));
         if std::env::var_os("SGC_GENERATE").is_some() {
             fs::write(committed, made).unwrap();
             continue;

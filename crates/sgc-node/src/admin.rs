@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use serde::Serialize;
 use sgc_wire::{CRL_BYTES_MAX, Name};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{UnixListener, UnixStream};
@@ -21,8 +22,10 @@ use tokio::sync::{Semaphore, mpsc, oneshot};
 use tracing::debug;
 
 use crate::core::CoreEvent;
+use crate::gateway::Gateway;
 use crate::graph::Side;
 use crate::reload::Reloader;
+use crate::shell::{self, CallWish, PublishWish};
 use crate::tap::{Tap, TapWish, Tapped};
 
 /// What a line of a question begins with; the number is the version of the protocol.
@@ -63,6 +66,10 @@ pub enum AdminRequest {
         /// Most bytes of a payload that are sent; the rest is cut off.
         bytes: u32,
     },
+    /// Publish what follows: a message in JSON a line. Each is answered, as the question itself is.
+    Publish(PublishWish),
+    /// Call a service.
+    Call(CallWish),
 }
 
 /// What precedes each message of a tap: [`TapHead::BYTES`] bytes, numbers big endian in this order. So many bytes
@@ -162,6 +169,14 @@ impl AdminRequest {
                 Some(name) => Ok(Self::Graph(Some(name))),
                 None => Err(AdminError::Argument { word: "graph" }),
             },
+            ("publish", wish) => match serde_json::from_str(wish) {
+                Ok(wish) => Ok(Self::Publish(wish)),
+                Err(_) => Err(AdminError::Argument { word: "publish" }),
+            },
+            ("call", wish) => match serde_json::from_str(wish) {
+                Ok(wish) => Ok(Self::Call(wish)),
+                Err(_) => Err(AdminError::Argument { word: "call" }),
+            },
             ("tap", rest) => Self::parse_tap(rest).ok_or(AdminError::Argument { word: "tap" }),
             (word, _) => Err(AdminError::Unknown { word: word.chars().take(32).collect() }),
         }
@@ -190,8 +205,15 @@ impl AdminRequest {
             Self::Tap { topic, side, bytes } => {
                 format!("{ADMIN_PREFIX}tap {} {bytes} {topic}\n", side.map_or("any", Side::label))
             }
+            Self::Publish(wish) => format!("{ADMIN_PREFIX}publish {}\n", json(wish)),
+            Self::Call(wish) => format!("{ADMIN_PREFIX}call {}\n", json(wish)),
         }
     }
+}
+
+/// A wish in one line.
+fn json(wish: &impl Serialize) -> String {
+    serde_json::to_string(wish).expect("texts and numbers have a JSON form")
 }
 
 /// Why a question is none.
@@ -216,7 +238,9 @@ pub enum AdminError {
         word: &'static str,
     },
     /// A word that is not known.
-    #[error("{word:?} is nothing that this node can be asked: status, reload, crl, graph and tap are")]
+    #[error(
+        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, tap, publish and call are"
+    )]
     Unknown {
         /// The word.
         word: String,
@@ -241,7 +265,12 @@ pub(crate) fn bind_socket(path: &Path) -> io::Result<UnixListener> {
 }
 
 /// Answers until the node ends.
-pub(crate) async fn serve(listener: UnixListener, events: mpsc::Sender<CoreEvent>, reloader: Arc<Reloader>) {
+pub(crate) async fn serve(
+    listener: UnixListener,
+    events: mpsc::Sender<CoreEvent>,
+    reloader: Arc<Reloader>,
+    gateway: Arc<Gateway>,
+) {
     let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     let taps = Arc::new(Semaphore::new(TAPS_MAX));
     while let Ok(place) = places.clone().acquire_owned().await {
@@ -250,9 +279,10 @@ pub(crate) async fn serve(listener: UnixListener, events: mpsc::Sender<CoreEvent
             return;
         }
         let (events, reloader, taps) = (events.clone(), reloader.clone(), taps.clone());
+        let gateway = gateway.clone();
         tokio::spawn(async move {
             if is_ours(&stream) {
-                answer(stream, &events, &reloader, &taps).await;
+                answer(stream, &events, &reloader, &taps, &gateway).await;
             }
             drop(place);
         });
@@ -270,10 +300,11 @@ async fn answer(
     events: &mpsc::Sender<CoreEvent>,
     reloader: &Reloader,
     taps: &Semaphore,
+    gateway: &Gateway,
 ) {
     let request = read_line(&mut stream).await.and_then(|line| AdminRequest::parse(&line));
     let text = match request {
-        Ok(AdminRequest::Status) => match status(events).await {
+        Ok(AdminRequest::Status) => match status(events, gateway).await {
             Some(text) => text,
             None => return,
         },
@@ -288,7 +319,18 @@ async fn answer(
                 Err(why) => envelope(Err(why)),
             }
         }
-        Ok(request) => envelope(carry_out(request, events, reloader).await),
+        Ok(AdminRequest::Publish(wish)) => {
+            let Ok(_place) = taps.try_acquire() else {
+                let many = envelope(Err(format!("{TAPS_MAX} topics are looked at or published on already")));
+                let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(many.as_bytes())).await;
+                return;
+            };
+            if let Err(error) = shell::publish(gateway, wish, stream, envelope).await {
+                debug!(%error, "who published at the status socket went away");
+            }
+            return;
+        }
+        Ok(request) => envelope(carry_out(request, events, reloader, gateway).await),
         Err(error) => envelope(Err(error.to_string())),
     };
     let write = async {
@@ -326,10 +368,12 @@ async fn read_line(stream: &mut UnixStream) -> Result<Vec<u8>, AdminError> {
     }
 }
 
-async fn status(events: &mpsc::Sender<CoreEvent>) -> Option<String> {
+async fn status(events: &mpsc::Sender<CoreEvent>, gateway: &Gateway) -> Option<String> {
     let (reply, status) = oneshot::channel();
     events.send(CoreEvent::Status(reply)).await.ok()?;
-    serde_json::to_string(&status.await.ok()?).ok()
+    let mut status = status.await.ok()?;
+    status.gateway = gateway.status().await;
+    serde_json::to_string(&status).ok()
 }
 
 async fn begin_tap(wish: TapWish, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
@@ -377,18 +421,21 @@ async fn carry_out(
     request: AdminRequest,
     events: &mpsc::Sender<CoreEvent>,
     reloader: &Reloader,
+    gateway: &Gateway,
 ) -> Result<String, String> {
     let stopping = || "the node is stopping".to_owned();
     match request {
-        AdminRequest::Status => status(events).await.ok_or_else(stopping),
+        AdminRequest::Status => status(events, gateway).await.ok_or_else(stopping),
         AdminRequest::Graph(name) => {
             let (reply, graph) = oneshot::channel();
             events.send(CoreEvent::Graph(name, reply)).await.map_err(|_| stopping())?;
             let graph = graph.await.map_err(|_| stopping())?;
             serde_json::to_string(&graph).map_err(|error| error.to_string())
         }
-        // It is not answered in one line.
+        // They are not answered in one line.
         AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
+        AdminRequest::Publish(_) => Err(AdminError::Argument { word: "publish" }.to_string()),
+        AdminRequest::Call(wish) => shell::call(gateway, &wish).await,
         AdminRequest::Reload => {
             let report = reloader.reload("sgc reload").await?;
             serde_json::to_string(&report).map_err(|error| error.to_string())
@@ -435,6 +482,13 @@ mod tests {
             AdminRequest::Graph(Some(Name([0xab; 32]))),
             tap(None),
             tap(Some(Side::Sent)),
+            AdminRequest::Publish(PublishWish {
+                topic: "/a".into(),
+                wait_for: 1,
+                depth: Some(3),
+                ..Default::default()
+            }),
+            AdminRequest::Call(CallWish { request: "{\"a\":\n1}".into(), ..Default::default() }),
         ] {
             let line = request.to_line();
             assert!(line.ends_with('\n') && line.len() <= ADMIN_LINE_BYTES_MAX);
@@ -474,6 +528,7 @@ mod tests {
             (b"sgc/1 tap any -1 /a", AdminError::Argument { word: "tap" }),
             (b"sgc/1 tap both 1 /a", AdminError::Argument { word: "tap" }),
             (b"sgc/1 tap any 1 /a b", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 publish /a", AdminError::Argument { word: "publish" }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {
             assert_eq!(AdminRequest::parse(line), Err(error), "{}", line.escape_ascii());

@@ -704,6 +704,8 @@ impl<N: RosNetwork> Core<N> {
                 routed_names: router.routed_names,
                 branches: router.branches,
             },
+            // The core knows nothing of it.
+            gateway: None,
         }
     }
 }

@@ -5,6 +5,7 @@
 //! beside it, on the tasks and threads that receive.
 #![forbid(unsafe_code)]
 
+mod access;
 pub mod admin;
 #[cfg(test)]
 mod allocations;
@@ -21,6 +22,7 @@ mod dataplane;
 mod file_watch;
 mod finding;
 mod fleet_file;
+mod gateway;
 pub mod graph;
 mod heart;
 mod labels;
@@ -38,6 +40,7 @@ mod replays;
 mod roaming;
 mod rules;
 mod shaper;
+pub mod shell;
 mod sinks;
 mod sources;
 mod state;
@@ -46,8 +49,10 @@ mod status;
 mod tap;
 mod tell;
 
+pub use access::{ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with};
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
+pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use node::{
     NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
 };

@@ -12,6 +12,7 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
+use sgc_gateway::LocalRos;
 use sgc_ros::{RosError, RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
@@ -29,6 +30,7 @@ use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
 use crate::file_watch::FileWatch;
 use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
+use crate::gateway::{Gateway, OpenLocalRos};
 use crate::heart::Patience;
 use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
@@ -163,6 +165,8 @@ pub struct RunOptions {
     pub file: Option<PathBuf>,
     /// The port of mDNS, if not its own: so that tests have a local network each.
     pub mdns_port: Option<u16>,
+    /// Opens the gateway's part of the local network; [`run`] sets it by itself.
+    pub gateway: Option<OpenLocalRos>,
 }
 
 /// Reads an identity file, which must be its owner's alone.
@@ -252,7 +256,12 @@ pub async fn run(
         Some(ros) => Some(Arc::new(CycloneNetwork::open(&dds_config(ros, &identity))?)),
         None => None,
     };
-    run_on(config, identity, network, options, shutdown).await
+    let gateway = config.ros.as_ref().map(|ros| -> OpenLocalRos {
+        // An ordinary participant, whose topics the node's own sees as any program's.
+        let config = DdsConfig { tag: None, ..dds_config(ros, &identity) };
+        Arc::new(move || CycloneNetwork::open(&config).map(|network| Arc::new(network) as Arc<dyn LocalRos>))
+    });
+    run_on(config, identity, network, RunOptions { gateway, ..options }, shutdown).await
 }
 
 /// [`run`] with an identity and a local network that are there already.
@@ -416,6 +425,7 @@ pub async fn run_on<N: RosNetwork>(
         };
         accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
     }
+    let gateway = Gateway::new(options.gateway, identity.node_name().as_str(), sgc_gateway::Shipped);
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     let reloader = Arc::new(Reloader {
         source: options.source,
@@ -443,7 +453,12 @@ pub async fn run_on<N: RosNetwork>(
         tasks.push(tokio::spawn(watch.run(reloader.clone())));
     }
     match admin::bind_socket(&socket) {
-        Ok(listener) => tasks.push(tokio::spawn(admin::serve(listener, events.clone(), reloader.clone()))),
+        Ok(listener) => tasks.push(tokio::spawn(admin::serve(
+            listener,
+            events.clone(),
+            reloader.clone(),
+            gateway.clone(),
+        ))),
         Err(error) => warn!(path = %socket.display(), %error, "no status socket"),
     }
     audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
@@ -456,6 +471,7 @@ pub async fn run_on<N: RosNetwork>(
     if let Some(local) = &local {
         local.say_goodbye().await;
     }
+    gateway.stop().await;
     let stop = async {
         let (reply, flows) = oneshot::channel();
         let _ = events.send(CoreEvent::Quiesce(reply)).await;

@@ -39,11 +39,7 @@ pub struct Verdict {
 
 /// The policy of a share.
 pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Policy {
-    let all = |recipients: &[Recipient]| {
-        let mut all = Grantees::default();
-        recipients.iter().for_each(|recipient| add(&mut all, recipient, identity, partners));
-        all
-    };
+    let all = |recipients: &[Recipient]| grantees(recipients, identity, partners);
     let mut policy = Policy { subscribe: all(&share.to), publish: all(&share.publish) };
     // Tokens are for topics.
     if share.interface != Interface::Topic {
@@ -146,6 +142,13 @@ fn tokens_of<'p>(
     partners.tokens.iter().filter(|grant| {
         grant.topic == share.topic && share.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
     })
+}
+
+/// Whom these words name.
+pub(crate) fn grantees(recipients: &[Recipient], identity: &Identity, partners: &Partners) -> Grantees {
+    let mut all = Grantees::default();
+    recipients.iter().for_each(|recipient| add(&mut all, recipient, identity, partners));
+    all
 }
 
 fn add(set: &mut Grantees, recipient: &Recipient, identity: &Identity, partners: &Partners) {

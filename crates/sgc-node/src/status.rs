@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::Ordering::Relaxed;
 
 use serde::Serialize;
+use sgc_gateway::GatewayStatus;
 use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
@@ -35,6 +36,8 @@ pub struct Status {
     pub refused: BTreeMap<String, u64>,
     /// How much the router knows.
     pub router: RouterLine,
+    /// Programs without ROS, if they may connect.
+    pub gateway: Option<GatewayStatus>,
 }
 
 /// A link.

@@ -6,10 +6,11 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use sgc_gateway::{Anonymous, Right};
 use sgc_node::config::{
-    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, Mistake, Naming, Origin, Recipient,
-    Rename, RotationConfig, SHARES_MAX, SUITES, Shaping, Table, TokenConfig, TokenSource, TransportConfig,
-    load, load_args, parse,
+    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Mistake, Naming, Origin,
+    Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, Shaping, Table, TokenConfig, TokenSource,
+    TransportConfig, load, load_args, parse,
 };
 use sgc_transport::Congestion;
 use sgc_trust::Suite;
@@ -199,7 +200,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ),
         (
             "[[share]]\ntopic = '/a'\nto = ['b']\nlisten = []",
-            &["node.toml:6: [[share]] has no key `listen`; it belongs in [router]"],
+            &["node.toml:6: [[share]] has no key `listen`; it belongs in [gateway] or [router]"],
         ),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\nto = ['c']",
@@ -442,7 +443,7 @@ fn tables_and_values_of_the_wrong_type_are_told() {
         (
             "use = ['a']",
             &[
-                "node.toml:3: `use` is a string ('a'); it takes tables: [[share]], [[use]] or [[partner]], and the keys below",
+                "node.toml:3: `use` is a string ('a'); it takes tables: [[share]], [[use]], [[partner]] or [[gateway.client]], and the keys below",
             ],
         ),
         (
@@ -1234,7 +1235,7 @@ fn syntax_errors_have_their_lines() {
 #[test]
 fn all_mistakes_are_told_in_the_order_of_the_file() {
     let errors = parse_with(
-        "[[use]]\nfrom = 'Desk'\ntopic = 'cmd_vel'\n[[share]]\ntopic = '/a'\nto = []\n[ros]\ndomian_id = 1\n[gateway]\n",
+        "[[use]]\nfrom = 'Desk'\ntopic = 'cmd_vel'\n[[share]]\ntopic = '/a'\nto = []\n[ros]\ndomian_id = 1\n[profile]\n",
         &[("ROS_DOMAIN_ID", "x")],
     )
     .unwrap_err();
@@ -1253,6 +1254,227 @@ fn all_mistakes_are_told_in_the_order_of_the_file() {
         ]
     );
     assert_eq!(errors.to_string().lines().count(), errors.iter().count());
+}
+
+#[test]
+fn a_gateway_is_for_programs_of_this_host_unless_it_says_more() {
+    let config = good(&format!("{NODE}[gateway]\n"));
+    assert_eq!(config.gateway, Some(GatewayConfig::default()));
+    assert!(config.ros.is_some(), "a gateway is one to a ROS network");
+    let gateway = config.gateway.unwrap();
+    assert_eq!(
+        texts(&gateway.listen),
+        ["ws://127.0.0.1:9090", "ws://127.0.0.1:8765", "grpc://127.0.0.1:50051"]
+    );
+    assert_eq!((gateway.clients_max, gateway.client_bytes_max), (512, 64 << 20));
+    assert_eq!(gateway.warnings(), [""; 0]);
+    assert_eq!(good(NODE).gateway, None);
+}
+
+#[test]
+fn every_key_of_a_gateway_is_taken_over() {
+    let config = good(&format!(
+        r#"{NODE}
+        [[partner]]
+        name = "acme"
+        ca = "acme-ca.pem"
+        [gateway]
+        listen = ["wss://0.0.0.0:443", "grpcs://[::]", "ws://10.0.0.1"]
+        certificate = "robot.pem"
+        key = "robot.key"
+        anonymous = "all"
+        origins = ["https://Dash.example.org:443"]
+        plain = true
+        msg_dirs = ["msgs", "/opt/msgs"]
+        clients_max = 16
+        client_bytes_max = "1MiB"
+        [[gateway.client]]
+        who = ["desk", "group:operators", "partner:acme"]
+        subscribe = ["/**"]
+        [[gateway.client]]
+        who = ["*"]
+        publish = ["/cmd_vel"]
+        call = ["/plan"]
+        serve = ["/arm/*"]
+        "#
+    ));
+    let gateway = config.gateway.unwrap();
+    assert_eq!(texts(&gateway.listen), ["wss://0.0.0.0:443", "grpcs://[::]:50051", "ws://10.0.0.1:9090"]);
+    let tls = gateway.tls.as_ref().unwrap();
+    assert_eq!(
+        (&*tls.certificate, &*tls.key),
+        (Path::new("/etc/sgc/robot.pem"), Path::new("/etc/sgc/robot.key"))
+    );
+    assert_eq!((gateway.anonymous, gateway.plain), (Anonymous::All, true));
+    assert_eq!(texts(&gateway.origins), ["https://dash.example.org"]);
+    assert_eq!(gateway.msg_dirs, [PathBuf::from("/etc/sgc/msgs"), PathBuf::from("/opt/msgs")]);
+    assert_eq!((gateway.clients_max, gateway.client_bytes_max), (16, 1 << 20));
+    assert_eq!(gateway.clients.len(), 2);
+    assert_eq!(texts(&gateway.clients[0].who), ["desk", "group:operators", "partner:acme"]);
+    assert_eq!(gateway.clients[1].scope.to_string(), "publish /cmd_vel; call /plan; serve /arm/*");
+    assert!(gateway.clients[0].scope.permits(Right::Subscribe, "/a/b"));
+    let warnings = gateway.warnings();
+    assert!(
+        warnings[0].contains("anonymous = \"all\": whoever reaches wss://0.0.0.0:443 may"),
+        "{warnings:?}"
+    );
+    assert!(warnings[1].contains("ws://10.0.0.1:9090 is not encrypted"), "{warnings:?}");
+}
+
+#[test]
+fn mistakes_in_a_gateway_are_told() {
+    check_all(&[
+        (
+            "[gateway]\nlisten = ['ws://0.0.0.0:9090', 'grpc://127.0.0.1', 'grpc://[::]']",
+            &[
+                "node.toml:4: `listen` is \"ws://0.0.0.0:9090\": other hosts may connect, and nothing is encrypted, so that \
+                 anybody on the way can read and change everything, tokens too: write \"wss://0.0.0.0:9090\", listen at \
+                 127.0.0.1, or say `plain = true` if the network is one that you trust",
+                "node.toml:4: `listen` is \"grpc://[::]\": other hosts may connect, and nothing is encrypted, so that \
+                 anybody on the way can read and change everything, tokens too: write \"grpcs://[::]:50051\", listen at \
+                 127.0.0.1, or say `plain = true` if the network is one that you trust",
+            ],
+        ),
+        (
+            "[gateway]\nlisten = ['ws://localhost', 'http://127.0.0.1']",
+            &[
+                "node.toml:4: `listen` is \"ws://localhost\"; it listens at an IP address, not at a name: \
+                 \"ws://127.0.0.1:9090\"",
+                "node.toml:4: `listen` is \"http://127.0.0.1\"; it takes ws://, wss://, grpc:// and grpcs://, such as \
+                 \"ws://127.0.0.1:9090\"",
+            ],
+        ),
+        (
+            "[gateway]\nlisten = []",
+            &[
+                "node.toml:4: `listen` is empty; give it a value, such as listen = [\"ws://127.0.0.1:9090\"], or leave it out \
+                 to listen at the usual ports of this host",
+            ],
+        ),
+        (
+            "[gateway]\nlisten = ['ws://127.0.0.1', 'ws://127.0.0.1:9090']",
+            &["node.toml:4: `listen` names \"ws://127.0.0.1:9090\" twice; once is enough"],
+        ),
+        (
+            "[gateway]\ncertificate = 'a.pem'",
+            &[
+                "node.toml:4: `certificate` needs `key` beside it: give both, or neither for the node's own certificate",
+            ],
+        ),
+        (
+            "[gateway]\ncertificate = 'a.pem'\nkey = 'a.key'",
+            &[
+                "node.toml:4: `certificate` is for wss:// and grpcs://, and `listen` has neither: take it out, or listen there",
+            ],
+        ),
+        (
+            "[gateway]\nanonymous = 'any'\norigins = ['null', '*']",
+            &[
+                "node.toml:4: `anonymous` is \"any\"; it takes \"local\", \"none\", \"all\"",
+                "node.toml:5: `origins` names \"null\"; \"null\" is what pages of anywhere can be made to say: name where the \
+                 page is from",
+                "node.toml:5: `origins` names \"*\"; it is no origin of pages: write \"https://dashboard.example.org\", with \
+                 :PORT behind it if there is one",
+            ],
+        ),
+        (
+            "[gateway]\nclients_max = 0\nclient_bytes_max = '64MB'",
+            &[
+                "node.toml:4: `clients_max` is 0; it takes a number of clients from 1 to 65536",
+                "node.toml:5: `client_bytes_max` is \"64MB\"; it takes a number with KiB, MiB or GiB, from \"64KiB\" to \
+                 \"16GiB\"",
+            ],
+        ),
+        (
+            "[[gateway.client]]\nwho = ['partner:acme']\nsubscribe = ['odom']",
+            &[
+                "node.toml:4: `who` names partner \"acme\", which no [[partner]] describes: add [[partner]] with name = \"acme\" and \
+                 ca = \"FILE\"",
+                "node.toml:5: `subscribe` is \"odom\"; a topic name starts with '/': \"/odom\"",
+            ],
+        ),
+        (
+            "[[gateway.client]]\nwho = ['desk']",
+            &[
+                "node.toml:3: [[gateway.client]]: it permits nothing: name at least one interface to subscribe to, publish on, \
+                 call or serve",
+            ],
+        ),
+        (
+            "[[gateway.client]]\nsubscribe = ['/a']",
+            &[
+                "node.toml:3: [[gateway.client]] has no `who`; add one, such as who = [\"desk\", \"group:operators\"]",
+            ],
+        ),
+        (
+            "[[gateway.client]]\nwho = ['desk']\nsubscribe = 1",
+            &[
+                "node.toml:5: `subscribe` is an integer (1); it takes an array of strings, such as [\"/odom\", \"/camera/**\"]",
+            ],
+        ),
+        (
+            "[gateway]\nclient = 1",
+            &[
+                "node.toml:4: `gateway.client` is an integer (1); it takes tables: [[share]], [[use]], [[partner]] or \
+             [[gateway.client]], and the keys below",
+            ],
+        ),
+        (
+            "[gateway.client]\nwho = ['desk']\nsubscribe = ['/a']",
+            &[
+                "node.toml:3: `gateway.client` is one table but may occur many times; write [[gateway.client]]",
+            ],
+        ),
+        (
+            "[[gateway]]\n",
+            &["node.toml:3: `gateway` is an array of tables but may occur only once; write [gateway]"],
+        ),
+        (
+            "[gateway]\nport = 9090",
+            &[
+                "node.toml:4: [gateway] has no key `port`; it has `listen`, `certificate`, `key`, `anonymous`, `origins`, `plain`, \
+             `msg_dirs`, `clients_max`, `client_bytes_max`, `client`",
+            ],
+        ),
+    ]);
+}
+
+#[test]
+fn files_of_a_gateway_are_looked_at() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, key) = (dir.path().join("node.toml"), dir.path().join("robot.key"));
+    let identity = dir.path().join("x");
+    for path in [&identity, &key] {
+        fs::write(path, "nothing").unwrap();
+        fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();
+    }
+    fs::write(dir.path().join("robot.pem"), "nothing").unwrap();
+    let gateway = "[gateway]\nlisten = ['wss://127.0.0.1']\ncertificate = 'robot.pem'\nkey = 'robot.key'\n";
+    fs::write(&file, format!("{NODE}{gateway}msg_dirs = ['msgs', 'robot.pem']")).unwrap();
+    let told = || -> Vec<String> {
+        let place = dir.path().display().to_string();
+        let errors = load(&file, &no_env).unwrap_err();
+        errors.iter().map(|error| error.to_string().replace(&place, "DIR")).collect()
+    };
+    let said = told();
+    let lines: Vec<_> = said.iter().map(|line| &line[..16]).collect();
+    assert_eq!(lines, ["DIR/node.toml:5:", "DIR/node.toml:6:", "DIR/node.toml:7:", "DIR/node.toml:7:"]);
+    assert!(said[0].contains("no certificate is in it"), "{}", said[0]);
+    assert!(said[1].contains("no private key is in it"), "{}", said[1]);
+    assert!(said[2].contains("DIR/msgs: No such file") && said[3].contains("not a directory"), "{said:?}");
+    fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
+    assert!(told()[1].contains("its mode 0644 lets others at the gateway's private key"), "{}", told()[1]);
+}
+
+#[test]
+fn an_argument_turns_a_gateway_on() {
+    let config = Config::from_args(
+        &args(&[("identity", "x"), ("router", "quic://r:7447"), ("gateway", "yes")]),
+        &no_env,
+    )
+    .unwrap();
+    assert_eq!(config.gateway, Some(GatewayConfig::default()));
+    assert!(config.ros.is_some());
 }
 
 #[test]
@@ -1307,6 +1529,7 @@ fn args(args: &[(&str, &str)]) -> ArgsConfig {
         peers: all("peer"),
         announce: !all("announce").is_empty(),
         accept: all("accept").iter().map(PathBuf::from).collect(),
+        gateway: !all("gateway").is_empty(),
     }
 }
 

@@ -6,8 +6,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use sgc_gateway::Anonymous;
 use sgc_node::config::{
-    self, Config, DiscoveryRange, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
+    self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
+    TokenSource,
 };
 use sgc_trust::Identity;
 
@@ -127,7 +129,44 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
         };
         row("partner", format!("{}, {nodes}, CA in {}", partner.name, partner.ca.display()));
     }
+    if let Some(gateway) = &config.gateway {
+        rows.extend(gateway_rows(gateway));
+    }
     Ok(rows)
+}
+
+/// Where programs without ROS connect, who they may be, and what of it an operator should know.
+fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
+    let mut rows = Vec::new();
+    let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
+    let listen: Vec<_> = gateway.listen.iter().map(ToString::to_string).collect();
+    row("gateway", listen.join(", "));
+    if let Some(tls) = &gateway.tls {
+        row("", format!("shows the certificate in {}", tls.certificate.display()));
+    }
+    row(
+        "",
+        match gateway.anonymous {
+            Anonymous::Local => {
+                "programs of this host may do everything; others show a token or a certificate"
+            }
+            Anonymous::None => "programs show a token or a certificate, those of this host too",
+            Anonymous::All => "whoever reaches it may do everything",
+        }
+        .to_owned(),
+    );
+    if !gateway.origins.is_empty() {
+        let origins: Vec<_> = gateway.origins.iter().map(ToString::to_string).collect();
+        row("", format!("pages of {} may connect without a token", origins.join(", ")));
+    }
+    for client in &gateway.clients {
+        let who: Vec<_> = client.who.iter().map(ToString::to_string).collect();
+        row("", format!("certificates of {}: {}", who.join(", "), client.scope));
+    }
+    for warning in gateway.warnings() {
+        row("warning", warning);
+    }
+    rows
 }
 
 fn type_of(type_name: Option<&str>) -> String {

@@ -9,9 +9,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+use sgc_gateway::AccessTokenError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
-use sgc_node::{FleetFileError, NodeError, RulesError, StateError};
+use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
 use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
@@ -204,6 +205,12 @@ pub(crate) enum CliError {
     /// The state directory.
     #[error(transparent)]
     State(#[from] StateError),
+    /// Access tokens that were made.
+    #[error(transparent)]
+    Access(#[from] AccessError),
+    /// An access token that cannot be made.
+    #[error("such a token cannot be made: {0}")]
+    AccessToken(#[from] AccessTokenError),
     /// A text that is no token.
     #[error("the token cannot be used: {0}")]
     Token(#[from] TokenError),
@@ -336,6 +343,8 @@ impl CliError {
             | Self::Partner(_)
             | Self::Rules(_)
             | Self::State(_)
+            | Self::Access(_)
+            | Self::AccessToken(_)
             | Self::Token(_)
             | Self::Cannot { .. } => EXIT_USAGE,
             Self::Node(NodeError::Listen { .. } | NodeError::Ros(_) | NodeError::Randomness(_)) => {

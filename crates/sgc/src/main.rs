@@ -21,11 +21,14 @@ mod output;
 mod policy;
 mod reload;
 mod run;
+mod service;
 mod share_token;
 mod status;
+mod token;
 mod topic;
 mod use_token;
 mod why;
+mod yaml;
 
 use std::process::ExitCode;
 
@@ -57,10 +60,12 @@ enum Command {
     Check(check::CheckArgs),
     Status(status::StatusArgs),
     Topic(topic::TopicArgs),
+    Service(service::ServiceArgs),
     Why(why::WhyArgs),
     Reload(reload::ReloadArgs),
     Audit(audit::AuditArgs),
     Policy(policy::PolicyArgs),
+    Token(token::TokenArgs),
     ShareToken(share_token::ShareTokenArgs),
     Use(use_token::UseArgs),
     Name(name::NameArgs),
@@ -89,10 +94,12 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Check(args) => check::check(&args),
         Command::Why(args) => return why::why(&args),
         Command::Topic(args) => return topic::topic(&args),
+        Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
         Command::Reload(args) => reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),
+        Command::Token(args) => token::token(&args),
         Command::ShareToken(args) => share_token::share_token(&args),
         Command::Use(args) => use_token::use_token(&args),
         Command::Name(args) => name::name(&args),

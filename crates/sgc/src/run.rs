@@ -34,7 +34,7 @@ const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 pub(crate) struct RunArgs {
     /// The configuration
     #[arg(short, long, value_name = "FILE",
-          conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen", "announce"])]
+          conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen", "announce", "gateway"])]
     config: Option<PathBuf>,
     /// The identity that `sgc fleet enroll` made
     #[arg(long, value_name = "FILE")]
@@ -59,6 +59,9 @@ pub(crate) struct RunArgs {
     /// Tell the local network by mDNS that a router is here
     #[arg(long, requires = "listen")]
     announce: bool,
+    /// Let programs of this host without ROS connect: rosbridge protocol and Foxglove at 9090 and 8765, gRPC at 50051
+    #[arg(long)]
+    gateway: bool,
     #[command(flatten)]
     process: ProcessArgs,
 }
@@ -121,6 +124,7 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
         uses: args.uses,
         listen: args.listen,
         announce: args.announce,
+        gateway: args.gateway,
         ..ArgsConfig::default()
     };
     let what = args.config.as_ref().map_or("command line".to_owned(), |path| path.display().to_string());

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use sgc_gateway::{AccessToken, Right};
 use sgc_trust::{Identity, ShareToken, derive_name};
 use sgc_wire::Metadata;
 use tempfile::TempDir;
@@ -393,6 +394,75 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     }
     let said = place.bad(2, &[&give[..5], &["--to", "lab-ca.pem", "--type", POSE]].concat());
     assert!(said.contains("its nodes need no token"), "{said}");
+}
+
+#[test]
+fn a_program_without_ros_gets_a_token_that_is_taken_back() {
+    let place = Place::new();
+    let create = ["token", "create", "-c", "arm-1.toml", "--for", "dashboard"];
+    let said = place.bad(2, &create);
+    assert!(said.contains("it permits nothing: name at least one interface"), "{said}");
+    let said = place.bad(2, &[&create[..], &["--subscribe", "odom"]].concat());
+    assert!(said.contains("\"odom\" is neither the full name of an interface"), "{said}");
+    place.bad(2, &[&create[..], &["--subscribe", "/odom", "--valid", "4000d"]].concat());
+    assert!(!place.path("state/access.json").exists(), "nothing was made");
+
+    let may =
+        ["--subscribe", "/odom", "--subscribe", "/camera/**", "--publish", "/cmd_vel", "--valid", "12h"];
+    let ran = place.run(&[&create[..], &may].concat());
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    assert!(ran.stderr.contains("subscribe /odom /camera/**; publish /cmd_vel"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("has no [gateway] yet"), "{}", ran.stderr);
+    let arm = place.identity("arm-1.identity");
+    let token = AccessToken::parse(&ran.stdout).unwrap();
+    let grant = token.verify(arm.as_peer()).unwrap();
+    assert!(grant.scope.permits(Right::Subscribe, "/camera/front/image"));
+    assert!(!grant.scope.permits(Right::Publish, "/camera/front/image"));
+    assert_eq!(grant.expires.0 - grant.issued.0, 12 * 3_600_000);
+    assert_eq!(place.mode("state/access.json"), 0o600);
+    let records = place.read("state/access.json");
+    assert!(!records.contains("sgc-access") && records.contains(&grant.id.to_string()), "{records}");
+
+    let into = ["--for", "teleop", "--call", "/plan", "--out", "teleop.token"];
+    let make = [&create[..4], &into].concat();
+    assert_eq!(place.good(&make), "", "it is in the file alone");
+    assert_eq!(place.mode("teleop.token"), 0o600);
+    let second = AccessToken::parse(&place.read("teleop.token")).unwrap().id();
+    let said = place.bad(2, &make);
+    assert!(said.contains("teleop.token exists already"), "{said}");
+
+    let list = ["token", "list", "-c", "arm-1.toml"];
+    let listed = place.good(&list);
+    assert!(listed.contains("dashboard") && listed.contains("call /plan"), "{listed}");
+    assert_eq!(listed.lines().count(), 3, "{listed}");
+    let said = place.bad(2, &["token", "revoke", "-c", "arm-1.toml", "0000"]);
+    assert!(said.contains("no access token begins with"), "{said}");
+    let id = grant.id.to_string();
+    let said = place.good(&["token", "revoke", "-c", "arm-1.toml", &id[..12]]);
+    assert!(said.contains("for dashboard is revoked") && said.contains("next start"), "{said}");
+    let json = place.good(&[&list[..], &["--json"]].concat());
+    let tokens: Vec<Value> = serde_json::from_str(&json).unwrap();
+    let revoked: Vec<_> = tokens.iter().filter(|token| !token["revoked"].is_null()).collect();
+    assert_eq!((revoked.len(), &revoked[0]["id"]), (1, &id.as_str().into()));
+    assert!(tokens.iter().any(|token| token["id"] == second.to_string().as_str()));
+}
+
+#[test]
+fn check_says_who_may_connect_to_a_gateway() {
+    let place = Place::new();
+    let before = place.read("arm-1.toml");
+    let gateway = "\n[gateway]\nlisten = ['grpcs://0.0.0.0']\nanonymous = 'all'\n\
+                   [[gateway.client]]\nwho = ['desk']\nsubscribe = ['/odom']\n";
+    place.write("arm-1.toml", &format!("{before}{gateway}"));
+    let said = place.good(&["check", "-c", "arm-1.toml"]);
+    for part in [
+        "gateway   grpcs://0.0.0.0:50051",
+        "whoever reaches it may do everything",
+        "certificates of desk: subscribe /odom",
+        "anonymous = \"all\": whoever reaches grpcs://0.0.0.0:50051 may receive",
+    ] {
+        assert!(said.contains(part), "{part}\n{said}");
+    }
 }
 
 #[test]

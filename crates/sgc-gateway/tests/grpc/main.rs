@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod gateway;
+mod programs;
 #[path = "../support/mod.rs"]
 mod support;
 

@@ -8,7 +8,8 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use super::draft::{
-    AuditDraft, Draft, Located, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft, Words,
+    AuditDraft, Draft, GatewayDraft, Located, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
+    Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 
@@ -43,6 +44,8 @@ pub struct ArgsConfig {
     pub announce: bool,
     /// `--accept FILE`, any number.
     pub accept: Vec<PathBuf>,
+    /// `--gateway`: a `[gateway]` with nothing in it.
+    pub gateway: bool,
 }
 
 /// Takes the arguments apart.
@@ -117,6 +120,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         audit: AuditDraft::default(),
         transport: TransportDraft::default(),
         partners: Vec::new(),
+        gateway: args.gateway.then(GatewayDraft::default),
     };
     (draft, errors)
 }

@@ -69,6 +69,7 @@ pub(super) struct Draft {
     pub(super) audit: AuditDraft,
     pub(super) transport: TransportDraft,
     pub(super) partners: Vec<PartnerDraft>,
+    pub(super) gateway: Option<GatewayDraft>,
 }
 
 /// How a source of configuration names the settings that an error may ask for.
@@ -170,6 +171,36 @@ pub(super) struct TransportDraft {
     pub(super) mtu_discovery: Option<Located<bool>>,
     pub(super) dscp: Option<Located<String>>,
     pub(super) lane_dscp: Option<Located<String>>,
+}
+
+/// `[gateway]`.
+#[derive(Debug, Default)]
+pub(super) struct GatewayDraft {
+    /// The whole list is located too, since an empty one would be a mistake.
+    pub(super) listen: Option<Located<Vec<Located<String>>>>,
+    pub(super) certificate: Option<Located<PathBuf>>,
+    pub(super) key: Option<Located<PathBuf>>,
+    pub(super) anonymous: Option<Located<String>>,
+    pub(super) origins: Vec<Located<String>>,
+    pub(super) plain: Option<Located<bool>>,
+    pub(super) msg_dirs: Vec<Located<String>>,
+    pub(super) clients_max: Option<Located<i64>>,
+    pub(super) client_bytes_max: Option<Located<String>>,
+    pub(super) clients: Vec<GatewayClientDraft>,
+}
+
+/// `[[gateway.client]]`. What is required is `None` only where an error has been recorded already.
+#[derive(Debug)]
+pub(super) struct GatewayClientDraft {
+    /// The place of what is missing.
+    pub(super) origin: Origin,
+    pub(super) who: Option<Located<Vec<Located<String>>>>,
+    pub(super) subscribe: Vec<Located<String>>,
+    pub(super) publish: Vec<Located<String>>,
+    pub(super) call: Vec<Located<String>>,
+    pub(super) serve: Vec<Located<String>>,
+    /// A list of patterns is there, but could not be read.
+    pub(super) is_broken: bool,
 }
 
 /// `[[partner]]`. What is required is `None` only where an error has been recorded already.

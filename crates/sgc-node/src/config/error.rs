@@ -8,9 +8,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use sgc_gateway::{PageOriginError, ScopeError};
 use sgc_transport::UrlError;
 use sgc_trust::TokenError;
 
+use super::gateway::{GatewayUrl, GatewayUrlError, size_text};
 use super::names::{duration_text, rate_text};
 use super::router_url::RouterUrlError;
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
@@ -525,6 +527,78 @@ pub enum Mistake {
         value: String,
         /// The address.
         host: String,
+    },
+    /// No address for a gateway.
+    #[error("`{key}` is {value:?}; {fault}")]
+    GatewayUrl {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What is wrong with it.
+        fault: GatewayUrlError,
+    },
+    /// A gateway for other hosts that is not encrypted.
+    #[error(
+        "`{key}` is {value:?}: other hosts may connect, and nothing is encrypted, so that anybody on the way can read and \
+         change everything, tokens too: write \"{}s://{}\", listen at 127.0.0.1, or say `plain = true` if the network is \
+         one that you trust",
+        url.scheme.as_str(),
+        url.address
+    )]
+    GatewayOpen {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What it means.
+        url: GatewayUrl,
+    },
+    /// No origin of pages.
+    #[error("`{key}` names {value:?}; {fault}")]
+    PageOrigin {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// What is wrong with it.
+        fault: PageOriginError,
+    },
+    /// Not a number of bytes, or out of bounds.
+    #[error(
+        "`{key}` is {value:?}; it takes a number with KiB, MiB or GiB, from \"{}\" to \"{}\"",
+        size_text(*min),
+        size_text(*max)
+    )]
+    Size {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The least, bytes.
+        min: u64,
+        /// The greatest, bytes.
+        max: u64,
+    },
+    /// Rights that are none.
+    #[error("[[gateway.client]]: {fault}")]
+    Scope {
+        /// What is wrong.
+        fault: ScopeError,
+    },
+    /// One of two keys that belong together.
+    #[error("`{key}` needs `{other}` beside it: give both, or neither for the node's own certificate")]
+    Alone {
+        /// The one that is there.
+        key: &'static str,
+        /// The one that is missing.
+        other: &'static str,
+    },
+    /// A certificate that nobody is shown.
+    #[error("`{key}` is for wss:// and grpcs://, and `listen` has neither: take it out, or listen there")]
+    CertificateUnused {
+        /// The key.
+        key: &'static str,
     },
     /// A value that only looks like on or off (ROS 2 reads only `1` as on).
     #[error(

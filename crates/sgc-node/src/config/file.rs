@@ -12,8 +12,8 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::draft::{
-    AuditDraft, Draft, Located, NamingDraft, PartnerDraft, RosDraft, RotationDraft, ShapingDraft, ShareDraft,
-    TransportDraft, UseDraft, Words,
+    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, Located, NamingDraft, PartnerDraft, RosDraft,
+    RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
@@ -91,6 +91,7 @@ impl FileReader<'_> {
         let rotation = self.single(&top, "rotation", Table::Rotation);
         let audit = self.single(&top, "audit", Table::Audit);
         let transport = self.single(&top, "transport", Table::Transport);
+        let gateway = self.single(&top, "gateway", Table::Gateway);
         let mut draft = Draft {
             origin: Origin::File { file: self.file.clone(), line: None },
             words: WORDS,
@@ -150,6 +151,7 @@ impl FileReader<'_> {
                 .iter()
                 .map(|partner| self.partner(partner))
                 .collect(),
+            gateway: gateway.map(|gateway| self.gateway(&gateway)),
         };
         draft.attempted = std::mem::take(&mut self.attempted);
         draft
@@ -312,6 +314,54 @@ impl FileReader<'_> {
         }
     }
 
+    fn gateway(&mut self, gateway: &Section<'_, '_>) -> GatewayDraft {
+        const FILES: &str = "a string, such as \"robot.pem\"";
+        let clients = self.repeated(gateway, "gateway.client", Table::GatewayClient);
+        let clients = clients.iter().map(|client| self.gateway_client(client)).collect();
+        let gateway = Some(gateway);
+        let mut file = |key| self.string(gateway, key, FILES).map(|written| written.map(PathBuf::from));
+        let (certificate, key) = (file("certificate"), file("key"));
+        GatewayDraft {
+            listen: self.strings(gateway, "listen", "an array of strings, such as [\"wss://0.0.0.0:9090\"]"),
+            certificate,
+            key,
+            anonymous: self.string(gateway, "anonymous", "a string, \"local\", \"none\" or \"all\""),
+            origins: self.flat_strings(
+                gateway,
+                "origins",
+                "an array of strings, such as [\"https://dashboard.example.org\"]",
+            ),
+            plain: self.boolean(gateway, "plain", "true or false"),
+            msg_dirs: self.flat_strings(
+                gateway,
+                "msg_dirs",
+                "an array of strings, such as [\"/opt/our_msgs\"]",
+            ),
+            clients_max: self.integer(gateway, "clients_max", "a number, such as 512"),
+            client_bytes_max: self.string(gateway, "client_bytes_max", "a string, such as \"64MiB\""),
+            clients,
+        }
+    }
+
+    fn gateway_client(&mut self, client: &Section<'_, '_>) -> GatewayClientDraft {
+        const PATTERNS: &str = "an array of strings, such as [\"/odom\", \"/camera/**\"]";
+        self.check_required(client, "who", "[\"desk\", \"group:operators\"]");
+        let origin = self.origin(client.span.clone());
+        let errors = self.errors.len();
+        let is_meant = !client.meant.is_empty();
+        let client = Some(client);
+        let who = self.strings(client, "who", "an array of strings, such as [\"desk\", \"group:operators\"]");
+        GatewayClientDraft {
+            origin,
+            who,
+            subscribe: self.flat_strings(client, "subscribe", PATTERNS),
+            publish: self.flat_strings(client, "publish", PATTERNS),
+            call: self.flat_strings(client, "call", PATTERNS),
+            serve: self.flat_strings(client, "serve", PATTERNS),
+            is_broken: is_meant || self.errors.len() > errors,
+        }
+    }
+
     /// The table `[key]`.
     fn single<'s, 't>(
         &mut self,
@@ -331,15 +381,17 @@ impl FileReader<'_> {
         None
     }
 
-    /// The tables `[[key]]`.
+    /// The tables `[[key]]`, of which `top` knows the last word.
     fn repeated<'s, 't>(
         &mut self,
         top: &Section<'s, 't>,
         key: &'static str,
         table: Table,
     ) -> Vec<Section<'s, 't>> {
-        const EXPECTED: &str = "tables: [[share]], [[use]] or [[partner]], and the keys below";
-        let Some(value) = top.entries.get(key) else { return Vec::new() };
+        const EXPECTED: &str =
+            "tables: [[share]], [[use]], [[partner]] or [[gateway.client]], and the keys below";
+        let name = key.rsplit('.').next().unwrap_or(key);
+        let Some(value) = top.entries.get(name) else { return Vec::new() };
         let mut sections = Vec::new();
         match value.get_ref() {
             DeValue::Array(array) => {

@@ -6,15 +6,27 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::Path;
 
+use rustls_pki_types::PrivateKeyDer;
+use rustls_pki_types::pem::PemObject as _;
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
 use super::error::Mistake;
 use super::resolve::{FileChecks, IdentityFile};
 use crate::{partners, state};
 
+/// Largest file of certificates or of a key for TLS, bytes.
+const PEM_BYTES_MAX: u64 = 256 * 1024;
+
 /// The checks of [`super::load`].
-pub(super) const FILES: FileChecks =
-    FileChecks { identity: check_identity, ca: check_ca, token: check_token, fleet: check_fleet };
+pub(super) const FILES: FileChecks = FileChecks {
+    identity: check_identity,
+    ca: check_ca,
+    token: check_token,
+    fleet: check_fleet,
+    chain: check_chain,
+    private_key: check_private_key,
+    directory: check_directory,
+};
 
 fn check_ca(key: &'static str, path: &Path) -> Result<(), Mistake> {
     const EXPECTED: &str = "a file of CA certificates in PEM, such as `sgc fleet show --ca` prints";
@@ -47,6 +59,46 @@ fn check_fleet(key: &'static str, path: &Path) -> Result<(), Mistake> {
         reason: error.to_string(),
         expected: "the file that `sgc fleet create` made, and that this user may read",
     })
+}
+
+fn check_chain(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    let read = fs::File::open(path).and_then(|file| {
+        let mut pem = Vec::new();
+        file.take(PEM_BYTES_MAX).read_to_end(&mut pem).map(|_| pem)
+    });
+    let reason = match read.map(|pem| partners::chain(&pem)) {
+        Ok(Ok(chain)) if !chain.is_empty() => return Ok(()),
+        Ok(Ok(_)) => "no certificate is in it".to_owned(),
+        Ok(Err(error)) => error.to_string(),
+        Err(error) => error.to_string(),
+    };
+    let expected = "a file of certificates in PEM, the server's own first";
+    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
+}
+
+fn check_private_key(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    private(key, path, "the gateway's private key")?;
+    let read = fs::File::open(path).and_then(|file| {
+        let mut pem = zeroize::Zeroizing::new(Vec::with_capacity(PEM_BYTES_MAX as usize));
+        file.take(PEM_BYTES_MAX).read_to_end(&mut pem).map(|_| pem)
+    });
+    let reason = match read {
+        Ok(pem) if PrivateKeyDer::from_pem_slice(&pem).is_ok() => return Ok(()),
+        Ok(_) => "no private key is in it".to_owned(),
+        Err(error) => error.to_string(),
+    };
+    let expected = "the private key of `certificate` in PEM, without a password";
+    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
+}
+
+fn check_directory(key: &'static str, path: &Path) -> Result<(), Mistake> {
+    let reason = match fs::metadata(path) {
+        Ok(found) if found.is_dir() => return Ok(()),
+        Ok(_) => "not a directory".to_owned(),
+        Err(error) => error.to_string(),
+    };
+    let expected = "a directory with message packages, such as PACKAGE/msg/NAME.msg";
+    Err(Mistake::File { key, path: path.to_owned(), reason, expected })
 }
 
 fn private(key: &'static str, path: &Path, what: &'static str) -> Result<(), Mistake> {

@@ -13,6 +13,7 @@ mod draft;
 mod error;
 mod file;
 mod files;
+mod gateway;
 mod names;
 mod resolve;
 mod ros_env;
@@ -34,6 +35,10 @@ use sgc_wire::{Class, NodeId};
 
 pub use args::ArgsConfig;
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
+pub use gateway::{
+    GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls, GatewayUrl,
+    GatewayUrlError, MSG_DIRS_MAX, ORIGINS_MAX,
+};
 pub use names::{
     FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, Recipient, TYPE_BYTES_MAX, parse_duration, parse_rate,
 };
@@ -110,6 +115,8 @@ pub struct Config {
     pub audit: AuditConfig,
     /// How links are made.
     pub transport: TransportConfig,
+    /// Programs without ROS on this node's network; none without `[gateway]`. Where it is there, so is `ros`.
+    pub gateway: Option<GatewayConfig>,
     /// Where the status socket goes, if not in its usual place.
     pub admin_socket: Option<PathBuf>,
 }

@@ -3,6 +3,8 @@
 //! All mistakes are collected. One that follows from another is not reported: a value that is wrong in itself
 //! takes no part in comparisons.
 
+mod gateway_table;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -72,6 +74,9 @@ pub(super) struct FileChecks {
     pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
     pub(super) token: fn(&'static str, &Path) -> Result<ShareToken, Mistake>,
     pub(super) fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) chain: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
+    pub(super) directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
 
 /// Judges a draft whose reader found `errors` already. Relative paths are taken from `base_dir`.
@@ -102,7 +107,8 @@ pub(super) fn resolve(
         let (dial, listen) = (draft.words.dial, draft.words.listen);
         resolver.record(&draft.origin, Mistake::ConnectsToNobody { dial, listen });
     }
-    let touches_ros = draft.ros.is_some() || !draft.shares.is_empty() || !draft.uses.is_empty();
+    let has_rules = !draft.shares.is_empty() || !draft.uses.is_empty();
+    let touches_ros = draft.ros.is_some() || has_rules || draft.gateway.is_some();
     let ros = touches_ros.then(|| {
         let nothing = RosDraft::default();
         ros_env::resolve(draft.ros.as_ref().unwrap_or(&nothing), env, &mut resolver.errors)
@@ -117,6 +123,7 @@ pub(super) fn resolve(
     let rotation = resolver.rotation(draft);
     let audit = resolver.audit(draft);
     let transport = resolver.transport(draft);
+    let gateway = draft.gateway.as_ref().map(|written| resolver.gateway(written, &draft.partners));
     let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket));
     match identity {
         Some(identity) if resolver.errors.is_empty() => Ok(Config {
@@ -142,6 +149,7 @@ pub(super) fn resolve(
             rotation,
             audit,
             transport,
+            gateway,
             admin_socket,
         }),
         _ => Err(resolver.errors),

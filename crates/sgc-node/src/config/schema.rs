@@ -30,17 +30,23 @@ pub enum Table {
     Audit,
     /// `[[partner]]`
     Partner,
+    /// `[gateway]`
+    Gateway,
+    /// `[[gateway.client]]`
+    GatewayClient,
 }
 
 impl Table {
     /// All of them, in the order in which the reference lists them.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::Top,
         Self::Node,
         Self::Ros,
         Self::Share,
         Self::Use,
         Self::Partner,
+        Self::Gateway,
+        Self::GatewayClient,
         Self::Router,
         Self::Transport,
         Self::Authority,
@@ -64,6 +70,8 @@ impl Table {
             Self::Rotation => "[rotation]",
             Self::Audit => "[audit]",
             Self::Partner => "[[partner]]",
+            Self::Gateway => "[gateway]",
+            Self::GatewayClient => "[[gateway.client]]",
         }
     }
 
@@ -77,6 +85,7 @@ impl Table {
                 "share",
                 "use",
                 "partner",
+                "gateway",
                 "router",
                 "transport",
                 "authority",
@@ -140,13 +149,26 @@ impl Table {
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "off"],
             Self::Partner => &["name", "ca", "node"],
+            Self::Gateway => &[
+                "listen",
+                "certificate",
+                "key",
+                "anonymous",
+                "origins",
+                "plain",
+                "msg_dirs",
+                "clients_max",
+                "client_bytes_max",
+                "client",
+            ],
+            Self::GatewayClient => &["who", "subscribe", "publish", "call", "serve"],
         }
     }
 
     /// The keys that the design names and a later version brings.
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
-            Self::Top => &["gateway", "profile"],
+            Self::Top => &["profile"],
             Self::Ros => &["enclave", "security_root"],
             Self::Node
             | Self::Router
@@ -155,7 +177,9 @@ impl Table {
             | Self::Authority
             | Self::Rotation
             | Self::Audit
-            | Self::Partner => &[],
+            | Self::Partner
+            | Self::Gateway
+            | Self::GatewayClient => &[],
             Self::Share => &["encoding"],
             Self::Use => &[],
         }

@@ -5,6 +5,7 @@
 mod echo;
 mod info;
 mod list;
+mod publish;
 mod rates;
 
 use std::io::{Read as _, Write as _};
@@ -30,7 +31,7 @@ const FIRST_LINE_BYTES_MAX: usize = 4096;
 /// The largest message that is read: what a node carries is smaller.
 const MESSAGE_BYTES_MAX: u32 = 256 << 20;
 
-/// List topics here and on the far side, show their messages and how often they come; no ROS 2 installation is needed
+/// List topics here and on the far side, show their messages and how often they come, publish; no ROS 2 installation is needed
 #[derive(Debug, Args)]
 pub(crate) struct TopicArgs {
     #[command(subcommand)]
@@ -42,6 +43,7 @@ enum TopicCommand {
     List(list::ListArgs),
     Info(info::InfoArgs),
     Echo(echo::EchoArgs),
+    Pub(publish::PubArgs),
     Hz(rates::HzArgs),
     Bw(rates::BwArgs),
     Delay(rates::DelayArgs),
@@ -100,6 +102,7 @@ pub(crate) fn topic(args: &TopicArgs) -> Result<ExitCode, CliError> {
         TopicCommand::List(args) => list::list(args),
         TopicCommand::Info(args) => info::info(args),
         TopicCommand::Echo(args) => echo::echo(args),
+        TopicCommand::Pub(args) => publish::publish(args),
         TopicCommand::Hz(args) => rates::hz(args),
         TopicCommand::Bw(args) => rates::bw(args),
         TopicCommand::Delay(args) => rates::delay(args),
@@ -134,13 +137,14 @@ enum Answer<T> {
     Refused(String),
 }
 
-fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) -> Result<T, CliError> {
+/// What a node answered.
+pub(crate) fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) -> Result<T, CliError> {
     match serde_json::from_str(text) {
         Ok(Answer::Done(what)) => Ok(what),
         Ok(Answer::Refused(reason)) => Err(CliError::NotSeen { reason }),
         Err(_) => Err(CliError::NotAStatus {
             path: socket.to_owned(),
-            reason: "it does not know `graph` and `tap`: it is of an earlier version; restart it".to_owned(),
+            reason: "it does not know what it was asked: it is of an earlier version; restart it".to_owned(),
         }),
     }
 }
@@ -213,5 +217,35 @@ impl Tap {
         self.stream.set_read_timeout(Some(BEGIN_MAX)).map_err(|e| broken(&self.socket, &e))?;
         self.stream.read_exact(&mut payload).map_err(|e| broken(&self.socket, &e))?;
         Ok(Some((head, payload)))
+    }
+}
+
+/// A type and a message, either of which may have been left out: what is alone is a type if it looks like one.
+pub(crate) fn type_and_message<'a>(
+    first: Option<&'a str>,
+    second: Option<&'a str>,
+) -> (Option<&'a str>, Option<&'a str>) {
+    let is_type = |text: &str| {
+        text.contains('/') && text.bytes().all(|b| b.is_ascii_alphanumeric() || b"_/".contains(&b))
+    };
+    match (first, second) {
+        (Some(only), None) if !is_type(only) => (None, Some(only)),
+        both => both,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::type_and_message;
+
+    #[test]
+    fn a_type_is_told_from_a_message() {
+        for name in ["std_msgs/String", "std_msgs/msg/String"] {
+            assert_eq!(type_and_message(Some(name), None), (Some(name), None));
+            assert_eq!(type_and_message(Some(name), Some("{}")), (Some(name), Some("{}")));
+        }
+        for message in ["data: a/b", "{}", "hello", "{a: b/c}"] {
+            assert_eq!(type_and_message(Some(message), None), (None, Some(message)));
+        }
     }
 }

@@ -1,0 +1,176 @@
+//! [`Door`]: who comes in, whatever protocol it speaks; and whether those who are in may stay.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use rustls_pki_types::CertificateDer;
+use serde::Serialize;
+use sgc_trust::{TrustAnchors, VerifiedPeer};
+use sgc_wire::UnixMillis;
+use tokio::sync::watch;
+
+use crate::access::{Access, Admission, Client, Denied};
+use crate::hub::lock;
+
+/// How often it is looked whether a client may stay whose time has no end that a timer could wait for: clocks are set.
+const LOOK_AGAIN_MAX: Duration = Duration::from_secs(60);
+/// Longest token that is looked at, bytes.
+const TOKEN_BYTES_MAX: usize = 32 << 10;
+
+/// Who is connected, for status.
+#[derive(Clone, Debug, Serialize, PartialEq, Eq)]
+pub struct ClientStatus {
+    /// What it is called.
+    pub name: String,
+    /// `"rosbridge"`, `"foxglove"` or `"grpc"`.
+    pub protocol: String,
+    /// Where it is.
+    pub address: String,
+    /// Since when, milliseconds since the Unix epoch.
+    pub since: u64,
+}
+
+/// What goes on at the gateway, for status.
+#[derive(Clone, Debug, Default, Serialize, PartialEq, Eq)]
+pub struct GatewayStatus {
+    /// Where it listens.
+    pub listen: Vec<String>,
+    /// Who is connected.
+    pub clients: Vec<ClientStatus>,
+    /// How many connections were refused, and why.
+    pub refused: BTreeMap<String, u64>,
+    /// Readers on the local network, shared by all clients.
+    pub readers: usize,
+}
+
+/// What is known of a connection before its client has said anything.
+#[derive(Clone, Debug)]
+pub(crate) struct Arrival {
+    pub(crate) peer: SocketAddr,
+    pub(crate) is_encrypted: bool,
+    /// What its certificate proves.
+    pub(crate) certificate: Option<VerifiedPeer>,
+}
+
+/// Who comes in.
+#[derive(Debug)]
+pub(crate) struct Door {
+    access: watch::Sender<Access>,
+    clients: Mutex<BTreeMap<u64, ClientStatus>>,
+    refused: Mutex<BTreeMap<&'static str, u64>>,
+    next: AtomicU64,
+    clients_max: usize,
+}
+
+/// A place at the gateway; free again when dropped.
+#[derive(Debug)]
+pub(crate) struct Place {
+    door: Arc<Door>,
+    number: u64,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        lock(&self.door.clients).remove(&self.number);
+    }
+}
+
+impl Door {
+    pub(crate) fn new(access: Access, clients_max: usize) -> Arc<Self> {
+        let access = watch::Sender::new(access);
+        let (clients, refused, next) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
+        Arc::new(Self { access, clients, refused, next, clients_max })
+    }
+
+    /// Other rules from now on: who is no longer admitted is disconnected.
+    pub(crate) fn set_access(&self, access: Access) {
+        self.access.send_replace(access);
+    }
+
+    pub(crate) fn access(&self) -> Access {
+        self.access.borrow().clone()
+    }
+
+    /// What a certificate proves; an error says why it proves nothing.
+    pub(crate) fn judge_certificate(
+        anchors: Option<&TrustAnchors>,
+        chain: &[CertificateDer<'_>],
+    ) -> Result<Option<VerifiedPeer>, sgc_trust::CertError> {
+        match anchors {
+            Some(anchors) if !chain.is_empty() => anchors.verify(chain, now()).map(Some),
+            _ => Ok(None),
+        }
+    }
+
+    /// Who this is, if it may come in.
+    pub(crate) fn admit(
+        &self,
+        arrival: &Arrival,
+        origin: Option<&str>,
+        token: Option<&str>,
+    ) -> Result<Client, Denied> {
+        let token = token.map(|token| token.get(..TOKEN_BYTES_MAX).unwrap_or(token));
+        let admission = Admission {
+            peer: arrival.peer,
+            encrypted: arrival.is_encrypted,
+            origin,
+            token,
+            certificate: arrival.certificate.as_ref(),
+            now: now(),
+        };
+        let access = self.access();
+        access.admit(&admission).inspect_err(|denied| {
+            self.count("not admitted");
+            tracing::debug!(peer = %arrival.peer, %denied, "a client is not admitted");
+        })
+    }
+
+    pub(crate) fn count(&self, why: &'static str) {
+        *lock(&self.refused).entry(why).or_default() += 1;
+    }
+
+    /// A place for a client, if there is one.
+    pub(crate) fn enter(self: &Arc<Self>, name: &str, protocol: &str, peer: SocketAddr) -> Option<Place> {
+        let mut clients = lock(&self.clients);
+        if clients.len() >= self.clients_max {
+            drop(clients);
+            self.count("too many clients");
+            return None;
+        }
+        let number = self.next.fetch_add(1, Ordering::Relaxed);
+        let (name, protocol) = (name.to_owned(), protocol.to_owned());
+        let status = ClientStatus { name, protocol, address: peer.to_string(), since: now().0 };
+        clients.insert(number, status);
+        Some(Place { door: Arc::clone(self), number })
+    }
+
+    /// Waits until a client may no longer stay.
+    pub(crate) async fn until_denied(&self, client: &Client) -> Denied {
+        let mut access = self.access.subscribe();
+        loop {
+            let current = access.borrow_and_update().clone();
+            if let Err(denied) = current.still_admits(client, now()) {
+                return denied;
+            }
+            let left = client.expires.map(|ends| Duration::from_millis(ends.0.saturating_sub(now().0) + 1));
+            let look_again = left.unwrap_or(LOOK_AGAIN_MAX).min(LOOK_AGAIN_MAX);
+            let _ = tokio::time::timeout(look_again, access.changed()).await;
+        }
+    }
+
+    pub(crate) fn clients(&self) -> Vec<ClientStatus> {
+        lock(&self.clients).values().cloned().collect()
+    }
+
+    pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
+        lock(&self.refused).iter().map(|(why, count)| ((*why).to_owned(), *count)).collect()
+    }
+}
+
+pub(crate) fn now() -> UnixMillis {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    UnixMillis(since.map_or(0, |since| since.as_millis().try_into().unwrap_or(u64::MAX)))
+}

@@ -1,0 +1,261 @@
+//! [`Outbox`]: what waits for one client to take it. What was asked for goes first, and bounds what is read; messages of
+//! topics wait in lanes, one a subscription, and give way.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::Notify;
+use tokio_tungstenite::tungstenite::Message as Frame;
+
+use crate::message::Message;
+
+use super::protocol::message_data;
+
+/// Answers that may wait before nothing more is read from the client.
+const ANSWERS_MAX: usize = 256;
+/// Bytes of them.
+const ANSWER_BYTES_MAX: usize = 4 << 20;
+/// Messages that may wait for one subscription.
+pub(super) const LANE_MESSAGES_MAX: usize = 1024;
+/// What a message counts for beside its payload, bytes.
+const MESSAGE_COST_BYTES: usize = 256;
+
+/// What waits for one client.
+#[derive(Debug)]
+pub(super) struct Outbox {
+    state: Mutex<State>,
+    /// Told when there is something to write.
+    filled: Notify,
+    /// Told when there is room for answers again.
+    drained: Notify,
+}
+
+#[derive(Debug)]
+struct State {
+    answers: VecDeque<Frame>,
+    answer_bytes: usize,
+    /// Messages in the order in which they came.
+    messages: BTreeMap<u64, Waiting>,
+    lanes: BTreeMap<u32, Lane>,
+    next: u64,
+    message_bytes: usize,
+    message_bytes_max: usize,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    subscription: u32,
+    message: Arc<Message>,
+}
+
+/// What waits for one subscription.
+#[derive(Debug, Default)]
+struct Lane {
+    numbers: VecDeque<u64>,
+    bytes: usize,
+    dropped: u64,
+}
+
+impl Outbox {
+    pub(super) fn new(message_bytes_max: usize) -> Self {
+        let state = State {
+            answers: VecDeque::new(),
+            answer_bytes: 0,
+            messages: BTreeMap::new(),
+            lanes: BTreeMap::new(),
+            next: 0,
+            message_bytes: 0,
+            message_bytes_max,
+        };
+        Self { state: Mutex::new(state), filled: Notify::new(), drained: Notify::new() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Puts an answer behind the others, whether there is room or not: who reads looks first.
+    pub(super) fn answer(&self, frame: Frame) {
+        let mut state = self.lock();
+        state.answer_bytes += frame.len();
+        state.answers.push_back(frame);
+        drop(state);
+        self.filled.notify_one();
+    }
+
+    /// Whether more may be read, which may need answers.
+    pub(super) fn has_room(&self) -> bool {
+        let state = self.lock();
+        state.answers.len() < ANSWERS_MAX && state.answer_bytes < ANSWER_BYTES_MAX
+    }
+
+    /// Waits until there is room.
+    pub(super) async fn room(&self) {
+        while !self.has_room() {
+            self.drained.notified().await;
+        }
+    }
+
+    /// Puts a message behind the others of its subscription. Who waits with the most gives way, its oldest first.
+    pub(super) fn message(&self, subscription: u32, message: Arc<Message>) {
+        let cost = cost(&message);
+        let mut state = self.lock();
+        if state.lanes.get(&subscription).is_some_and(|lane| lane.numbers.len() >= LANE_MESSAGES_MAX) {
+            state.drop_oldest(subscription);
+        }
+        while state.message_bytes + cost > state.message_bytes_max {
+            let most = state.lanes.iter().max_by_key(|(_, lane)| lane.bytes);
+            match most.filter(|(_, lane)| lane.bytes > 0).map(|(fullest, _)| *fullest) {
+                Some(fullest) => state.drop_oldest(fullest),
+                // One that is longer than all there may be passes alone.
+                None => break,
+            }
+        }
+        let number = state.next;
+        state.next += 1;
+        state.message_bytes += cost;
+        let lane = state.lanes.entry(subscription).or_default();
+        lane.numbers.push_back(number);
+        lane.bytes += cost;
+        state.messages.insert(number, Waiting { subscription, message });
+        drop(state);
+        self.filled.notify_one();
+    }
+
+    /// Nothing that waits for a subscription is wanted any more.
+    pub(super) fn forget(&self, subscription: u32) {
+        let mut state = self.lock();
+        let Some(lane) = state.lanes.remove(&subscription) else { return };
+        state.message_bytes -= lane.bytes;
+        for number in lane.numbers {
+            state.messages.remove(&number);
+        }
+    }
+
+    /// How many messages of a subscription gave way until now.
+    pub(super) fn dropped(&self, subscription: u32) -> u64 {
+        self.lock().lanes.get(&subscription).map_or(0, |lane| lane.dropped)
+    }
+
+    /// What is to be written next, if anything waits.
+    pub(super) fn pop(&self) -> Option<Frame> {
+        let mut state = self.lock();
+        if let Some(answer) = state.answers.pop_front() {
+            state.answer_bytes -= answer.len();
+            drop(state);
+            self.drained.notify_one();
+            return Some(answer);
+        }
+        let (_, Waiting { subscription, message }) = state.messages.pop_first()?;
+        let cost = cost(&message);
+        state.message_bytes -= cost;
+        if let Some(lane) = state.lanes.get_mut(&subscription) {
+            lane.numbers.pop_front();
+            lane.bytes -= cost;
+        }
+        drop(state);
+        Some(Frame::Binary(message_data(subscription, message.received_ns, &message.payload)))
+    }
+
+    /// The next answer, if one waits.
+    pub(super) fn pop_answer(&self) -> Option<Frame> {
+        let mut state = self.lock();
+        let answer = state.answers.pop_front()?;
+        state.answer_bytes -= answer.len();
+        Some(answer)
+    }
+
+    /// Waits until something may have come since it was asked for last. For one who writes.
+    pub(super) async fn filled(&self) {
+        self.filled.notified().await;
+    }
+}
+
+impl State {
+    fn drop_oldest(&mut self, subscription: u32) {
+        let Some(lane) = self.lanes.get_mut(&subscription) else { return };
+        let Some(number) = lane.numbers.pop_front() else { return };
+        lane.dropped += 1;
+        if let Some(waiting) = self.messages.remove(&number) {
+            let cost = cost(&waiting.message);
+            lane.bytes -= cost;
+            self.message_bytes -= cost;
+        }
+    }
+}
+
+fn cost(message: &Message) -> usize {
+    message.payload.len() + MESSAGE_COST_BYTES
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(bytes: usize) -> Arc<Message> {
+        Arc::new(Message::new(vec![0; bytes].into(), None, 0))
+    }
+
+    fn popped(outbox: &Outbox) -> Option<(u8, usize)> {
+        outbox.pop().map(|frame| {
+            let bytes = frame.into_data();
+            (bytes[1], bytes.len() - 13)
+        })
+    }
+
+    #[test]
+    fn messages_go_in_the_order_in_which_they_came_and_answers_before_them() {
+        let outbox = Outbox::new(10_000);
+        outbox.message(1, message(10));
+        outbox.message(2, message(20));
+        outbox.message(1, message(30));
+        outbox.answer(Frame::text("answer"));
+        assert_eq!(outbox.pop(), Some(Frame::text("answer")));
+        assert_eq!([popped(&outbox), popped(&outbox)], [Some((1, 10)), Some((2, 20))]);
+        outbox.forget(1);
+        assert_eq!(outbox.pop(), None);
+        assert_eq!(outbox.lock().message_bytes, 0);
+    }
+
+    #[test]
+    fn who_waits_with_the_most_gives_way() {
+        let outbox = Outbox::new(4 * (1000 + MESSAGE_COST_BYTES));
+        outbox.message(7, message(10));
+        for _ in 0..5 {
+            outbox.message(1, message(1000));
+        }
+        assert_eq!((outbox.dropped(1), outbox.dropped(7)), (2, 0));
+        // One that is longer than all there may be comes alone.
+        outbox.message(2, message(100_000));
+        assert_eq!((outbox.dropped(1), outbox.dropped(7)), (5, 1));
+        assert_eq!(popped(&outbox), Some((2, 100_000)));
+        assert_eq!(outbox.pop(), None);
+    }
+
+    #[test]
+    fn one_subscription_has_so_many_at_most() {
+        let outbox = Outbox::new(usize::MAX);
+        for _ in 0..LANE_MESSAGES_MAX + 3 {
+            outbox.message(1, message(0));
+        }
+        assert_eq!((outbox.dropped(1), outbox.lock().messages.len()), (3, LANE_MESSAGES_MAX));
+    }
+
+    #[tokio::test]
+    async fn answers_that_nobody_takes_leave_no_room_until_they_are() {
+        let outbox = Outbox::new(1);
+        for _ in 0..ANSWERS_MAX {
+            outbox.answer(Frame::text("x"));
+        }
+        assert!(!outbox.has_room());
+        let waits = outbox.room();
+        tokio::pin!(waits);
+        tokio::select! {
+            biased;
+            () = waits.as_mut() => panic!("there is no room"),
+            () = std::future::ready(()) => {}
+        }
+        assert!(outbox.pop().is_some());
+        waits.await;
+    }
+}

@@ -1,0 +1,391 @@
+//! [`Server`]: the gateway's sockets. Accepts, ends TLS, finds out who it is and what it speaks, and hands it on.
+
+use std::fmt;
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use rustls::ServerConfig;
+use rustls::sign::CertifiedKey;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::task::JoinSet;
+use tokio_rustls::TlsAcceptor;
+use tokio_stream::wrappers::ReceiverStream;
+
+use crate::access::Access;
+use crate::door::{Arrival, Door, GatewayStatus, Place, now};
+use crate::foxglove;
+use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
+use crate::hub::Hub;
+use crate::rosbridge::{self, Authenticate, RosbridgeOptions, StillAdmits};
+use crate::session::{Session, SessionLimits};
+use crate::tls::{TlsError, server_config};
+use crate::ws::upgrade;
+
+/// How long TLS and the upgrade may take together.
+const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
+/// Connections that may be in their handshake at a time.
+const HANDSHAKES_MAX: usize = 128;
+/// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
+const ACCEPT_RETRY: Duration = Duration::from_millis(100);
+/// Connections that wait to be served by gRPC.
+const GRPC_WAITING_MAX: usize = 64;
+
+/// What is spoken at an address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Protocol {
+    /// WebSocket: the rosbridge protocol, or Foxglove's where its subprotocol is asked for.
+    WebSocket,
+    /// gRPC.
+    Grpc,
+}
+
+/// Where to listen, and for what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct ListenAt {
+    /// For what.
+    pub protocol: Protocol,
+    /// Whether within TLS.
+    pub is_encrypted: bool,
+    /// Where; port 0 lets the system choose.
+    pub addr: SocketAddr,
+}
+
+impl fmt::Display for ListenAt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let scheme = match (self.protocol, self.is_encrypted) {
+            (Protocol::WebSocket, false) => "ws",
+            (Protocol::WebSocket, true) => "wss",
+            (Protocol::Grpc, false) => "grpc",
+            (Protocol::Grpc, true) => "grpcs",
+        };
+        write!(f, "{scheme}://{}", self.addr)
+    }
+}
+
+/// What a server is to be.
+pub struct ServerOptions {
+    /// What programs show it as.
+    pub name: String,
+    /// Where to listen.
+    pub listen: Vec<ListenAt>,
+    /// Who may come in.
+    pub access: Access,
+    /// What shows who the gateway is, within TLS.
+    pub key: Option<Arc<CertifiedKey>>,
+    /// Clients at a time.
+    pub clients_max: usize,
+    /// What each may have.
+    pub limits: SessionLimits,
+}
+
+/// Why a server does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// An address could not be bound.
+    #[error("the gateway cannot listen on {at}: {source}")]
+    Listen {
+        /// The address.
+        at: ListenAt,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// There is no certificate to show, or it cannot be used.
+    #[error("the gateway's certificate: {0}")]
+    Tls(#[from] TlsError),
+    /// TLS is wanted, and there is no certificate.
+    #[error("the gateway is to listen with TLS, and has no certificate")]
+    NoKey,
+}
+
+/// TLS of both protocols.
+#[derive(Clone)]
+struct Tls {
+    ws: Arc<ServerConfig>,
+    grpc: Arc<ServerConfig>,
+}
+
+struct Shared {
+    hub: Hub,
+    door: Arc<Door>,
+    tls: watch::Sender<Option<Tls>>,
+    limits: SessionLimits,
+    foxglove: foxglove::Options,
+    handshakes: Semaphore,
+    grpc: mpsc::Sender<Accepted<Placed>>,
+}
+
+/// A stream of bytes, whichever it is.
+trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
+
+/// A stream of bytes whose client has a place while it lasts.
+struct Placed {
+    stream: Box<dyn Bytes>,
+    _place: Place,
+}
+
+impl AsyncRead for Placed {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(cx, buf)
+    }
+}
+
+impl AsyncWrite for Placed {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(cx, buf)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(cx)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bufs: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(cx, bufs)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+}
+
+/// The gateway's sockets, and who came in by them. All of it ends when dropped.
+pub struct Server {
+    shared: Arc<Shared>,
+    local: Vec<ListenAt>,
+    _tasks: JoinSet<()>,
+}
+
+fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
+    let asks = access.takes_certificates();
+    key.map(|key| {
+        let ws = server_config(key, asks, &[b"http/1.1"])?;
+        Ok(Tls { ws, grpc: server_config(key, asks, &[b"h2"])? })
+    })
+    .transpose()
+}
+
+impl Server {
+    /// Binds all addresses, and serves.
+    pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
+        let tls = tls_of(options.key.as_ref(), &options.access)?;
+        if tls.is_none() && options.listen.iter().any(|at| at.is_encrypted) {
+            return Err(ServerError::NoKey);
+        }
+        let door = Door::new(options.access, options.clients_max);
+        let (grpc, accepted) = mpsc::channel(GRPC_WAITING_MAX);
+        let mut tasks = JoinSet::new();
+        let rules = Arc::clone(&door);
+        let grpc_options = GrpcOptions { session: options.limits, ..GrpcOptions::default() };
+        let front = Grpc::new(hub.clone(), move || rules.access(), grpc_options);
+        tasks.spawn(async move {
+            if let Err(error) = front.serve(ReceiverStream::new(accepted)).await {
+                tracing::error!(%error, "gRPC is not served any more");
+            }
+        });
+        let shared = Arc::new(Shared {
+            hub,
+            door,
+            tls: watch::Sender::new(tls),
+            limits: options.limits,
+            foxglove: foxglove::Options { name: options.name, ..foxglove::Options::default() },
+            handshakes: Semaphore::new(HANDSHAKES_MAX),
+            grpc,
+        });
+        let mut local = Vec::new();
+        for at in options.listen {
+            let bound = TcpListener::bind(at.addr).await.and_then(|listener| {
+                let addr = listener.local_addr()?;
+                Ok((listener, ListenAt { addr, ..at }))
+            });
+            let (listener, at) = bound.map_err(|source| ServerError::Listen { at, source })?;
+            tracing::info!("programs without ROS may connect at {at}");
+            local.push(at);
+            tasks.spawn(keep_accepting(listener, at, Arc::clone(&shared)));
+        }
+        Ok(Self { shared, local, _tasks: tasks })
+    }
+
+    /// Where it listens.
+    pub fn local(&self) -> &[ListenAt] {
+        &self.local
+    }
+
+    /// Other rules, and another certificate, from now on; who is no longer admitted is disconnected.
+    pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
+        let tls = tls_of(key, &access)?;
+        if tls.is_none() && self.local.iter().any(|at| at.is_encrypted) {
+            return Err(ServerError::NoKey);
+        }
+        self.shared.tls.send_replace(tls);
+        self.shared.door.set_access(access);
+        Ok(())
+    }
+
+    /// What goes on.
+    pub fn status(&self) -> GatewayStatus {
+        GatewayStatus {
+            listen: self.local.iter().map(ToString::to_string).collect(),
+            clients: self.shared.door.clients(),
+            refused: self.shared.door.refused(),
+            readers: self.shared.hub.readers(),
+        }
+    }
+
+    /// The hub.
+    pub fn hub(&self) -> &Hub {
+        &self.shared.hub
+    }
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Server").field("local", &self.local).finish_non_exhaustive()
+    }
+}
+
+async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>) {
+    // Ends all of them with the listener.
+    let mut connections = JoinSet::new();
+    loop {
+        tokio::select! {
+            accepted = listener.accept() => match accepted {
+                Ok((stream, peer)) => {
+                    let _ = stream.set_nodelay(true);
+                    connections.spawn(serve(stream, peer, at, Arc::clone(&shared)));
+                }
+                Err(error) => {
+                    tracing::warn!(%error, "the gateway could not accept a connection");
+                    tokio::time::sleep(ACCEPT_RETRY).await;
+                }
+            },
+            Some(_) = connections.join_next(), if !connections.is_empty() => {}
+        }
+    }
+}
+
+async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Shared>) {
+    let Ok(handshake) = shared.handshakes.try_acquire() else {
+        shared.door.count("too many handshakes");
+        return;
+    };
+    let deadline = tokio::time::Instant::now() + HANDSHAKE_MAX;
+    if !at.is_encrypted {
+        let arrival = Arrival { peer, is_encrypted: false, certificate: None };
+        return speak(stream, arrival, at, &shared, deadline, handshake).await;
+    }
+    let tls = shared.tls.borrow().clone();
+    let Some(tls) = tls else { return };
+    let config = match at.protocol {
+        Protocol::WebSocket => tls.ws,
+        Protocol::Grpc => tls.grpc,
+    };
+    let stream = match tokio::time::timeout_at(deadline, TlsAcceptor::from(config).accept(stream)).await {
+        Ok(Ok(stream)) => stream,
+        Ok(Err(error)) => {
+            shared.door.count("TLS failed");
+            tracing::debug!(%peer, %error, "a client's TLS failed");
+            return;
+        }
+        Err(_) => return shared.door.count("handshake too slow"),
+    };
+    let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
+    let access = shared.door.access();
+    let certificate = match Door::judge_certificate(access.rules().anchors.as_ref(), chain) {
+        Ok(certificate) => certificate,
+        Err(error) => {
+            shared.door.count("certificate does not hold");
+            tracing::debug!(%peer, %error, "a client's certificate does not hold");
+            None
+        }
+    };
+    let arrival = Arrival { peer, is_encrypted: true, certificate };
+    speak(stream, arrival, at, &shared, deadline, handshake).await;
+}
+
+/// Finds out what it speaks, and has it served until it goes or may no longer stay.
+async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
+    stream: S,
+    arrival: Arrival,
+    at: ListenAt,
+    shared: &Arc<Shared>,
+    deadline: tokio::time::Instant,
+    handshake: tokio::sync::SemaphorePermit<'_>,
+) {
+    if at.protocol == Protocol::Grpc {
+        // Its clients say who they are with each call.
+        let Arrival { peer, is_encrypted, certificate } = arrival;
+        let Some(place) = shared.door.enter(&peer.ip().to_string(), "grpc", peer) else { return };
+        let connection =
+            if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
+        let placed = Placed { stream: Box::new(stream), _place: place };
+        let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
+        return;
+    }
+    let (door, peer) = (&shared.door, arrival.peer);
+    let upgraded = upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS);
+    let upgraded = match tokio::time::timeout_at(deadline, upgraded).await {
+        Ok(Ok(upgraded)) => upgraded,
+        Ok(Err(error)) => {
+            tracing::debug!(%peer, %error, "no WebSocket");
+            return door.count("no WebSocket");
+        }
+        Err(_) => return door.count("handshake too slow"),
+    };
+    drop(handshake);
+    let client = upgraded.client;
+    let protocol = if upgraded.subprotocol.is_some() { "foxglove" } else { "rosbridge" };
+    let Some(_place) = door.enter(&client.name, protocol, peer) else { return };
+    let session = Arc::new(Session::new(&shared.hub, client.clone(), shared.limits));
+    let served = async {
+        if upgraded.subprotocol.is_some() {
+            let served = foxglove::serve(upgraded.socket, session, shared.foxglove.clone()).await;
+            return served.map_err(|error| error.to_string());
+        }
+        let (asked, judged) = (Arc::clone(door), Arc::clone(door));
+        // A token that comes later than the upgrade says who the client is from then on.
+        let authenticate: Authenticate = Arc::new(move |token| {
+            let admitted = asked.admit(&arrival, None, Some(token));
+            admitted.map_err(|denied| denied.told().to_owned())
+        });
+        let still_admits: StillAdmits = Arc::new(move |client| {
+            judged.access().still_admits(client, now()).map_err(|denied| denied.told().to_owned())
+        });
+        let options = RosbridgeOptions {
+            authenticate: Some(authenticate),
+            still_admits: Some(still_admits),
+            ..RosbridgeOptions::default()
+        };
+        let served = rosbridge::serve(upgraded.socket, session, options).await;
+        served.map_err(|error| error.to_string())
+    };
+    tokio::select! {
+        result = served => {
+            if let Err(error) = result {
+                tracing::debug!(%peer, %error, "a client's connection failed");
+            }
+        }
+        denied = door.until_denied(&client) => {
+            door.count("no longer admitted");
+            tracing::info!(client = %client.name, %denied, "a client is disconnected");
+        }
+    }
+}

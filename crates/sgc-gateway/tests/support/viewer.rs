@@ -1,0 +1,170 @@
+//! A client of Foxglove's protocol on loopback, and the gateway's end of its connection.
+
+#![allow(dead_code, reason = "each test program uses a part")]
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures_util::{SinkExt, StreamExt};
+use serde_json::Value;
+use sgc_gateway::Session;
+use sgc_gateway::foxglove::{self, FoxgloveError, Options, SUBPROTOCOLS};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::JoinHandle;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message as Frame;
+use tokio_tungstenite::tungstenite::handshake::server::{Request, Response};
+use tokio_tungstenite::tungstenite::http::HeaderValue;
+
+const PATIENCE: Duration = Duration::from_secs(10);
+
+pub(crate) type Ended = JoinHandle<Result<(), FoxgloveError>>;
+
+/// Serves the next who connects.
+pub(crate) async fn serve_one(session: Session, options: Options) -> (SocketAddr, Ended) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let ended = tokio::spawn(async move {
+        let (stream, _) = listener.accept().await.unwrap();
+        #[allow(clippy::result_large_err, reason = "the handshake's own type")]
+        let choose = |request: &Request, mut response: Response| {
+            let header = request.headers().get("sec-websocket-protocol");
+            let asked = header.and_then(|header| header.to_str().ok()).unwrap_or_default();
+            let chosen = SUBPROTOCOLS.into_iter().find(|known| asked.split(", ").any(|one| one == *known));
+            if let Some(chosen) = chosen {
+                response.headers_mut().insert("sec-websocket-protocol", HeaderValue::from_static(chosen));
+            }
+            Ok(response)
+        };
+        let socket = tokio_tungstenite::accept_hdr_async(stream, choose).await.unwrap();
+        foxglove::serve(socket, Arc::new(session), options).await
+    });
+    (address, ended)
+}
+
+/// A client.
+pub(crate) struct Viewer {
+    socket: WebSocketStream<TcpStream>,
+    /// What came and was not asked for yet.
+    kept: Vec<Frame>,
+    pub(crate) ended: Ended,
+}
+
+impl Viewer {
+    /// Connects, and takes what the server says of itself.
+    pub(crate) async fn new(session: Session) -> (Self, Value) {
+        Self::with(session, Options::default()).await
+    }
+
+    pub(crate) async fn with(session: Session, options: Options) -> (Self, Value) {
+        let (address, ended) = serve_one(session, options).await;
+        let stream = TcpStream::connect(address).await.unwrap();
+        let (socket, _) = tokio_tungstenite::client_async(format!("ws://{address}/"), stream).await.unwrap();
+        let mut viewer = Self { socket, kept: Vec::new(), ended };
+        let info = viewer.text("serverInfo").await;
+        (viewer, info)
+    }
+
+    pub(crate) async fn say(&mut self, value: Value) {
+        self.send(Frame::text(value.to_string())).await;
+    }
+
+    pub(crate) async fn send(&mut self, frame: Frame) {
+        self.socket.send(frame).await.unwrap();
+    }
+
+    /// Sends an opcode, numbers, and a payload behind them.
+    pub(crate) async fn binary(&mut self, opcode: u8, numbers: &[u32], payload: &[u8]) {
+        let mut bytes = vec![opcode];
+        numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
+        bytes.extend(payload);
+        self.send(Frame::Binary(bytes.into())).await;
+    }
+
+    /// The next frame that is so.
+    async fn next(&mut self, what: &str, is: impl Fn(&Frame) -> bool) -> Frame {
+        if let Some(at) = self.kept.iter().position(&is) {
+            return self.kept.remove(at);
+        }
+        loop {
+            let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+            let frame = next.unwrap_or_else(|_| panic!("no {what}, but {:?}", self.kept));
+            let frame = frame.unwrap_or_else(|| panic!("the end, and no {what}")).unwrap();
+            if is(&frame) {
+                return frame;
+            }
+            self.kept.push(frame);
+        }
+    }
+
+    /// The next text of such an op that is so.
+    pub(crate) async fn text_that(&mut self, op: &str, is: impl Fn(&Value) -> bool) -> Value {
+        let read =
+            |frame: &Frame| frame.to_text().ok().and_then(|text| serde_json::from_str::<Value>(text).ok());
+        let fits = |frame: &Frame| read(frame).is_some_and(|value| value["op"] == op && is(&value));
+        let frame = self.next(op, |frame| frame.is_text() && fits(frame)).await;
+        read(&frame).unwrap()
+    }
+
+    pub(crate) async fn text(&mut self, op: &str) -> Value {
+        self.text_that(op, |_| true).await
+    }
+
+    /// The channel of a topic, once there is one.
+    pub(crate) async fn channel(&mut self, topic: &str) -> Value {
+        self.listed("advertise", "channels", "topic", topic).await
+    }
+
+    /// A service, once there is one.
+    pub(crate) async fn service(&mut self, name: &str) -> Value {
+        self.listed("advertiseServices", "services", "name", name).await
+    }
+
+    async fn listed(&mut self, op: &str, list: &str, by: &str, name: &str) -> Value {
+        let find = |value: &Value| value[list].as_array()?.iter().find(|one| one[by] == name).cloned();
+        // Others may be looked for in the same text, so it stays.
+        loop {
+            let value = self.text_that(op, |value| find(value).is_some()).await;
+            self.kept.push(Frame::text(value.to_string()));
+            if let Some(found) = find(&value) {
+                return found;
+            }
+        }
+    }
+
+    /// Forgets what came.
+    pub(crate) fn forget(&mut self) {
+        self.kept.clear();
+    }
+
+    /// The next binary message of such an opcode, without it.
+    pub(crate) async fn binary_of(&mut self, opcode: u8) -> Bytes {
+        let is = |frame: &Frame| matches!(frame, Frame::Binary(bytes) if bytes.first() == Some(&opcode));
+        self.next(&format!("binary message {opcode}"), is).await.into_data().slice(1..)
+    }
+
+    /// The next message of a topic: its subscription and payload.
+    pub(crate) async fn message(&mut self) -> (u32, Bytes) {
+        let bytes = self.binary_of(1).await;
+        (u32::from_le_bytes(bytes[..4].try_into().unwrap()), bytes.slice(12..))
+    }
+
+    pub(crate) async fn subscribe(&mut self, id: u32, channel: &Value) {
+        let wanted = serde_json::json!({"id": id, "channelId": channel["id"]});
+        self.say(serde_json::json!({"op": "subscribe", "subscriptions": [wanted]})).await;
+    }
+
+    /// The next status that has such words in it.
+    pub(crate) async fn status(&mut self, words: &str) -> Value {
+        self.text_that("status", |value| value["message"].as_str().is_some_and(|said| said.contains(words)))
+            .await
+    }
+
+    /// Leaves, and waits for the gateway's end to have ended.
+    pub(crate) async fn leave(mut self) -> Result<(), FoxgloveError> {
+        self.socket.close(None).await.unwrap();
+        tokio::time::timeout(PATIENCE, self.ended).await.expect("it should have ended").unwrap()
+    }
+}

@@ -1,0 +1,73 @@
+//! `sgc service`: services of the local network and of the far side, without a ROS 2 installation.
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use serde_json::value::RawValue;
+use sgc_node::admin::AdminRequest;
+use sgc_node::shell::CallWish;
+
+use crate::error::CliError;
+use crate::topic::{NodeArgs, answer};
+use crate::{output, status, yaml};
+
+/// How long beyond the call itself the node may take to answer.
+const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// How long a reply is waited for unless it is said.
+const TIMEOUT_DEFAULT_S: u64 = 10;
+
+/// Call services here and on the far side; no ROS 2 installation is needed
+#[derive(Debug, Args)]
+pub(crate) struct ServiceArgs {
+    #[command(subcommand)]
+    command: ServiceCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum ServiceCommand {
+    Call(CallArgs),
+}
+
+/// Call a service with a request in JSON or YAML, and print its reply as JSON
+///
+/// The node that runs here calls it on its local network, where services that it uses from the far side are, too.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  sgc service call /add_two_ints example_interfaces/srv/AddTwoInts '{a: 2, b: 3}'
+  sgc service call /motors/enable '{data: true}'")]
+struct CallArgs {
+    /// The service
+    service: String,
+    /// Its type; may be left out if somebody serves it
+    #[arg(value_name = "TYPE")]
+    first: Option<String>,
+    /// The request; without it, all its members have their defaults
+    #[arg(value_name = "REQUEST")]
+    second: Option<String>,
+    /// How long the reply is waited for, seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = TIMEOUT_DEFAULT_S)]
+    timeout: u64,
+    #[command(flatten)]
+    node: NodeArgs,
+}
+
+/// Runs `sgc service`.
+pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
+    let ServiceCommand::Call(args) = &args.command;
+    let (type_name, request) = crate::topic::type_and_message(args.first.as_deref(), args.second.as_deref());
+    let request = yaml::json_of(request.unwrap_or_default())
+        .map_err(|reason| CliError::Cannot { reason: format!("the request: {reason}") })?;
+    let wish = CallWish {
+        service: args.service.clone(),
+        type_name: type_name.map(str::to_owned),
+        request,
+        timeout_ms: args.timeout.saturating_mul(1000),
+    };
+    let socket = args.node.socket()?;
+    let patience = Duration::from_secs(args.timeout).saturating_add(ANSWER_MAX);
+    let text = status::ask(&socket, &AdminRequest::Call(wish), patience)?;
+    let reply: Box<RawValue> = answer(&socket, &text)?;
+    output::line(reply)?;
+    Ok(ExitCode::SUCCESS)
+}

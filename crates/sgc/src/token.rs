@@ -1,0 +1,204 @@
+//! `sgc token`: access tokens for programs that connect to this node's gateway; shows what was made, takes it back.
+//!
+//! A token is signed with the node's identity, which this reads. It writes to the state directory, where the node finds what
+//! was revoked, and asks a running node to look there.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use rand_core::RngCore as _;
+use sgc_gateway::{ACCESS_VALID_MS_MAX, AccessGrant, Scope, TokenId};
+use sgc_node::config::{self, Config};
+use sgc_node::{AccessRecord, AccessRecords};
+use sgc_trust::Identity;
+use sgc_wire::UnixMillis;
+
+use crate::error::CliError;
+use crate::fleet::{system_rng, unix_now};
+use crate::{files, output, policy, reload};
+
+/// Digits of an id that a list shows.
+const ID_DIGITS: usize = 12;
+
+/// Make tokens for programs that connect to a node's gateway, show what was made, take them back.
+#[derive(Debug, Args)]
+#[command(after_help = "A dashboard in a browser, for twelve hours:
+  sgc token create -c arm-1.toml --for dashboard --subscribe /odom --subscribe '/camera/**' --valid 12h
+A program that drives:
+  sgc token create -c arm-1.toml --for teleop --subscribe /odom --publish /cmd_vel --out teleop.token
+Take it back:
+  sgc token revoke -c arm-1.toml 3f9c01aa52d4")]
+pub(crate) struct TokenArgs {
+    #[command(subcommand)]
+    command: TokenCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum TokenCommand {
+    Create(CreateArgs),
+    List(ListArgs),
+    Revoke(RevokeArgs),
+}
+
+/// Make a token that permits what is named, and nothing else.
+///
+/// It is printed once and not kept: bring it to the program on a private way. Whoever has it may do what it permits, at this
+/// node's gateway, until it ends or is revoked. Names may be patterns in quotes: '/arm/*', '/**'.
+#[derive(Debug, Args)]
+struct CreateArgs {
+    /// The node's configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// For whom it is: shown in lists and in the log
+    #[arg(long = "for", value_name = "LABEL")]
+    label: String,
+    /// A topic that its holder may receive; may be repeated
+    #[arg(long, value_name = "/TOPIC")]
+    subscribe: Vec<String>,
+    /// A topic that its holder may publish on; may be repeated
+    #[arg(long, value_name = "/TOPIC")]
+    publish: Vec<String>,
+    /// A service or an action that its holder may call; may be repeated
+    #[arg(long, value_name = "/NAME")]
+    call: Vec<String>,
+    /// A service or an action that its holder may serve; may be repeated
+    #[arg(long, value_name = "/NAME")]
+    serve: Vec<String>,
+    /// How long it is to hold, at most 3650d
+    #[arg(long, value_name = "TIME", default_value = "30d", value_parser = valid)]
+    valid: Duration,
+    /// Write it into this file, mode 0600, instead of printing it
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// Show the tokens that have not ended.
+#[derive(Debug, Args)]
+struct ListArgs {
+    /// The node's configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Print them as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Take a token back: it holds no more, and who is connected with it is disconnected.
+#[derive(Debug, Args)]
+struct RevokeArgs {
+    /// Its id, or the first digits of that
+    id: String,
+    /// The node's configuration; without it, the one *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+}
+
+/// Runs `sgc token`.
+pub(crate) fn token(args: &TokenArgs) -> Result<(), CliError> {
+    match &args.command {
+        TokenCommand::Create(args) => create(args),
+        TokenCommand::List(args) => list(args),
+        TokenCommand::Revoke(args) => revoke(args),
+    }
+}
+
+fn create(args: &CreateArgs) -> Result<(), CliError> {
+    let (config, identity, state) = open(args.config.as_deref())?;
+    if let Some(path) = args.out.as_deref().filter(|path| files::exists(path)) {
+        let hint = ": a token may be in it; name another file, or remove it";
+        return Err(CliError::Exists { path: path.to_owned(), hint });
+    }
+    let now = unix_now();
+    let mut id = [0; 16];
+    system_rng()?.fill_bytes(&mut id);
+    let valid = u64::try_from(args.valid.as_millis()).unwrap_or(u64::MAX);
+    let grant = AccessGrant {
+        id: TokenId(id),
+        gateway: identity.node_id(),
+        label: args.label.clone(),
+        scope: Scope {
+            subscribe: args.subscribe.clone(),
+            publish: args.publish.clone(),
+            call: args.call.clone(),
+            serve: args.serve.clone(),
+        },
+        issued: now,
+        expires: UnixMillis(now.0.saturating_add(valid)),
+    };
+    let token = grant.clone().sign(&identity)?;
+    sgc_node::create_state_dir(&state)?;
+    // On the disk before it is printed: one that is in no list is overlooked.
+    AccessRecords::change(&state, |records| records.add(AccessRecord::from(&grant), now))?;
+    let short = short(&grant.id.to_string());
+    output::diagnostic(&format!(
+        "Token {short} for {}, until {}: {}. Whoever has it may do that at the gateway of {}: keep it secret.\nTo take it \
+         back: sgc token revoke {short}",
+        grant.label,
+        grant.expires,
+        grant.scope,
+        identity.node_name()
+    ));
+    if config.gateway.is_none() {
+        output::diagnostic("This configuration has no [gateway] yet, so there is nothing to connect to.");
+    }
+    match &args.out {
+        Some(path) => {
+            let text = zeroize::Zeroizing::new(format!("{}\n", token.to_text().as_str()));
+            files::write_secret(path, &text, files::Existing::Keep(""))
+        }
+        None => output::line(token.to_text().as_str()),
+    }
+}
+
+fn list(args: &ListArgs) -> Result<(), CliError> {
+    let (_, _, state) = open(args.config.as_deref())?;
+    let now = unix_now();
+    let mut records = AccessRecords::load(&state)?;
+    records.tokens.retain(|record| record.expires >= now.0);
+    if args.json {
+        let text = serde_json::to_string(&records.tokens).map_err(|error| CliError::Output(error.into()))?;
+        return output::line(text);
+    }
+    if records.tokens.is_empty() {
+        return output::line("no access token was made here that has not ended");
+    }
+    let head = ["id", "for", "made", "until", "may"].map(str::to_owned).to_vec();
+    let row = |record: &AccessRecord| {
+        let until = match record.revoked {
+            Some(at) => format!("revoked {}", UnixMillis(at)),
+            None => UnixMillis(record.expires).to_string(),
+        };
+        let made = UnixMillis(record.created).to_string();
+        vec![short(&record.id), record.label.clone(), made, until, record.scope().to_string()]
+    };
+    let rows: Vec<_> = std::iter::once(head).chain(records.tokens.iter().map(row)).collect();
+    output::columns(&rows).into_iter().try_for_each(output::line)
+}
+
+fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
+    let (config, identity, state) = open(args.config.as_deref())?;
+    sgc_node::create_state_dir(&state)?;
+    let record = AccessRecords::change(&state, |records| records.revoke(&args.id, unix_now()))?;
+    let whose = if record.label.is_empty() { "which is not listed here" } else { &record.label };
+    output::line(format!("token {} for {whose} is revoked", short(&record.id)))?;
+    let socket = sgc_node::admin_socket_path(&config, identity.node_name().as_str());
+    reload::after_change(&socket)?.into_iter().try_for_each(output::line)
+}
+
+fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
+    let path = files::config_here(config)?;
+    let (config, identity, _) = policy::load(&path)?;
+    let state = sgc_node::state_dir(&config, identity.node_name().as_str());
+    Ok((config, identity, state.ok_or(sgc_node::StateError::Nowhere)?))
+}
+
+fn short(id: &str) -> String {
+    id.chars().take(ID_DIGITS).collect()
+}
+
+fn valid(text: &str) -> Result<Duration, String> {
+    let max = Duration::from_millis(ACCESS_VALID_MS_MAX);
+    let time = config::parse_duration(text).filter(|time| !time.is_zero() && *time <= max);
+    time.ok_or_else(|| "12h, 90d, for example, and at most 3650d".to_owned())
+}

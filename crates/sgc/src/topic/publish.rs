@@ -1,0 +1,161 @@
+//! `sgc topic pub`: publishes as `ros2 topic pub` does, by the node that runs here.
+
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::{Args, ValueEnum};
+use sgc_node::admin::AdminRequest;
+use sgc_node::shell::{PublishWish, Published};
+
+use super::{ANSWER_MAX, BEGIN_MAX, NodeArgs, answer, type_and_message};
+use crate::error::{CliError, EXIT_FAILURE};
+use crate::{output, status, yaml};
+
+/// How long subscribers are waited for unless it is said.
+const WAIT_DEFAULT_S: u64 = 10;
+
+#[derive(Clone, Copy, Debug, ValueEnum, PartialEq, Eq)]
+enum ReliabilityArg {
+    Reliable,
+    BestEffort,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum, PartialEq, Eq)]
+enum DurabilityArg {
+    Volatile,
+    TransientLocal,
+}
+
+/// Publish messages on a topic, in JSON or YAML
+///
+/// The node that runs here publishes them on its local network, as a program of it would: what is shared goes to the far
+/// side. Members that are left out have their defaults. Without MESSAGE, a message a line is read from standard input.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  sgc topic pub /cmd_vel geometry_msgs/msg/Twist '{linear: {x: 0.5}}' --rate 10
+  sgc topic pub --once /chatter std_msgs/String 'data: hello'")]
+pub(crate) struct PubArgs {
+    /// The topic
+    topic: String,
+    /// Its type; may be left out if the topic is there already
+    #[arg(value_name = "TYPE")]
+    first: Option<String>,
+    /// The message
+    #[arg(value_name = "MESSAGE")]
+    second: Option<String>,
+    /// Messages a second
+    #[arg(short, long, value_name = "HZ", default_value_t = 1.0)]
+    rate: f64,
+    /// Publish once, when there is a subscriber, and end
+    #[arg(short = '1', long, conflicts_with = "count")]
+    once: bool,
+    /// End after so many messages
+    #[arg(short = 'n', long, value_name = "N")]
+    count: Option<u64>,
+    /// Wait for so many subscribers on the local network first, the node's own for the far side among them [default: 1 with --once, else 0]
+    #[arg(short, long, value_name = "N")]
+    wait: Option<u32>,
+    /// For so long at most, seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = WAIT_DEFAULT_S)]
+    timeout: u64,
+    #[arg(long, value_enum, default_value = "reliable")]
+    reliability: ReliabilityArg,
+    #[arg(long, value_enum, default_value = "volatile")]
+    durability: DurabilityArg,
+    /// Messages that are kept for who reads slowly or comes later
+    #[arg(long, value_name = "N")]
+    depth: Option<u32>,
+    #[command(flatten)]
+    node: NodeArgs,
+}
+
+/// A node that publishes.
+struct Publisher {
+    socket: PathBuf,
+    from: BufReader<UnixStream>,
+    into: UnixStream,
+}
+
+impl Publisher {
+    fn begin(socket: PathBuf, wish: PublishWish) -> Result<(Self, Published), CliError> {
+        let patience = BEGIN_MAX + Duration::from_millis(wish.wait_ms);
+        let no_node = |error: std::io::Error| status::no_node(&socket, &error, patience);
+        let mut into = UnixStream::connect(&socket).map_err(no_node)?;
+        into.set_read_timeout(Some(patience)).map_err(no_node)?;
+        into.write_all(AdminRequest::Publish(wish).to_line().as_bytes()).map_err(no_node)?;
+        let from = BufReader::new(into.try_clone().map_err(no_node)?);
+        let mut publisher = Self { socket, from, into };
+        let published = publisher.answer()?;
+        publisher.into.set_read_timeout(Some(ANSWER_MAX)).map_err(|e| publisher.broken(&e))?;
+        Ok((publisher, published))
+    }
+
+    fn broken(&self, error: &std::io::Error) -> CliError {
+        status::no_node(&self.socket, error, ANSWER_MAX)
+    }
+
+    fn answer<T: serde::de::DeserializeOwned>(&mut self) -> Result<T, CliError> {
+        let mut line = String::new();
+        match self.from.read_line(&mut line) {
+            Ok(0) => Err(CliError::NotSeen { reason: "the node stopped".to_owned() }),
+            Ok(_) => answer(&self.socket, line.trim_end()),
+            Err(error) => Err(self.broken(&error)),
+        }
+    }
+
+    /// Publishes a message; says how many subscribers there are.
+    fn publish(&mut self, json: &str) -> Result<u32, CliError> {
+        let written = self.into.write_all(json.as_bytes()).and_then(|()| self.into.write_all(b"\n"));
+        written.map_err(|error| self.broken(&error))?;
+        self.answer()
+    }
+}
+
+pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
+    let (type_name, message) = type_and_message(args.first.as_deref(), args.second.as_deref());
+    let not_a_message = |reason: String| CliError::Cannot { reason: format!("the message: {reason}") };
+    let message = message.map(yaml::json_of).transpose().map_err(not_a_message)?;
+    let period = Duration::try_from_secs_f64(1.0 / args.rate)
+        .map_err(|_| CliError::Cannot { reason: "--rate: more than 0 messages a second".to_owned() })?;
+    let wait_for = args.wait.unwrap_or(u32::from(args.once));
+    let wish = PublishWish {
+        topic: args.topic.clone(),
+        type_name: type_name.map(str::to_owned),
+        best_effort: args.reliability == ReliabilityArg::BestEffort,
+        transient_local: args.durability == DurabilityArg::TransientLocal,
+        depth: args.depth,
+        wait_for,
+        wait_ms: args.timeout.saturating_mul(1000),
+    };
+    let (mut publisher, begun) = Publisher::begin(args.node.socket()?, wish)?;
+    if begun.subscribers < wait_for {
+        output::diagnostic(&format!(
+            "sgc: {}: {} subscribers after {} s: nothing was published",
+            args.topic, begun.subscribers, args.timeout
+        ));
+        return Ok(ExitCode::from(EXIT_FAILURE));
+    }
+    let Some(message) = message else {
+        for line in std::io::stdin().lock().lines() {
+            let line = line.map_err(|source| CliError::System { what: "cannot read messages", source })?;
+            publisher.publish(&yaml::json_of(&line).map_err(not_a_message)?)?;
+        }
+        return Ok(ExitCode::SUCCESS);
+    };
+    let most = if args.once { Some(1) } else { args.count };
+    let mut next = Instant::now();
+    let mut sent = 0;
+    while most.is_none_or(|most| sent < most) {
+        publisher.publish(&message)?;
+        sent += 1;
+        output::line(format!("published {sent}: {message}"))?;
+        next += period;
+        if most != Some(sent) {
+            std::thread::sleep(next.saturating_duration_since(Instant::now()));
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
