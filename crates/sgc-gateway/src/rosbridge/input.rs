@@ -76,18 +76,20 @@ fn of_ros_1(raw: &str) -> Option<String> {
 }
 
 fn rename(value: &mut Json) -> bool {
+    let mut any = false;
     match value {
-        Json::Array(all) => all.iter_mut().fold(false, |any, value| rename(value) || any),
+        Json::Array(all) => all.iter_mut().for_each(|value| any |= rename(value)),
         Json::Object(members) => {
-            let mut any = rename_time(members);
+            any = rename_time(members);
             if members.get("stamp").is_some_and(Json::is_null) {
                 members.remove("stamp");
                 any = true;
             }
-            members.values_mut().fold(any, |any, value| rename(value) || any)
+            members.values_mut().for_each(|value| any |= rename(value));
         }
-        _ => false,
+        _ => {}
     }
+    any
 }
 
 fn rename_time(members: &mut Map<String, Json>) -> bool {

@@ -47,7 +47,7 @@ pub(super) enum OpError {
     #[error("{op}: {member:?} is no {expected}: {found}")]
     Kind { op: String, member: &'static str, expected: &'static str, found: String },
     #[error("{op}: {source}")]
-    Gateway { op: String, source: GatewayError },
+    Gateway { op: String, source: Box<GatewayError> },
     #[error("{op}: {why}")]
     Refused { op: String, why: String },
 }
@@ -92,7 +92,7 @@ impl<'a> Op<'a> {
     }
 
     pub(super) fn gateway(&self, source: GatewayError) -> OpError {
-        OpError::Gateway { op: self.name.to_string(), source }
+        OpError::Gateway { op: self.name.to_string(), source: Box::new(source) }
     }
 
     fn missing(&self, member: &'static str) -> OpError {
