@@ -70,10 +70,13 @@ impl InterfaceType {
     }
 }
 
+/// By name, and by the hash that was asked for.
+type Known = BTreeMap<(String, Option<String>), Arc<Layout>>;
+
 /// What messages look like.
 pub struct Types {
     finder: Box<dyn FindDefinitions>,
-    known: Mutex<BTreeMap<(String, Option<String>), Arc<Layout>>>,
+    known: Mutex<Known>,
 }
 
 impl fmt::Debug for Types {
@@ -132,7 +135,7 @@ impl Types {
         self.finder.text(&file).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<(String, Option<String>), Arc<Layout>>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Known> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
