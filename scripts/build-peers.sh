@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds the test peers that are not ours to test against: .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
+# Builds the test peers that are not ours to test against: .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust),
+# and installs the libraries that clients of the gateway use, of Python and JavaScript.
 # Does nothing for what is there and newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -18,6 +19,14 @@ if ! cmp -s "$requirements" "$installed"; then
     python3 -m venv --clear .venv
     .venv/bin/pip install --quiet --disable-pip-version-check --only-binary :all: -r "$requirements"
     cp "$requirements" "$installed"
+fi
+
+# What they depend on is pinned with its hashes, and runs nothing while it is installed.
+lock=tests/js/package-lock.json
+if ! cmp -s "$lock" tests/js/node_modules/installed.json; then
+    say "JavaScript clients in tests/js"
+    npm ci --prefix tests/js --ignore-scripts --no-audit --no-fund --loglevel error >/dev/null
+    cp "$lock" tests/js/node_modules/installed.json
 fi
 
 cat >.peers/cyclone <<'SCRIPT'

@@ -56,6 +56,7 @@ if [ "$what" = test ]; then
     need 'compiles c++ fastcdr/Cdr.h' libfastcdr-dev -- "the Fast DDS test peer"
     need 'compiles c++ fastdds/dds/domain/DomainParticipant.hpp' libfastrtps-dev -- "the Fast DDS test peer"
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "the Cyclone DDS test peer runs in a virtual environment"
+    need 'command -v node && command -v npm' nodejs npm -- "clients of the gateway in JavaScript"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
     need 'command -v openssl' openssl -- "a DTLS program that is not ours"

@@ -105,6 +105,12 @@ pub enum GatewayError {
         /// How long was waited.
         waited_ms: u64,
     },
+    /// Its server does not take a goal.
+    #[error("the server of {name} rejected the goal")]
+    GoalRejected {
+        /// The action.
+        name: String,
+    },
     /// The local network refused.
     #[error(transparent)]
     Ros(#[from] RosError),
@@ -126,6 +132,8 @@ pub enum ErrorKind {
     Denied,
     /// The client has too much.
     Exhausted,
+    /// Who was asked does not want to.
+    Refused,
     /// Nobody is there to do it.
     Unavailable,
     /// It took too long.
@@ -146,6 +154,7 @@ impl GatewayError {
             Self::TooLong { .. } | Self::TooMany { .. } => ErrorKind::Exhausted,
             Self::Twice { .. } => ErrorKind::Exists,
             Self::NoServer { .. } | Self::Stopping => ErrorKind::Unavailable,
+            Self::GoalRejected { .. } => ErrorKind::Refused,
             Self::Timeout { .. } => ErrorKind::Timeout,
             Self::Decode(_) | Self::Ros(_) => ErrorKind::Internal,
         }

@@ -1,6 +1,7 @@
 //! [`Feed`]: a reader of a topic, and all who hear it. Each topic is read once for everybody who takes it as it is offered.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
@@ -86,6 +87,12 @@ impl Latched {
     }
 }
 
+impl std::fmt::Debug for Feed {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Feed").field(&self.key).finish()
+    }
+}
+
 /// What comes from a feed's reader.
 struct Intake(Arc<Feed>);
 
@@ -142,6 +149,11 @@ impl Feed {
         let mut outlets = self.outlets();
         outlets.latched.writers.values().flatten().for_each(|message| queue.push(message));
         outlets.queues.push(Arc::downgrade(queue));
+    }
+
+    /// What is kept, once more.
+    fn replay(&self, queue: &Queue) {
+        self.outlets().latched.writers.values().flatten().for_each(|message| queue.push(message));
     }
 
     fn leave(&self, queue: &Arc<Queue>) {
@@ -244,10 +256,12 @@ pub struct Delivery {
 }
 
 /// How much one subscriber takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub(crate) struct Intaking {
     pub(crate) depth: usize,
     pub(crate) bytes_max: usize,
+    /// Bytes that wait for the client in all its subscriptions.
+    pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) interval_min: Option<Duration>,
     pub(crate) overflow: Overflow,
 }
@@ -263,7 +277,7 @@ pub struct Subscription {
 
 impl Subscription {
     pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
-        let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.overflow));
+        let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.waiting, taking.overflow));
         feed.join(&queue);
         Self { feed, queue, layout, interval_min: taking.interval_min, not_before: None }
     }
@@ -299,9 +313,53 @@ impl Subscription {
         Some(Delivery { message, dropped })
     }
 
+    /// What ends it whoever holds it.
+    pub(crate) fn ender(&self) -> SubscriptionEnd {
+        SubscriptionEnd { feed: Arc::downgrade(&self.feed), queue: Arc::downgrade(&self.queue) }
+    }
+
     /// How many messages were left out until now.
     pub fn dropped(&self) -> u64 {
         self.queue.dropped()
+    }
+
+    /// Takes messages at another pace from now on, as [`Subscribe`](crate::Subscribe) has it.
+    pub fn set_pace(&mut self, depth: usize, interval_min: Option<Duration>) {
+        self.queue.set_depth(depth);
+        let before = std::mem::replace(&mut self.interval_min, interval_min);
+        let last = self.not_before.zip(before).and_then(|(at, before)| at.checked_sub(before));
+        self.not_before = last.zip(interval_min).map(|(last, interval)| last + interval);
+    }
+
+    /// Has what is kept for who subscribes later come once more, for another part of the same client.
+    pub fn replay(&self) {
+        self.feed.replay(&self.queue);
+    }
+}
+
+/// Ends a [`Subscription`] that somebody else holds: one that is waited for, for example, by who does not look at it.
+#[derive(Debug)]
+pub(crate) struct SubscriptionEnd {
+    feed: Weak<Feed>,
+    queue: Weak<Queue>,
+}
+
+impl SubscriptionEnd {
+    /// Nothing comes any more, and nothing waits any more.
+    pub(crate) fn end(&self) {
+        if let (Some(feed), Some(queue)) = (self.feed.upgrade(), self.queue.upgrade()) {
+            feed.leave(&queue);
+            queue.close();
+            queue.clear();
+            if let Some(hub) = feed.hub.upgrade() {
+                hub.sweep();
+            }
+        }
+    }
+
+    /// Whether the subscription is dropped.
+    pub(crate) fn has_ended(&self) -> bool {
+        self.queue.strong_count() == 0
     }
 }
 

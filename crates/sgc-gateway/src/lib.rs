@@ -10,22 +10,32 @@
 #![forbid(unsafe_code)]
 
 mod access;
+mod action;
 mod content;
 mod error;
 mod feed;
+pub mod foxglove;
 mod graph;
+pub mod grpc;
 mod hub;
 mod message;
 mod publisher;
 mod queue;
 mod ros;
+pub mod rosbridge;
 mod service;
 mod session;
 mod types;
 
-pub mod foxglove;
-
-pub use access::{Client, Right, Scope};
+pub use access::{
+    ACCESS_LABEL_BYTES_MAX, ACCESS_TOKEN_PREFIX, ACCESS_TOKEN_TEXT_BYTES_MAX, ACCESS_VALID_MS_MAX, Access,
+    AccessGrant, AccessRules, AccessToken, AccessTokenError, Admission, AdmittedBy, Anonymous, Client,
+    ClientRule, Denied, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, Right, SCOPE_BYTES_MAX,
+    SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
+};
+pub use action::{
+    ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
+};
 pub use content::{Content, Form};
 pub use error::{ErrorKind, GatewayError};
 pub use feed::{Delivery, Subscription};

@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_cdr::Layout;
+use sgc_cdr::{Layout, Value};
 use sgc_ros::{EndpointKind, EndpointSpec, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_wire::{History, Qos};
 use tokio::time::Instant;
 
-use crate::content::Content;
+use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::hub::Shared;
@@ -85,6 +85,11 @@ impl Publication {
             return Err(GatewayError::TooLong { bytes: payload.len(), max: PAYLOAD_BYTES_MAX });
         }
         self.write(payload).await
+    }
+
+    /// The same with a value.
+    pub(crate) async fn publish_value(&self, value: &Value) -> Result<(), GatewayError> {
+        self.write(serialise(&self.layout, value)?).await
     }
 
     async fn write(&self, payload: Bytes) -> Result<(), GatewayError> {

@@ -1,6 +1,7 @@
 //! [`Queue`]: what waits for one subscriber, bounded by number and bytes.
 
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
@@ -31,15 +32,24 @@ pub(crate) struct Queue {
     state: Mutex<State>,
     filled: Notify,
     room: Condvar,
-    depth: usize,
+    depth: AtomicUsize,
     bytes_max: usize,
+    /// Bytes that wait in all queues of the client, this one among them.
+    waiting: Arc<AtomicUsize>,
     overflow: Overflow,
 }
 
 impl Queue {
-    pub(crate) fn new(depth: usize, bytes_max: usize, overflow: Overflow) -> Self {
+    /// `bytes_max` is for all queues that share `waiting`; of a full one it is for each alone, since nobody else makes room.
+    pub(crate) fn new(depth: usize, bytes_max: usize, waiting: Arc<AtomicUsize>, overflow: Overflow) -> Self {
         let (state, filled, room) = (Mutex::default(), Notify::new(), Condvar::new());
-        Self { state, filled, room, depth: depth.max(1), bytes_max, overflow }
+        let depth = AtomicUsize::new(depth.max(1));
+        Self { state, filled, room, depth, bytes_max, waiting, overflow }
+    }
+
+    /// How many messages may wait from now on.
+    pub(crate) fn set_depth(&self, depth: usize) {
+        self.depth.store(depth.max(1), Ordering::Relaxed);
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -47,7 +57,12 @@ impl Queue {
     }
 
     fn has_room(&self, state: &State, bytes: usize) -> bool {
-        let fits = state.messages.len() < self.depth && state.bytes + bytes <= self.bytes_max;
+        let waiting = match self.overflow {
+            Overflow::DropOldest => self.waiting.load(Ordering::Relaxed),
+            Overflow::Wait => state.bytes,
+        };
+        let depth = self.depth.load(Ordering::Relaxed);
+        let fits = state.messages.len() < depth && waiting.saturating_add(bytes) <= self.bytes_max;
         // One that is longer than the bound alone passes alone.
         fits || state.messages.is_empty()
     }
@@ -71,6 +86,7 @@ impl Queue {
                 Overflow::DropOldest => {
                     if let Some(oldest) = state.messages.pop_front() {
                         state.bytes -= oldest.payload.len();
+                        self.waiting.fetch_sub(oldest.payload.len(), Ordering::Relaxed);
                         state.dropped += 1;
                     }
                 }
@@ -80,6 +96,7 @@ impl Queue {
             return;
         }
         state.bytes += bytes;
+        self.waiting.fetch_add(bytes, Ordering::Relaxed);
         state.messages.push_back(Arc::clone(message));
         drop(state);
         self.filled.notify_one();
@@ -95,6 +112,7 @@ impl Queue {
         let mut state = self.lock();
         let message = state.messages.pop_front()?;
         state.bytes -= message.payload.len();
+        self.waiting.fetch_sub(message.payload.len(), Ordering::Relaxed);
         let dropped = state.dropped;
         drop(state);
         if self.overflow == Overflow::Wait {
@@ -121,11 +139,24 @@ impl Queue {
         self.lock().dropped
     }
 
+    /// Forgets what waits.
+    pub(crate) fn clear(&self) {
+        let mut state = self.lock();
+        (state.messages, state.bytes) = (VecDeque::new(), 0);
+    }
+
     /// Nothing comes any more; who waits for room goes on.
     pub(crate) fn close(&self) {
         self.lock().is_closed = true;
         self.room.notify_all();
         self.filled.notify_one();
+    }
+}
+
+impl Drop for Queue {
+    fn drop(&mut self) {
+        let bytes = self.lock().bytes;
+        self.waiting.fetch_sub(bytes, Ordering::Relaxed);
     }
 }
 
@@ -137,9 +168,25 @@ mod tests {
         Arc::new(Message::new(vec![0; bytes].into(), None, 0))
     }
 
+    #[test]
+    fn queues_of_a_client_share_what_may_wait() {
+        let waiting: Arc<AtomicUsize> = Arc::default();
+        let queue = || Queue::new(9, 100, Arc::clone(&waiting), Overflow::DropOldest);
+        let (one, other) = (queue(), queue());
+        one.push(&message(80));
+        for _ in 0..3 {
+            other.push(&message(30));
+        }
+        // One message each is there in any case.
+        assert_eq!((one.dropped(), other.dropped(), waiting.load(Ordering::Relaxed)), (0, 2, 110));
+        drop(one);
+        other.push(&message(30));
+        assert_eq!((other.dropped(), waiting.load(Ordering::Relaxed)), (2, 60));
+    }
+
     #[tokio::test]
     async fn the_oldest_gives_way_and_is_counted() {
-        let queue = Queue::new(2, 100, Overflow::DropOldest);
+        let queue = Queue::new(2, 100, Arc::default(), Overflow::DropOldest);
         for bytes in [10, 20, 30] {
             queue.push(&message(bytes));
         }
@@ -157,7 +204,7 @@ mod tests {
 
     #[test]
     fn who_waits_for_room_goes_on_when_there_is_some_or_the_end() {
-        let queue = Arc::new(Queue::new(1, 100, Overflow::Wait));
+        let queue = Arc::new(Queue::new(1, 100, Arc::default(), Overflow::Wait));
         queue.push(&message(1));
         assert!(queue.would_wait(1));
         let pusher = {

@@ -6,14 +6,14 @@ use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_cdr::Layout;
+use sgc_cdr::{Layout, Value};
 use sgc_ros::{
     EndpointKind, EndpointSpec, RequestId, RosClient, RosError, RosServer, ServiceSpec, ServiceTopic,
     service_qos,
 };
 use tokio::sync::{mpsc, oneshot};
 
-use crate::content::{Content, Form, convert};
+use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::hub::{Shared, lock};
@@ -184,9 +184,24 @@ pub struct Replier {
 }
 
 impl Replier {
+    /// What replies look like.
+    pub fn reply_layout(&self) -> &Arc<Layout> {
+        &self.halves.reply
+    }
+
     /// Answers a request.
     pub async fn reply(&self, id: RequestId, content: &Content) -> Result<(), GatewayError> {
         let payload = content.to_cdr(&self.halves.reply)?;
+        self.send(id, payload).await
+    }
+
+    /// The same with a value.
+    pub(crate) async fn reply_value(&self, id: RequestId, value: &Value) -> Result<(), GatewayError> {
+        let payload = serialise(&self.halves.reply, value)?;
+        self.send(id, payload).await
+    }
+
+    async fn send(&self, id: RequestId, payload: Bytes) -> Result<(), GatewayError> {
         let server = Arc::clone(&self.server);
         self.shared.blocking(move |_| server.reply(&id, payload)).await
     }
@@ -233,6 +248,11 @@ impl Serving {
     /// A request in a form.
     pub fn write(&self, request: &Request, form: Form) -> Result<Bytes, GatewayError> {
         convert(&self.halves.request, &request.payload, form)
+    }
+
+    /// What requests look like.
+    pub fn request_layout(&self) -> &Arc<Layout> {
+        &self.halves.request
     }
 
     /// What answers.

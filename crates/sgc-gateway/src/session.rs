@@ -1,5 +1,6 @@
 //! [`Session`]: one client's part in the hub, within its scope and its bounds.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -21,7 +22,7 @@ use crate::types::InterfaceType;
 /// What one client may have at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
-    /// Bytes that wait for it in all its subscriptions together; each alone may hold as many.
+    /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case.
     pub waiting_bytes_max: usize,
     /// Subscriptions.
     pub subscriptions_max: usize,
@@ -80,6 +81,7 @@ pub struct Session {
     client: Client,
     limits: SessionLimits,
     calls: AtomicUsize,
+    waiting: Arc<AtomicUsize>,
 }
 
 /// A call of a client's, counted while it lasts.
@@ -94,7 +96,7 @@ impl Drop for Counted<'_> {
 impl Session {
     /// A client's.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
-        Self { hub: hub.clone(), client, limits, calls: AtomicUsize::new(0) }
+        Self { hub: hub.clone(), client, limits, calls: AtomicUsize::new(0), waiting: Arc::default() }
     }
 
     /// Who it is.
@@ -105,6 +107,11 @@ impl Session {
     /// The hub.
     pub fn hub(&self) -> &Hub {
         &self.hub
+    }
+
+    /// Bytes of messages that wait for it in all its subscriptions.
+    pub fn waiting_bytes(&self) -> usize {
+        self.waiting.load(Ordering::Relaxed)
     }
 
     /// What it may have. Protocols count what they hold by [`Session::check_count`].
@@ -196,6 +203,7 @@ impl Session {
         let taking = Intaking {
             depth: wanted.depth,
             bytes_max: self.limits.waiting_bytes_max,
+            waiting: Arc::clone(&self.waiting),
             interval_min: wanted.interval_min,
             overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
         };

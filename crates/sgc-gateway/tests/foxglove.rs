@@ -32,7 +32,7 @@ impl Program {
         let types = Types::new(Shipped);
         let options = HubOptions { node: node.to_owned() };
         let hub = Hub::start(Arc::new(site.domain.join(false)), types, options).await.unwrap();
-        let client = Client { name: node.into(), scope: Arc::new(Scope::everything()) };
+        let client = Client::own(node);
         Self { session: Arc::new(Session::new(&hub, client, SessionLimits::default())) }
     }
 
@@ -400,7 +400,7 @@ async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
     let site = Site::new().await;
     let talker = site.writer("/fast", Qos::default());
     site.knows("/fast").await;
-    let client = Client { name: "slow".into(), scope: Arc::new(Scope::everything()) };
+    let client = Client::own("slow");
     let limits = SessionLimits { waiting_bytes_max: 1 << 20, ..SessionLimits::default() };
     let (mut slow, _) = Viewer::new(Session::new(&site.hub, client, limits)).await;
     let (mut fast, _) = Viewer::new(site.session("fast")).await;

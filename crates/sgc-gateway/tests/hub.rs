@@ -1,4 +1,5 @@
 //! Clients of a hub on a network in memory, beside ordinary programs.
+#![allow(clippy::unwrap_used)]
 
 mod support;
 

@@ -35,7 +35,7 @@ impl Site {
     }
 
     pub(crate) fn session_with(&self, name: &str, scope: Scope) -> Session {
-        let client = Client { name: name.into(), scope: Arc::new(scope) };
+        let client = Client::own(name).with_scope(scope);
         Session::new(&self.hub, client, SessionLimits::default())
     }
 

@@ -1,0 +1,722 @@
+"""A client of the gateway: topics, services, actions and the graph. Threads are those of grpc, and one for each service."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import logging
+import os
+import queue
+import threading
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Callable, Dict, Generic, Iterator, List, Mapping, Optional, Set, Tuple, Type, TypeVar, Union
+from urllib.parse import urlsplit
+
+import grpc
+
+from . import _cbor, _proto
+from ._message import Info, Message
+
+_log = logging.getLogger("sgc")
+
+MESSAGE_BYTES_MAX = 64 << 20
+"""Longest message, either way."""
+_PORT = 50051
+_CDR, _CBOR = 1, 3
+_OPTIONS = [
+    ("grpc.max_receive_message_length", MESSAGE_BYTES_MAX),
+    ("grpc.max_send_message_length", MESSAGE_BYTES_MAX),
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 20_000),
+    # Each client has a connection of its own: what one leaves unread is no business of another.
+    ("grpc.use_local_subchannel_pool", 1),
+]
+
+Pem = Union[str, "os.PathLike[str]", bytes]
+"""A file of certificates or a key in PEM: its name, or what is in it."""
+Content = Mapping[str, Any]
+"""A message: members that are left out have their defaults."""
+T = TypeVar("T")
+Handler = TypeVar("Handler", bound=Callable[..., Any])
+
+
+class GatewayError(Exception):
+    """What went wrong, as the gateway says it."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+        """Name of the status of gRPC: ``PERMISSION_DENIED``, ``NOT_FOUND``, ``UNAVAILABLE`` …"""
+
+    @classmethod
+    def _of(cls, error: Any) -> "GatewayError":
+        return cls(error.code().name, error.details() or error.code().name)
+
+
+@dataclass(frozen=True)
+class Qos:
+    """Quality of service; the defaults are those of ROS 2."""
+
+    reliable: bool = True
+    latched: bool = False
+    """Whether those who come later hear what was published before (``transient_local``)."""
+    depth: int = 10
+    keep_all: bool = False
+
+    def _proto(self) -> Any:
+        return _proto.message("Qos")(
+            reliability=2 if self.reliable else 1,
+            durability=2 if self.latched else 1,
+            depth=0 if self.keep_all else self.depth,
+            keep_all=self.keep_all,
+        )
+
+    @classmethod
+    def _of(cls, said: Any) -> "Qos":
+        return cls(said.reliability != 1, said.durability == 2, said.depth, said.keep_all)
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A publisher or a subscriber."""
+
+    node: str
+    type: str
+    qos: Qos
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic."""
+
+    name: str
+    type: str
+    publishers: Tuple[Endpoint, ...]
+    subscribers: Tuple[Endpoint, ...]
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service or an action."""
+
+    name: str
+    type: str
+    servers: Tuple[str, ...]
+    clients: Tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node, and the names of what it has."""
+
+    name: str
+    publishes: Tuple[str, ...]
+    subscribes: Tuple[str, ...]
+    serves: Tuple[str, ...]
+    calls: Tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Graph:
+    """What is on the network, by name."""
+
+    topics: Dict[str, Topic] = field(default_factory=dict)
+    services: Dict[str, Service] = field(default_factory=dict)
+    actions: Dict[str, Service] = field(default_factory=dict)
+    nodes: Dict[str, Node] = field(default_factory=dict)
+
+    def _with(self, changed: Any, gone: Any) -> "Graph":
+        def merged(old: Dict[str, T], new: Any, lost: Any, read: Callable[[Any], T]) -> Dict[str, T]:
+            kept = {name: one for name, one in old.items() if name not in set(lost)}
+            kept.update({one.name: read(one) for one in new})
+            return dict(sorted(kept.items()))
+
+        return Graph(
+            merged(self.topics, changed.topics, gone.topics, _topic),
+            merged(self.services, changed.services, gone.services, _service),
+            merged(self.actions, changed.actions, gone.actions, _service),
+            merged(self.nodes, changed.nodes, gone.nodes, _node),
+        )
+
+
+def _topic(said: Any) -> Topic:
+    def ends(of: Any) -> Tuple[Endpoint, ...]:
+        return tuple(Endpoint(one.node, one.type, Qos._of(one.qos)) for one in of)
+
+    return Topic(said.name, said.type, ends(said.publishers), ends(said.subscribers))
+
+
+def _service(said: Any) -> Service:
+    return Service(said.name, said.type, tuple(said.servers), tuple(said.clients))
+
+
+def _node(said: Any) -> Node:
+    lists = (said.publishes, said.subscribes, said.serves, said.calls)
+    return Node(said.name, *(tuple(one) for one in lists))
+
+
+@dataclass(frozen=True)
+class TypeDefinition:
+    """What a type is."""
+
+    hash: str
+    """``RIHS01_…``, of a message."""
+    texts: Dict[str, str]
+    """The text of its file, and those of all types that it needs."""
+
+
+def _pem(said: Optional[Pem]) -> Optional[bytes]:
+    if said is None or isinstance(said, bytes):
+        return said
+    with open(said, "rb") as file:
+        return file.read()
+
+
+def connect(
+    address: str,
+    *,
+    token: Optional[str] = None,
+    ca: Optional[Pem] = None,
+    certificate: Optional[Pem] = None,
+    key: Optional[Pem] = None,
+    server_name: Optional[str] = None,
+    timeout: float = 10.0,
+) -> "Client":
+    """Connects to a gateway.
+
+    ``address`` is ``grpc://HOST[:PORT]``, or ``grpcs://HOST[:PORT]`` over TLS. A gateway admits by ``token``
+    (``sgc token create`` makes one), by a client certificate (``certificate`` and its ``key``), or programs of its own
+    host. ``ca`` verifies the gateway, by default whom the system trusts; ``server_name`` is what its certificate calls it,
+    if that is not HOST. Files are in PEM.
+    """
+    parts = urlsplit(address if "//" in address else f"grpc://{address}")
+    if parts.scheme not in ("grpc", "grpcs") or not parts.hostname:
+        raise ValueError(f"{address!r} is no address of a gateway: write grpc://HOST:PORT or grpcs://HOST:PORT")
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    target = f"{host}:{parts.port or _PORT}"
+    options: List[Tuple[str, Any]] = list(_OPTIONS)
+    if parts.scheme == "grpc":
+        if ca or certificate or key or server_name:
+            raise ValueError("certificates are for grpcs://")
+        channel = grpc.insecure_channel(target, options)
+    else:
+        if server_name:
+            options.append(("grpc.ssl_target_name_override", server_name))
+        credentials = grpc.ssl_channel_credentials(_pem(ca), _pem(key), _pem(certificate))
+        channel = grpc.secure_channel(target, credentials, options)
+    try:
+        grpc.channel_ready_future(channel).result(timeout)
+    except grpc.FutureTimeoutError:
+        channel.close()
+        raise GatewayError("UNAVAILABLE", f"no gateway at {address} within {timeout:g} s") from None
+    return Client(channel, token)
+
+
+class Client:
+    """A program's connection to a gateway. Threads may share it; it ends with :meth:`close`, or as a context."""
+
+    def __init__(self, channel: Any, token: Optional[str] = None) -> None:
+        self._channel = channel
+        self._calls = _proto.stub(channel)
+        self._metadata = [("authorization", f"Bearer {token}")] if token else []
+        self._open: Set[Any] = set()
+
+    def __enter__(self) -> "Client":
+        return self
+
+    def __exit__(self, kind: Optional[Type[BaseException]], _e: Any, _t: Optional[TracebackType]) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends everything that it began."""
+        for one in list(self._open):
+            try:
+                one.close()
+            except GatewayError as error:
+                _log.error("%s", error)
+        self._channel.close()
+
+    def _unary(self, name: str, request: Any, timeout: Optional[float]) -> Any:
+        try:
+            return self._calls[name](request, timeout=timeout, metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise GatewayError._of(error) from None
+
+    def _stream(self, name: str, request: Any) -> Any:
+        return self._calls[name](request, metadata=self._metadata)
+
+    def graph(self, *, hidden: bool = False, timeout: Optional[float] = 10.0) -> Graph:
+        """What is on the network. With ``hidden`` also that of which actions are made."""
+        request = _proto.message("GetGraphRequest")(include_hidden=hidden)
+        said = self._unary("GetGraph", request, timeout)
+        return Graph()._with(said.graph, _proto.message("WatchGraphResponse.Gone")())
+
+    def watch_graph(self, *, hidden: bool = False) -> Iterator[Graph]:
+        """What is on the network, and again whenever it has changed."""
+        call = self._stream("WatchGraph", _proto.message("WatchGraphRequest")(include_hidden=hidden))
+        graph = Graph()
+        try:
+            for change in call:
+                graph = graph._with(change.changed, change.gone)
+                yield graph
+        except grpc.RpcError as error:
+            raise GatewayError._of(error) from None
+        finally:
+            call.cancel()
+
+    def type(self, name: str, *, timeout: Optional[float] = 10.0) -> TypeDefinition:
+        """What a type is: ``geometry_msgs/msg/Twist``."""
+        said = self._unary("GetType", _proto.message("GetTypeRequest")(type=name), timeout)
+        return TypeDefinition(said.type_hash, {one.type: one.text for one in said.definitions})
+
+    def subscribe(
+        self,
+        topic: str,
+        type: str = "",
+        *,
+        qos: Optional[Qos] = None,
+        depth: int = 10,
+        rate: float = 0.0,
+        waits: bool = False,
+    ) -> "Subscription[Message]":
+        """Hears a topic; it is heard once this returns.
+
+        ``type`` may be left out if somebody has the topic. At most ``rate`` messages a second come, 0 is all. Of what
+        comes too fast the newest ``depth`` are kept; with ``waits`` publishers that keep all wait instead. Without ``qos``
+        each publisher is heard as it offers.
+        """
+        return Subscription(self, _subscribe_request(topic, type, _CBOR, qos, depth, rate, waits), _decode)
+
+    def subscribe_raw(
+        self,
+        topic: str,
+        type: str = "",
+        *,
+        qos: Optional[Qos] = None,
+        depth: int = 10,
+        rate: float = 0.0,
+        waits: bool = False,
+    ) -> "Subscription[Tuple[bytes, Info]]":
+        """The same with messages as ROS 2 serialises them, for who reads CDR."""
+        return Subscription(self, _subscribe_request(topic, type, _CDR, qos, depth, rate, waits), _raw)
+
+    def publisher(self, topic: str, type: str = "", *, qos: Optional[Qos] = None, raw: bool = False) -> "Publisher":
+        """Publishes on a topic. ``type`` may be left out if somebody has the topic; with ``raw`` messages are ``bytes``,
+        as ROS 2 serialises them."""
+        publisher = Publisher(self, topic, type, qos, raw)
+        self._open.add(publisher)
+        return publisher
+
+    def call(
+        self, service: str, request: Optional[Content] = None, type: str = "", *, timeout: Optional[float] = 10.0
+    ) -> Message:
+        """Calls a service, and waits for its reply, so many seconds at most."""
+        payload = _cbor.dumps(request or {})
+        said = _proto.message("CallRequest")(service=service, type=type, encoding=_CBOR, payload=payload)
+        return _message(self._unary("Call", said, timeout).payload)
+
+    def serve(
+        self, service: str, handler: Callable[[Message], Content], type: str = "", *, workers: int = 4
+    ) -> "Serving":
+        """Serves a service until it is closed; it is served once this returns. ``handler`` is given each request and gives
+        the reply, in up to ``workers`` threads; if it fails, that is logged and who called is not answered."""
+        serving = Serving(self, service, type, handler, workers)
+        self._open.add(serving)
+        return serving
+
+    def service(self, name: str, type: str = "", *, workers: int = 4) -> Callable[[Handler], Handler]:
+        """The same as a decorator::
+
+            @robot.service("/switch", "std_srvs/srv/SetBool")
+            def switch(request):
+                return {"success": True}
+        """
+
+        def decorate(handler: Handler) -> Handler:
+            self.serve(name, handler, type, workers=workers)
+            return handler
+
+        return decorate
+
+    def send_goal(self, action: str, goal: Optional[Content] = None, type: str = "") -> "Goal":
+        """Sends a goal; a server has taken it once this returns."""
+        return Goal(self, action, goal or {}, type)
+
+    def serve_action(
+        self, action: str, handler: Callable[["ActionGoal"], Optional[Content]], type: str = "", *, workers: int = 4
+    ) -> "Serving":
+        """Serves an action until it is closed. ``handler`` works on a goal, in a thread of up to ``workers``, and gives the
+        result; if it fails the goal is aborted."""
+        serving = _ServingAction(self, action, type, handler, workers)
+        self._open.add(serving)
+        return serving
+
+    def action(self, name: str, type: str = "", *, workers: int = 4) -> Callable[[Handler], Handler]:
+        """The same as a decorator."""
+
+        def decorate(handler: Handler) -> Handler:
+            self.serve_action(name, handler, type, workers=workers)
+            return handler
+
+        return decorate
+
+
+def _subscribe_request(
+    topic: str, type: str, encoding: int, qos: Optional[Qos], depth: int, rate: float, waits: bool
+) -> Any:
+    request = _proto.message("SubscribeRequest")(
+        topic=topic, type=type, encoding=encoding, depth=depth, max_rate_hz=rate, waits=waits
+    )
+    if qos is not None:
+        request.qos.CopyFrom(qos._proto())
+    return request
+
+
+def _message(payload: bytes) -> Message:
+    message = _cbor.loads(payload)
+    if not isinstance(message, Message):
+        raise GatewayError("INTERNAL", "the gateway sent something else than a message")
+    return message
+
+
+def _info(said: Any) -> Info:
+    return Info(said.source_time_ns, said.received_time_ns, said.node, said.dropped)
+
+
+def _decode(said: Any) -> Message:
+    message = _message(said.payload)
+    message._sgc_info = _info(said)
+    return message
+
+
+def _raw(said: Any) -> Tuple[bytes, Info]:
+    return said.payload, _info(said)
+
+
+class Subscription(Generic[T]):
+    """What is heard on a topic: an iterator, which ends when it is closed."""
+
+    def __init__(self, client: Client, request: Any, read: Callable[[Any], T]) -> None:
+        self.topic: str = request.topic
+        self._read = read
+        self._is_closed = False
+        self._call = client._stream("Subscribe", request)
+        try:
+            first = next(self._call).subscribed
+        except grpc.RpcError as error:
+            raise GatewayError._of(error) from None
+        self.type: str = first.type
+        self.type_hash: str = first.type_hash
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        while True:
+            try:
+                said = next(self._call)
+            except grpc.RpcError as error:
+                if self._is_closed:
+                    raise StopIteration from None
+                raise GatewayError._of(error) from None
+            if said.WhichOneof("kind") == "message":
+                return self._read(said.message)
+            _log.warning("%s: a message of %s: %s", self.topic, said.unreadable.node, said.unreadable.reason)
+
+    def __enter__(self) -> "Subscription[T]":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends it; who waits for a message goes on."""
+        self._is_closed = True
+        self._call.cancel()
+
+
+class _Requests:
+    """What is sent on a stream, at the pace at which the gateway takes it."""
+
+    def __init__(self, waiting_max: int) -> None:
+        self._waiting: "queue.Queue[Any]" = queue.Queue(waiting_max)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._waiting.get, None)
+
+    def put(self, request: Any, call: Any) -> None:
+        """Waits for room, unless the call has ended."""
+        while not call.done():
+            try:
+                return self._waiting.put(request, timeout=0.1)
+            except queue.Full:
+                pass
+        raise GatewayError._of(call)
+
+    def end(self) -> None:
+        """Nothing is sent any more: the thread that sends ends."""
+        while True:
+            try:
+                return self._waiting.put_nowait(None)
+            except queue.Full:
+                try:
+                    self._waiting.get_nowait()
+                except queue.Empty:
+                    pass
+
+
+class Publisher:
+    """Publishes on a topic, until it is closed."""
+
+    def __init__(self, client: Client, topic: str, type: str, qos: Optional[Qos], raw: bool) -> None:
+        self.topic = topic
+        self._client = client
+        self._is_raw = raw
+        self._requests = _Requests(8)
+        first = _proto.message("PublishRequest.Publisher")(topic=topic, type=type, encoding=_CDR if raw else _CBOR)
+        if qos is not None:
+            first.qos.CopyFrom(qos._proto())
+        self._request = _proto.message("PublishRequest")
+        self._requests._waiting.put(self._request(publisher=first))
+        self._call = client._calls["Publish"].future(iter(self._requests), metadata=client._metadata)
+        self._published: Optional[int] = None
+
+    def publish(self, message: Optional[Union[Content, bytes]] = None, **members: Any) -> None:
+        """Publishes a message: ``publish({"data": "left"})`` or ``publish(data="left")``. Waits while the gateway does not
+        take more; what was wrong with an earlier message is raised here."""
+        if self._is_raw:
+            payload = message if isinstance(message, bytes) else b""
+        else:
+            payload = _cbor.dumps(members if message is None else message)
+        self._requests.put(self._request(payload=payload), self._call)
+
+    def close(self, timeout: float = 10.0) -> int:
+        """Ends it; says how many messages were published, and raises what was wrong with one."""
+        self._client._open.discard(self)
+        if self._published is None:
+            try:
+                self._requests.put(None, self._call)
+                self._published = int(self._call.result(timeout).published)
+            except grpc.RpcError as error:
+                raise GatewayError._of(error) from None
+            except grpc.FutureTimeoutError:
+                self._call.cancel()
+                raise GatewayError("DEADLINE_EXCEEDED", f"{self.topic} does not take what waits") from None
+            finally:
+                self._requests.end()
+        return self._published
+
+    def __enter__(self) -> "Publisher":
+        return self
+
+    def __exit__(self, kind: Optional[Type[BaseException]], _e: Any, _t: Any) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._client._open.discard(self)
+            self._call.cancel()
+            self._requests.end()
+
+
+class Serving:
+    """A service or an action that is served, until it is closed."""
+
+    _call_name, _request_name = "Serve", "ServeRequest"
+
+    def __init__(
+        self, client: Client, name: str, type: str, handler: Callable[..., Any], workers: int
+    ) -> None:
+        self.name = name
+        self._client = client
+        self._handler = handler
+        self._requests = _Requests(64)
+        self._request = _proto.message(self._request_name)
+        self._requests._waiting.put(self._request(server=self._server(name, type)))
+        self._call = client._stream(self._call_name, iter(self._requests))
+        self._error: Optional[GatewayError] = None
+        self._is_closed = False
+        try:
+            self.type: str = next(self._call).served.type
+        except grpc.RpcError as error:
+            self._requests.end()
+            raise GatewayError._of(error) from None
+        self._pool = concurrent.futures.ThreadPoolExecutor(workers, thread_name_prefix=f"sgc {name}")
+        self._thread = threading.Thread(target=self._run, name=f"sgc {name}", daemon=True)
+        self._thread.start()
+
+    def _server(self, name: str, type: str) -> Any:
+        return _proto.message("ServeRequest.Server")(service=name, type=type, encoding=_CBOR)
+
+    def _run(self) -> None:
+        try:
+            for said in self._call:
+                self._hear(said)
+        except grpc.RpcError as error:
+            if not self._is_closed:
+                self._error = GatewayError._of(error)
+                _log.error("%s is not served any more: %s", self.name, self._error)
+        finally:
+            self._pool.shutdown(wait=False)
+            self._requests.end()
+            self._client._open.discard(self)
+
+    def _hear(self, said: Any) -> None:
+        kind = said.WhichOneof("kind")
+        if kind == "request":
+            self._pool.submit(self._answer, said.request)
+        elif kind == "refused":
+            _log.error("%s: a reply was refused: %s", self.name, said.refused.reason)
+
+    def _answer(self, asked: Any) -> None:
+        try:
+            payload = _cbor.dumps(self._handler(_message(asked.payload)))
+            reply = _proto.message("ServeRequest.Reply")(id=asked.id, payload=payload)
+            self._say(reply=reply)
+        except Exception:
+            _log.exception("%s: a request is not answered", self.name)
+
+    def _say(self, **kind: Any) -> None:
+        self._requests.put(self._request(**kind), self._call)
+
+    def wait(self) -> None:
+        """Waits until it is closed; raises why, if it was not by this program."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Ends it: what is asked meanwhile is not answered."""
+        self._is_closed = True
+        self._call.cancel()
+
+    def __enter__(self) -> "Serving":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+
+class ActionGoal:
+    """A goal that this program works on."""
+
+    def __init__(self, serving: "_ServingAction", goal_id: bytes, request: Message) -> None:
+        self.id = goal_id
+        self.request = request
+        """What is wanted."""
+        self._serving = serving
+        self._is_to_end = threading.Event()
+
+    @property
+    def is_canceled(self) -> bool:
+        """Whether it is to be given up: then :meth:`Client.serve_action`'s handler gives what it has."""
+        return self._is_to_end.is_set()
+
+    def wait(self, seconds: float) -> bool:
+        """Waits so long, or until it is to be given up; says whether it is."""
+        return self._is_to_end.wait(seconds)
+
+    def feedback(self, message: Content) -> None:
+        """Tells of it."""
+        said = _proto.message("ServeActionRequest.Feedback")(goal_id=self.id, payload=_cbor.dumps(message))
+        self._serving._say(feedback=said)
+
+
+class _ServingAction(Serving):
+    _call_name, _request_name = "ServeAction", "ServeActionRequest"
+
+    def __init__(self, *args: Any) -> None:
+        self._goals: Dict[bytes, ActionGoal] = {}
+        super().__init__(*args)
+
+    def _server(self, name: str, type: str) -> Any:
+        return _proto.message("ServeActionRequest.Server")(action=name, type=type, encoding=_CBOR)
+
+    def _hear(self, said: Any) -> None:
+        kind = said.WhichOneof("kind")
+        if kind == "goal":
+            goal = ActionGoal(self, said.goal.goal_id, _message(said.goal.payload))
+            self._goals[goal.id] = goal
+            self._say(answer=_proto.message("ServeActionRequest.Answer")(goal_id=goal.id, is_taken=True))
+            self._pool.submit(self._work, goal)
+        elif kind == "cancel":
+            goal_to_end = self._goals.get(said.cancel.goal_id)
+            if goal_to_end is not None:
+                goal_to_end._is_to_end.set()
+        elif kind == "refused":
+            _log.error("%s: refused: %s", self.name, said.refused.reason)
+
+    def _work(self, goal: ActionGoal) -> None:
+        finish = _proto.message("ServeActionRequest.Finish")(goal_id=goal.id)
+        try:
+            finish.payload = _cbor.dumps(self._handler(goal) or {})
+            finish.status = 5 if goal.is_canceled else 4
+        except Exception:
+            _log.exception("%s: a goal is aborted", self.name)
+            finish.status, finish.payload = 6, _cbor.dumps({})
+        self._goals.pop(goal.id, None)
+        try:
+            self._say(finish=finish)
+        except GatewayError as error:
+            _log.error("%s: a goal is not finished: %s", self.name, error)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a goal ended."""
+
+    status: str
+    """``succeeded``, ``canceled`` or ``aborted``."""
+    result: Message
+
+
+class Goal:
+    """A goal that a server has taken: iterate over its feedback, then ask for its outcome."""
+
+    _STATUS = {4: "succeeded", 5: "canceled", 6: "aborted"}
+
+    def __init__(self, client: Client, action: str, goal: Content, type: str) -> None:
+        self.action = action
+        self._requests = _Requests(4)
+        self._request = _proto.message("SendGoalRequest")
+        first = _proto.message("SendGoalRequest.Goal")(
+            action=action, type=type, encoding=_CBOR, payload=_cbor.dumps(goal)
+        )
+        self._requests._waiting.put(self._request(goal=first))
+        self._call = client._stream("SendGoal", iter(self._requests))
+        self._outcome: Optional[Outcome] = None
+        taken = self._next()
+        if taken is None:
+            raise GatewayError("INTERNAL", f"{action} said nothing of the goal")
+        self.id: bytes = taken.taken.goal_id
+
+    def _next(self) -> Any:
+        try:
+            return next(self._call, None)
+        except grpc.RpcError as error:
+            self._requests.end()
+            raise GatewayError._of(error) from None
+
+    def __iter__(self) -> Iterator[Message]:
+        """Its feedback, until it has ended."""
+        while self._outcome is None:
+            said = self._next()
+            if said is None:
+                raise GatewayError("UNAVAILABLE", f"{self.action} did not say how the goal ended")
+            kind = said.WhichOneof("kind")
+            if kind == "feedback":
+                yield _message(said.feedback.payload)
+            elif kind == "result":
+                status = self._STATUS.get(said.result.status, "unknown")
+                self._outcome = Outcome(status, _message(said.result.payload))
+                self._requests.end()
+
+    def outcome(self) -> Outcome:
+        """Waits for its end; feedback that was not looked at is left out."""
+        for _ in self:
+            pass
+        assert self._outcome is not None
+        return self._outcome
+
+    def cancel(self) -> None:
+        """Asks its server to give it up."""
+        self._requests.put(self._request(cancel=_proto.message("SendGoalRequest.Cancel")()), self._call)

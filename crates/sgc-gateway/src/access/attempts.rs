@@ -1,0 +1,108 @@
+//! Who showed tokens that do not hold, so that nobody goes on trying, nor makes this node check signatures all day.
+//!
+//! A table with a bound: what an attacker with many addresses can do is make it forget others.
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv6Addr};
+use std::time::Duration;
+
+use sgc_wire::UnixMillis;
+
+/// Tokens of one address that may fail within [`WINDOW_MS`].
+pub(super) const FAILURES_MAX: u32 = 10;
+/// How long failures count, milliseconds.
+pub(super) const WINDOW_MS: u64 = 60_000;
+/// Addresses that are remembered.
+pub(super) const ADDRESSES_MAX: usize = 1024;
+
+/// Failures, by address. Those of IPv6 count by their network of 64 bits, of which one host has all addresses.
+#[derive(Debug, Default)]
+pub(super) struct Attempts {
+    of: BTreeMap<IpAddr, Failures>,
+}
+
+#[derive(Debug)]
+struct Failures {
+    count: u32,
+    since: UnixMillis,
+}
+
+impl Attempts {
+    /// Whether a token of this address is looked at; else how long it is not.
+    pub(super) fn check(&mut self, address: IpAddr, now: UnixMillis) -> Result<(), Duration> {
+        let key = network(address);
+        let Some(Failures { count, since }) = self.of.get(&key) else { return Ok(()) };
+        // A clock that was set back must not keep anybody out.
+        let left = match now.0.checked_sub(since.0) {
+            Some(age) if age < WINDOW_MS => WINDOW_MS - age,
+            _ => {
+                self.of.remove(&key);
+                return Ok(());
+            }
+        };
+        if *count < FAILURES_MAX { Ok(()) } else { Err(Duration::from_millis(left)) }
+    }
+
+    /// A token of this address did not hold.
+    pub(super) fn fail(&mut self, address: IpAddr, now: UnixMillis) {
+        let key = network(address);
+        if !self.of.contains_key(&key) && self.of.len() >= ADDRESSES_MAX {
+            let oldest = self.of.iter().min_by_key(|(_, failures)| failures.since).map(|(key, _)| *key);
+            oldest.map(|oldest| self.of.remove(&oldest));
+        }
+        let failures = self.of.entry(key).or_insert(Failures { count: 0, since: now });
+        failures.count = failures.count.saturating_add(1);
+    }
+}
+
+fn network(address: IpAddr) -> IpAddr {
+    match address.to_canonical() {
+        IpAddr::V4(v4) => IpAddr::V4(v4),
+        IpAddr::V6(v6) => IpAddr::V6(Ipv6Addr::from_bits(v6.to_bits() >> 64 << 64)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
+
+    fn address(text: &str) -> IpAddr {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn an_address_that_fails_often_waits_and_others_do_not() {
+        let mut attempts = Attempts::default();
+        let (bad, other) = (address("10.0.0.66"), address("10.0.0.7"));
+        for _ in 0..FAILURES_MAX {
+            assert_eq!(attempts.check(bad, NOW), Ok(()));
+            attempts.fail(bad, NOW);
+        }
+        let later = UnixMillis(NOW.0 + 20_000);
+        assert_eq!(attempts.check(bad, later), Err(Duration::from_secs(40)));
+        assert_eq!(attempts.check(address("::ffff:10.0.0.66"), later), Err(Duration::from_secs(40)));
+        assert_eq!(attempts.check(other, later), Ok(()));
+        assert_eq!(attempts.check(bad, UnixMillis(NOW.0 + WINDOW_MS)), Ok(()));
+        assert_eq!(attempts.check(bad, NOW), Ok(()), "what is over is forgotten");
+    }
+
+    #[test]
+    fn a_host_with_many_addresses_is_one() {
+        let mut attempts = Attempts::default();
+        (0..FAILURES_MAX).for_each(|n| attempts.fail(address(&format!("2001:db8::{n}")), NOW));
+        assert!(attempts.check(address("2001:db8::ffff"), NOW).is_err());
+        assert_eq!(attempts.check(address("2001:db8:0:1::1"), NOW), Ok(()));
+    }
+
+    #[test]
+    fn what_is_remembered_has_a_bound() {
+        let mut attempts = Attempts::default();
+        for n in 0..2 * ADDRESSES_MAX as u32 {
+            attempts.fail(IpAddr::V4(n.into()), UnixMillis(NOW.0 + u64::from(n)));
+        }
+        assert_eq!(attempts.of.len(), ADDRESSES_MAX);
+        assert!(!attempts.of.contains_key(&address("0.0.0.0")));
+    }
+}

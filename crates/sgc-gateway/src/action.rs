@@ -1,0 +1,651 @@
+//! Actions (the ROS 2 design article "Actions"): [`Goal`] is one that a client has sent, [`ActionServing`] an action that a
+//! client serves.
+//!
+//! An action is three services and two topics, which are used here as any other: nothing below knows of actions.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use aws_lc_rs::rand;
+use bytes::Bytes;
+use sgc_cdr::{Layout, Value};
+use sgc_ros::RequestId;
+use sgc_wire::{Durability, History, Qos};
+use tokio::runtime::Handle;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+use crate::access::Right;
+use crate::content::{Content, Form, write};
+use crate::error::GatewayError;
+use crate::feed::Subscription;
+use crate::hub::{Shared, lock};
+use crate::publisher::Publication;
+use crate::service::{Caller, Replier, Request, Serving};
+use crate::session::{Session, Subscribe};
+use crate::types::InterfaceType;
+
+/// How long a server may take to say whether it takes a goal, or cancels one.
+const ANSWER_MAX: Duration = Duration::from_secs(10);
+/// Messages of feedback that wait for a client.
+const FEEDBACK_DEPTH: usize = 100;
+/// What waits for a client that serves.
+const EVENTS_MAX: usize = 256;
+/// Goals that an action remembers; the oldest that ended give way.
+const GOALS_MAX: usize = 1024;
+/// How long the result of a goal is kept (`rcl_action`'s default).
+const RESULT_KEPT: Duration = Duration::from_secs(900);
+/// Where the id of a goal is in a message of feedback: behind the encapsulation header.
+const GOAL_ID_AT: std::ops::Range<usize> = 4..20;
+
+/// Id of a goal (`unique_identifier_msgs/msg/UUID`).
+pub type GoalId = [u8; 16];
+
+/// How a goal stands (`action_msgs/msg/GoalStatus`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(i8)]
+pub enum GoalStatus {
+    /// Nobody knows of it.
+    Unknown = 0,
+    /// It was taken.
+    Accepted = 1,
+    /// It is worked on.
+    Executing = 2,
+    /// It is to be given up.
+    Canceling = 3,
+    /// It is done.
+    Succeeded = 4,
+    /// It was given up as somebody wished.
+    Canceled = 5,
+    /// It was given up.
+    Aborted = 6,
+}
+
+impl GoalStatus {
+    /// Of its number.
+    pub fn of(number: i64) -> Self {
+        match number {
+            1 => Self::Accepted,
+            2 => Self::Executing,
+            3 => Self::Canceling,
+            4 => Self::Succeeded,
+            5 => Self::Canceled,
+            6 => Self::Aborted,
+            _ => Self::Unknown,
+        }
+    }
+
+    /// Whether it has ended.
+    pub fn is_end(self) -> bool {
+        self >= Self::Succeeded
+    }
+}
+
+/// What a server says to the wish that a goal be given up (`action_msgs/srv/CancelGoal`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(i8)]
+pub enum CancelAnswer {
+    /// It is being given up.
+    Taken = 0,
+    /// It goes on.
+    Rejected = 1,
+    /// Nobody knows of it.
+    UnknownGoal = 2,
+    /// It has ended.
+    Ended = 3,
+}
+
+/// How a goal ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outcome {
+    /// How.
+    pub status: GoalStatus,
+    /// The result, in the form that was asked for.
+    pub result: Bytes,
+}
+
+/// A goal that a client has sent and a server has taken.
+#[derive(Clone)]
+pub struct Goal {
+    shared: Arc<Shared>,
+    action: Arc<str>,
+    id: GoalId,
+    result: Arc<Layout>,
+    get_result: Arc<Caller>,
+}
+
+/// What a server tells of a goal while it works on it.
+#[derive(Debug)]
+pub struct Feedback {
+    id: GoalId,
+    subscription: Subscription,
+    layout: Arc<Layout>,
+}
+
+impl Session {
+    /// The type of an action: as it is said, else as the network has it.
+    pub fn action_type(&self, action: &str, said: Option<&str>) -> Result<String, GatewayError> {
+        let graph = self.hub().graph();
+        let actual = graph.actions.get(action).map(|info| info.type_name.clone());
+        match said.filter(|said| !said.is_empty()) {
+            None => actual.ok_or_else(|| GatewayError::TypeUnknown { name: action.to_owned() }),
+            Some(said) => {
+                let wanted = InterfaceType::Action.full_name(said)?;
+                match actual {
+                    Some(actual) if actual != wanted => {
+                        Err(GatewayError::OtherType { name: action.to_owned(), actual, wanted })
+                    }
+                    _ => Ok(wanted),
+                }
+            }
+        }
+    }
+
+    /// Sends a goal, and waits until a server has taken it; feedback is heard from before that.
+    pub async fn send_goal(
+        &self,
+        action: &str,
+        type_name: Option<&str>,
+        goal: &Content,
+    ) -> Result<(Goal, Feedback), GatewayError> {
+        self.check(Right::Call, action)?;
+        let of = self.action_type(action, type_name)?;
+        let shared = &self.hub().shared;
+        let (name, service) = (of.clone(), action.to_owned());
+        let (layouts, send, get_result) = shared
+            .run(move |shared| {
+                let layouts = Layouts::find(shared, &name)?;
+                let caller = |part: &str, of: &str| shared.caller(&format!("{service}/_action/{part}"), of);
+                let send = caller("send_goal", &format!("{name}_SendGoal"))?;
+                Ok((layouts, send, caller("get_result", &format!("{name}_GetResult"))?))
+            })
+            .await?;
+        let wanted = Subscribe {
+            topic: format!("{action}/_action/feedback"),
+            type_name: Some(format!("{of}_FeedbackMessage")),
+            depth: FEEDBACK_DEPTH,
+            ..Subscribe::default()
+        };
+        let subscription = self.subscribe_checked(wanted).await?;
+        let mut id = [0; 16];
+        rand::fill(&mut id).map_err(|_| GatewayError::Stopping)?;
+        // A UUID of random bits (RFC 9562, 5.4).
+        id[6] = id[6] & 0x0f | 0x40;
+        id[8] = id[8] & 0x3f | 0x80;
+        let goal = goal.value(&layouts.goal)?;
+        let request = record([("goal_id", uuid(&id)), ("goal", goal)]);
+        let payload = write(&send.halves.request, &request, Form::Cdr)?;
+        let reply = send.call(payload, ANSWER_MAX).await?;
+        let reply = send.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
+        if reply.at("accepted") != Some(Value::Bool(true)) {
+            return Err(GatewayError::GoalRejected { name: action.to_owned() });
+        }
+        let feedback = Feedback { id, subscription, layout: layouts.feedback };
+        let goal = Goal {
+            shared: Arc::clone(shared),
+            action: action.into(),
+            id,
+            result: layouts.result,
+            get_result,
+        };
+        Ok((goal, feedback))
+    }
+
+    /// Serves an action.
+    pub async fn serve_action(
+        &self,
+        action: &str,
+        type_name: Option<&str>,
+    ) -> Result<ActionServing, GatewayError> {
+        self.check(Right::Serve, action)?;
+        let of = self.action_type(action, type_name)?;
+        ActionServing::new(&self.hub().shared, action, &of).await
+    }
+}
+
+impl Goal {
+    /// Its id.
+    pub fn id(&self) -> &GoalId {
+        &self.id
+    }
+
+    /// Waits for its end, so long at most.
+    pub async fn outcome(&self, form: Form, max: Duration) -> Result<Outcome, GatewayError> {
+        let request = record([("goal_id", uuid(&self.id))]);
+        let payload = write(&self.get_result.halves.request, &request, Form::Cdr)?;
+        let reply = self.get_result.call(payload, max).await?;
+        let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
+        let status = GoalStatus::of(integer(&reply, "status"));
+        let result = reply.at("result").unwrap_or(Value::Record(Vec::new()));
+        Ok(Outcome { status, result: write(&self.result, &result, form)? })
+    }
+
+    /// Asks the server to give it up.
+    pub async fn cancel(&self) -> Result<CancelAnswer, GatewayError> {
+        let service = format!("{}/_action/cancel_goal", self.action);
+        let caller =
+            self.shared.run(move |shared| shared.caller(&service, "action_msgs/srv/CancelGoal")).await?;
+        let info = record([("goal_id", uuid(&self.id)), ("stamp", stamp(0))]);
+        let request = record([("goal_info", info)]);
+        let payload = write(&caller.halves.request, &request, Form::Cdr)?;
+        let reply = caller.call(payload, ANSWER_MAX).await?;
+        let reply = caller.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
+        Ok(match integer(&reply, "return_code") {
+            0 => CancelAnswer::Taken,
+            2 => CancelAnswer::UnknownGoal,
+            3 => CancelAnswer::Ended,
+            _ => CancelAnswer::Rejected,
+        })
+    }
+}
+
+impl fmt::Debug for Goal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Goal").field("action", &self.action).field("id", &self.id).finish_non_exhaustive()
+    }
+}
+
+impl Feedback {
+    /// Waits for the next word of this goal; `None` once the gateway stops.
+    pub async fn next(&mut self, form: Form) -> Option<Result<Bytes, GatewayError>> {
+        loop {
+            let delivery = self.subscription.next().await?;
+            let payload = &delivery.message.payload;
+            // Those of other goals are not decoded, but where the sizes of what is within come first.
+            let is_delimited = payload.get(1).is_some_and(|id| *id >= 8);
+            if !is_delimited && payload.get(GOAL_ID_AT) != Some(&self.id) {
+                continue;
+            }
+            let said = match self.subscription.layout().decode(payload) {
+                Ok(said) => said,
+                Err(error) => return Some(Err(GatewayError::Decode(error))),
+            };
+            if goal_id(&said, "goal_id") != Some(self.id) {
+                continue;
+            }
+            let feedback = said.at("feedback").unwrap_or(Value::Record(Vec::new()));
+            return Some(write(&self.layout, &feedback, form));
+        }
+    }
+}
+
+/// What goals, results and feedback of an action look like.
+#[derive(Clone, Debug)]
+struct Layouts {
+    goal: Arc<Layout>,
+    result: Arc<Layout>,
+    feedback: Arc<Layout>,
+}
+
+impl Layouts {
+    fn find(shared: &Shared, of: &str) -> Result<Self, GatewayError> {
+        let layout = |part: &str| shared.types.layout(&format!("{of}_{part}"), None);
+        Ok(Self { goal: layout("Goal")?, result: layout("Result")?, feedback: layout("Feedback")? })
+    }
+}
+
+/// What a client that serves an action is told.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ActionEvent {
+    /// A goal, which is to be taken or rejected.
+    Goal {
+        /// Its id.
+        id: GoalId,
+        /// What is wanted.
+        goal: Value,
+    },
+    /// A goal that was taken is to be given up: it is the client's to end it.
+    Cancel {
+        /// Its id.
+        id: GoalId,
+    },
+}
+
+/// An action that a client serves; ends when dropped, and with it goals that were taken: they are aborted.
+#[derive(Debug)]
+pub struct ActionServing {
+    events: mpsc::Receiver<ActionEvent>,
+    server: Arc<ActionServer>,
+    task: JoinHandle<()>,
+    runtime: Handle,
+}
+
+/// What answers at an action that a client serves.
+#[derive(Clone, Debug)]
+pub struct ActionReplier(Arc<ActionServer>);
+
+#[derive(Debug)]
+struct ActionServer {
+    action: String,
+    layouts: Layouts,
+    goals: Mutex<Goals>,
+    send_goal: Replier,
+    get_result: Replier,
+    cancel_goal: Replier,
+    feedback: Publication,
+    status: Publication,
+}
+
+type Goals = BTreeMap<GoalId, Served>;
+
+#[derive(Debug)]
+struct Served {
+    status: GoalStatus,
+    /// The request that has not been answered yet.
+    asked: Option<RequestId>,
+    taken_ns: i64,
+    result: Option<Value>,
+    /// Those who wait for the result.
+    waiting: Vec<RequestId>,
+    ended: Option<Instant>,
+}
+
+impl ActionServing {
+    async fn new(shared: &Arc<Shared>, action: &str, of: &str) -> Result<Self, GatewayError> {
+        let name = of.to_owned();
+        let layouts = shared.run(move |shared| Layouts::find(shared, &name)).await?;
+        let part = |part: &str| format!("{action}/_action/{part}");
+        let goals = Serving::new(shared, part("send_goal"), format!("{of}_SendGoal")).await?;
+        let results = Serving::new(shared, part("get_result"), format!("{of}_GetResult")).await?;
+        let cancels =
+            Serving::new(shared, part("cancel_goal"), "action_msgs/srv/CancelGoal".to_owned()).await?;
+        let feedback_type = format!("{of}_FeedbackMessage");
+        let feedback = Publication::new(shared, part("feedback"), feedback_type, Qos::default()).await?;
+        let latched =
+            Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
+        let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
+        let status = Publication::new(shared, part("status"), status_type, latched).await?;
+        let server = Arc::new(ActionServer {
+            action: action.to_owned(),
+            layouts,
+            goals: Mutex::default(),
+            send_goal: goals.replier(),
+            get_result: results.replier(),
+            cancel_goal: cancels.replier(),
+            feedback,
+            status,
+        });
+        let (send, events) = mpsc::channel(EVENTS_MAX);
+        let task = tokio::spawn(serve(Arc::clone(&server), [goals, results, cancels], send));
+        Ok(Self { events, server, task, runtime: shared.runtime.clone() })
+    }
+
+    /// The action.
+    pub fn action(&self) -> &str {
+        &self.server.action
+    }
+
+    /// Waits for what comes next; `None` once the gateway stops.
+    pub async fn next(&mut self) -> Option<ActionEvent> {
+        self.events.recv().await
+    }
+
+    /// A goal in a form.
+    pub fn write(&self, goal: &Value, form: Form) -> Result<Bytes, GatewayError> {
+        write(&self.server.layouts.goal, goal, form)
+    }
+
+    /// What answers.
+    pub fn replier(&self) -> ActionReplier {
+        ActionReplier(Arc::clone(&self.server))
+    }
+}
+
+impl Drop for ActionServing {
+    fn drop(&mut self) {
+        self.task.abort();
+        let server = Arc::clone(&self.server);
+        self.runtime.spawn(async move { server.abort_all().await });
+    }
+}
+
+impl ActionReplier {
+    /// Takes a goal, which is worked on from now on, or rejects it.
+    pub async fn answer(&self, id: &GoalId, is_taken: bool) -> Result<(), GatewayError> {
+        let server = &self.0;
+        let (asked, taken_ns) = {
+            let mut goals = lock(&server.goals);
+            let goal = goals.get_mut(id).ok_or_else(|| server.no_goal())?;
+            let asked = goal.asked.take().ok_or_else(|| server.no_goal())?;
+            goal.status = GoalStatus::Executing;
+            let taken_ns = goal.taken_ns;
+            if !is_taken {
+                goals.remove(id);
+            }
+            (asked, taken_ns)
+        };
+        let reply = record([("accepted", Value::Bool(is_taken)), ("stamp", stamp(taken_ns))]);
+        server.send_goal.reply_value(asked, &reply).await?;
+        if is_taken { server.publish_status().await } else { Ok(()) }
+    }
+
+    /// Tells of a goal that is worked on.
+    pub async fn feedback(&self, id: &GoalId, content: &Content) -> Result<(), GatewayError> {
+        let server = &self.0;
+        if lock(&server.goals).get(id).is_none_or(|goal| goal.status.is_end()) {
+            return Err(server.no_goal());
+        }
+        let feedback = content.value(&server.layouts.feedback)?;
+        server.feedback.publish_value(&record([("goal_id", uuid(id)), ("feedback", feedback)])).await
+    }
+
+    /// Ends a goal.
+    pub async fn finish(
+        &self,
+        id: &GoalId,
+        status: GoalStatus,
+        content: &Content,
+    ) -> Result<(), GatewayError> {
+        let server = &self.0;
+        let result = content.value(&server.layouts.result)?;
+        server.finish(id, status, result).await
+    }
+}
+
+impl ActionServer {
+    fn no_goal(&self) -> GatewayError {
+        GatewayError::NotThere { name: self.action.clone(), what: "asked for such a goal" }
+    }
+
+    fn no_result(&self) -> Value {
+        self.layouts.result.from_json(b"{}").unwrap_or(Value::Record(Vec::new()))
+    }
+
+    async fn finish(&self, id: &GoalId, status: GoalStatus, result: Value) -> Result<(), GatewayError> {
+        let status = if status.is_end() { status } else { GoalStatus::Aborted };
+        let waiting = {
+            let mut goals = lock(&self.goals);
+            let goal = goals.get_mut(id).filter(|goal| !goal.status.is_end() && goal.asked.is_none());
+            let goal = goal.ok_or_else(|| self.no_goal())?;
+            goal.status = status;
+            goal.ended = Some(Instant::now());
+            goal.result = Some(result.clone());
+            std::mem::take(&mut goal.waiting)
+        };
+        for asked in waiting {
+            self.reply_result(asked, status, result.clone()).await;
+        }
+        self.publish_status().await
+    }
+
+    async fn reply_result(&self, asked: RequestId, status: GoalStatus, result: Value) {
+        let reply = record([("status", Value::Int(status as i64)), ("result", result)]);
+        if let Err(error) = self.get_result.reply_value(asked, &reply).await {
+            tracing::debug!(%error, "the result of a goal could not be said");
+        }
+    }
+
+    async fn abort_all(&self) {
+        let open: Vec<GoalId> =
+            lock(&self.goals).iter().filter(|(_, goal)| !goal.status.is_end()).map(|(id, _)| *id).collect();
+        for id in open {
+            let _ = self.finish(&id, GoalStatus::Aborted, self.no_result()).await;
+        }
+    }
+
+    async fn publish_status(&self) -> Result<(), GatewayError> {
+        let list = lock(&self.goals)
+            .iter()
+            .filter(|(_, goal)| goal.asked.is_none())
+            .map(|(id, goal)| {
+                let info = record([("goal_id", uuid(id)), ("stamp", stamp(goal.taken_ns))]);
+                record([("goal_info", info), ("status", Value::Int(goal.status as i64))])
+            })
+            .collect();
+        self.status.publish_value(&record([("status_list", Value::List(list))])).await
+    }
+
+    /// Makes room for one more; false if all are worked on.
+    fn has_room(goals: &mut Goals) -> bool {
+        let is_old = |goal: &Served| goal.ended.is_some_and(|ended| ended.elapsed() >= RESULT_KEPT);
+        goals.retain(|_, goal| !is_old(goal));
+        if goals.len() >= GOALS_MAX
+            && let Some((_, oldest)) = goals.iter().filter_map(|(id, goal)| Some((goal.ended?, *id))).min()
+        {
+            goals.remove(&oldest);
+        }
+        goals.len() < GOALS_MAX
+    }
+
+    async fn take_goal(&self, serving: &Serving, request: Request, events: &mpsc::Sender<ActionEvent>) {
+        let said = serving.request_layout().decode(&request.payload);
+        let found = said.ok().and_then(|said| Some((goal_id(&said, "goal_id")?, said.at("goal")?)));
+        let is_new = found.as_ref().is_some_and(|(id, _)| {
+            let mut goals = lock(&self.goals);
+            let is_new = !goals.contains_key(id) && Self::has_room(&mut goals);
+            if is_new {
+                let taken_ns = now_ns();
+                let (asked, status) = (Some(request.id), GoalStatus::Unknown);
+                let (result, waiting, ended) = (None, Vec::new(), None);
+                goals.insert(*id, Served { status, asked, taken_ns, result, waiting, ended });
+            }
+            is_new
+        });
+        match found {
+            Some((id, goal)) if is_new => drop(events.send(ActionEvent::Goal { id, goal }).await),
+            _ => {
+                let reply = record([("accepted", Value::Bool(false)), ("stamp", stamp(0))]);
+                let _ = self.send_goal.reply_value(request.id, &reply).await;
+            }
+        }
+    }
+
+    async fn take_result(&self, serving: &Serving, request: Request) {
+        let said = serving.request_layout().decode(&request.payload);
+        let id = said.ok().and_then(|said| goal_id(&said, "goal_id"));
+        let ended = {
+            let mut goals = lock(&self.goals);
+            match id.and_then(|id| goals.get_mut(&id)) {
+                None => Some((GoalStatus::Unknown, self.no_result())),
+                Some(goal) => match &goal.result {
+                    Some(result) => Some((goal.status, result.clone())),
+                    None => {
+                        if goal.waiting.len() < EVENTS_MAX {
+                            goal.waiting.push(request.id);
+                        }
+                        None
+                    }
+                },
+            }
+        };
+        if let Some((status, result)) = ended {
+            self.reply_result(request.id, status, result).await;
+        }
+    }
+
+    async fn take_cancel(&self, serving: &Serving, request: Request, events: &mpsc::Sender<ActionEvent>) {
+        let said = serving.request_layout().decode(&request.payload).ok();
+        let id = said.as_ref().and_then(|said| goal_id(said, "goal_info.goal_id")).unwrap_or_default();
+        let until = said.as_ref().map_or(0, |said| {
+            integer(said, "goal_info.stamp.sec") * 1_000_000_000 + integer(said, "goal_info.stamp.nanosec")
+        });
+        let (answer, canceling) = {
+            let mut goals = lock(&self.goals);
+            let is_all = id == GoalId::default();
+            let mut chosen = Vec::new();
+            for (goal, served) in goals.iter_mut() {
+                // All, all until then, or the one: and with a time, those until then beside it.
+                let is_meant = if is_all && until == 0 {
+                    true
+                } else {
+                    *goal == id || (until > 0 && served.taken_ns <= until)
+                };
+                let is_active = served.asked.is_none() && !served.status.is_end();
+                if is_meant && is_active {
+                    served.status = GoalStatus::Canceling;
+                    chosen.push((*goal, served.taken_ns));
+                }
+            }
+            let answer = match (chosen.is_empty(), goals.get(&id)) {
+                (false, _) => CancelAnswer::Taken,
+                (true, _) if is_all => CancelAnswer::Taken,
+                (true, Some(_)) => CancelAnswer::Ended,
+                (true, None) => CancelAnswer::UnknownGoal,
+            };
+            (answer, chosen)
+        };
+        let list = canceling.iter().map(|(id, ns)| record([("goal_id", uuid(id)), ("stamp", stamp(*ns))]));
+        let reply = record([
+            ("return_code", Value::Int(answer as i64)),
+            ("goals_canceling", Value::List(list.collect())),
+        ]);
+        let _ = self.cancel_goal.reply_value(request.id, &reply).await;
+        for (id, _) in canceling {
+            let _ = events.send(ActionEvent::Cancel { id }).await;
+        }
+        let _ = self.publish_status().await;
+    }
+}
+
+/// Takes what comes at the three services of an action.
+async fn serve(
+    server: Arc<ActionServer>,
+    [mut goals, mut results, mut cancels]: [Serving; 3],
+    events: mpsc::Sender<ActionEvent>,
+) {
+    loop {
+        tokio::select! {
+            Some(request) = goals.next() => server.take_goal(&goals, request, &events).await,
+            Some(request) = results.next() => server.take_result(&results, request).await,
+            Some(request) = cancels.next() => server.take_cancel(&cancels, request, &events).await,
+            else => return,
+        }
+    }
+}
+
+fn record<const N: usize>(members: [(&str, Value); N]) -> Value {
+    Value::Record(members.into_iter().map(|(name, value)| (Arc::from(name), value)).collect())
+}
+
+fn uuid(id: &GoalId) -> Value {
+    record([("uuid", Value::Octets(Bytes::copy_from_slice(id)))])
+}
+
+/// A `builtin_interfaces/msg/Time`.
+fn stamp(ns: i64) -> Value {
+    let (sec, nanosec) = (ns.div_euclid(1_000_000_000), ns.rem_euclid(1_000_000_000));
+    record([("sec", Value::Int(sec)), ("nanosec", Value::Uint(nanosec.unsigned_abs()))])
+}
+
+fn goal_id(value: &Value, path: &str) -> Option<GoalId> {
+    match value.at(&format!("{path}.uuid")) {
+        Some(Value::Octets(id)) => id.as_ref().try_into().ok(),
+        _ => None,
+    }
+}
+
+fn integer(value: &Value, path: &str) -> i64 {
+    match value.at(path) {
+        Some(Value::Int(number)) => number,
+        Some(Value::Uint(number)) => i64::try_from(number).unwrap_or(i64::MAX),
+        _ => 0,
+    }
+}
+
+fn now_ns() -> i64 {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX))
+}

@@ -1,0 +1,259 @@
+//! `SendGoal` and `ServeAction`: goals that a client sends, and those that it serves.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::FutureExt as _;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Status, Streaming};
+
+use super::client::{Guest, Place, Taken};
+use super::fault::Fault;
+use super::proto::send_goal_request::{Goal as GoalSaid, Kind as Asked};
+use super::proto::send_goal_response as sent;
+use super::proto::serve_action_request::{Finish, Kind as Said, Server};
+use super::proto::serve_action_response as served;
+use super::proto::{self, SendGoalRequest, SendGoalResponse, ServeActionRequest, ServeActionResponse};
+use super::qos;
+use super::service::Responses;
+use crate::action::{
+    ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus,
+};
+use crate::content::{Content, Form};
+use crate::error::GatewayError;
+
+/// Responses that wait for a client: what comes beyond them waits in the hub.
+const RESPONSES_MAX: usize = 16;
+/// How long the end of a goal is waited for.
+const OUTCOME_WAIT_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
+/// Feedback that was there when a goal ended and is told before that.
+const LAST_FEEDBACK_MAX: usize = 64;
+/// What is to come first.
+const ORDER_GOAL: Fault = Fault::Order { what: "the goal" };
+const ORDER_ACTION: Fault = Fault::Order { what: "the action" };
+
+type Told<T> = mpsc::Sender<Result<T, Status>>;
+
+/// Sends a goal, and tells of it until it has ended.
+pub(super) async fn send_goal(
+    guest: Arc<Guest>,
+    mut requests: Streaming<SendGoalRequest>,
+) -> Result<Responses<SendGoalResponse>, Status> {
+    let place = guest.take(Taken::Goal)?;
+    let first = async { Ok(requests.message().await) };
+    let Some(SendGoalRequest { kind: Some(Asked::Goal(said)) }) = guest.admitted(first).await?? else {
+        return Err(ORDER_GOAL.into());
+    };
+    let GoalSaid { action, r#type, encoding, payload } = said;
+    let form = qos::form(encoding)?;
+    let said = Some(&*r#type).filter(|name| !name.is_empty());
+    let content = Content { form, bytes: payload };
+    let sent = async {
+        let taken = guest.session.send_goal(&action, said, &content).await?;
+        Ok((guest.session.action_type(&action, said)?, taken))
+    };
+    let (type_name, (goal, feedback)) = guest.admitted(sent).await?;
+    let (told, responses) = mpsc::channel(RESPONSES_MAX);
+    let taken = sent::Taken { goal_id: goal.id().to_vec().into(), r#type: type_name };
+    let _ = told.try_send(Ok(SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) }));
+    tokio::spawn(Sent { place, goal, feedback, form }.run(requests, told));
+    Ok(Box::pin(ReceiverStream::new(responses)))
+}
+
+/// A goal that a server has taken.
+struct Sent {
+    place: Place,
+    goal: Goal,
+    feedback: Feedback,
+    form: Form,
+}
+
+impl Sent {
+    async fn run(mut self, requests: Streaming<SendGoalRequest>, told: Told<SendGoalResponse>) {
+        let guest = Arc::clone(&self.place.guest);
+        let why = tokio::select! {
+            biased;
+            why = guest.ended() => Err(Status::from(why)),
+            // Its client has gone.
+            () = told.closed() => return,
+            done = self.work(requests, &told) => done,
+        };
+        drop(self);
+        if let Err(why) = why {
+            let _ = told.send(Err(why)).await;
+        }
+    }
+
+    async fn work(
+        &mut self,
+        mut requests: Streaming<SendGoalRequest>,
+        told: &Told<SendGoalResponse>,
+    ) -> Result<(), Status> {
+        let Self { goal, feedback, form, .. } = self;
+        let tell = async |kind: sent::Kind| {
+            let _ = told.send(Ok(SendGoalResponse { kind: Some(kind) })).await;
+        };
+        let ended = goal.outcome(*form, OUTCOME_WAIT_MAX);
+        tokio::pin!(ended);
+        let mut is_asking = true;
+        loop {
+            tokio::select! {
+                outcome = &mut ended => {
+                    let outcome = outcome.map_err(Fault::from)?;
+                    for _ in 0..LAST_FEEDBACK_MAX {
+                        let Some(Some(next)) = feedback.next(*form).now_or_never() else { break };
+                        if let Ok(payload) = next {
+                            tell(sent::Kind::Feedback(sent::Feedback { payload })).await;
+                        }
+                    }
+                    let (status, payload) = (to_proto(outcome.status).into(), outcome.result);
+                    tell(sent::Kind::Result(sent::Result { status, payload })).await;
+                    return Ok(());
+                }
+                next = feedback.next(*form) => match next {
+                    None => return Err(Fault::from(GatewayError::Stopping).into()),
+                    Some(Ok(payload)) => tell(sent::Kind::Feedback(sent::Feedback { payload })).await,
+                    Some(Err(error)) => tracing::debug!(%error, "feedback that cannot be read is left out"),
+                },
+                asked = requests.message(), if is_asking => match asked? {
+                    None => is_asking = false,
+                    Some(SendGoalRequest { kind: Some(Asked::Cancel(_)) }) => {
+                        let answer = goal.cancel().await.map_err(Fault::from)?;
+                        let is_taken = answer == CancelAnswer::Taken;
+                        tell(sent::Kind::CancelAnswer(sent::CancelAnswer { is_taken })).await;
+                    }
+                    Some(_) => return Err(ORDER_GOAL.into()),
+                },
+            }
+        }
+    }
+}
+
+fn to_proto(status: GoalStatus) -> proto::GoalStatus {
+    match status {
+        GoalStatus::Succeeded => proto::GoalStatus::Succeeded,
+        GoalStatus::Canceled => proto::GoalStatus::Canceled,
+        GoalStatus::Aborted => proto::GoalStatus::Aborted,
+        _ => proto::GoalStatus::Unspecified,
+    }
+}
+
+/// Serves an action for as long as its client listens and speaks.
+pub(super) async fn serve(
+    guest: Arc<Guest>,
+    mut requests: Streaming<ServeActionRequest>,
+) -> Result<Responses<ServeActionResponse>, Status> {
+    let place = guest.take(Taken::Serving)?;
+    let first = async { Ok(requests.message().await) };
+    let Some(ServeActionRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
+        return Err(ORDER_ACTION.into());
+    };
+    let Server { action, r#type, encoding } = server;
+    let form = qos::form(encoding)?;
+    let said = Some(&*r#type).filter(|name| !name.is_empty());
+    let serving = async {
+        let serving = guest.session.serve_action(&action, said).await?;
+        Ok((guest.session.action_type(&action, said)?, serving))
+    };
+    let (type_name, serving) = guest.admitted(serving).await?;
+    let replier = serving.replier();
+    let (told, responses) = mpsc::channel(RESPONSES_MAX);
+    let first = served::Kind::Served(served::Served { r#type: type_name });
+    let _ = told.try_send(Ok(ServeActionResponse { kind: Some(first) }));
+    tokio::spawn(Served { place, serving, replier, form }.run(requests, told));
+    Ok(Box::pin(ReceiverStream::new(responses)))
+}
+
+/// An action that a client serves.
+struct Served {
+    place: Place,
+    serving: ActionServing,
+    replier: ActionReplier,
+    form: Form,
+}
+
+impl Served {
+    async fn run(mut self, requests: Streaming<ServeActionRequest>, told: Told<ServeActionResponse>) {
+        let guest = Arc::clone(&self.place.guest);
+        let why = tokio::select! {
+            biased;
+            why = guest.ended() => Err(Status::from(why)),
+            // Its client has gone.
+            () = told.closed() => return,
+            done = self.work(requests, &told) => done,
+        };
+        drop(self);
+        if let Err(why) = why {
+            let _ = told.send(Err(why)).await;
+        }
+    }
+
+    async fn work(
+        &mut self,
+        mut requests: Streaming<ServeActionRequest>,
+        told: &Told<ServeActionResponse>,
+    ) -> Result<(), Status> {
+        loop {
+            tokio::select! {
+                said = requests.message() => {
+                    let Some(said) = said? else { return Ok(()) };
+                    let Some(kind) = said.kind else { return Err(ORDER_ACTION.into()) };
+                    let goal_id = match &kind {
+                        Said::Server(_) => return Err(ORDER_ACTION.into()),
+                        Said::Answer(said) => said.goal_id.clone(),
+                        Said::Feedback(said) => said.goal_id.clone(),
+                        Said::Finish(said) => said.goal_id.clone(),
+                    };
+                    if let Err(why) = self.hear(kind).await {
+                        let refused = served::Kind::Refused(served::Refused { goal_id, reason: why.to_string() });
+                        let _ = told.send(Ok(ServeActionResponse { kind: Some(refused) })).await;
+                    }
+                }
+                event = async {
+                    let room = told.reserve().await.ok()?;
+                    Some((room, self.serving.next().await))
+                } => {
+                    let Some((room, event)) = event else { return Ok(()) };
+                    let kind = match event.ok_or(Fault::from(GatewayError::Stopping))? {
+                        ActionEvent::Goal { id, goal } => {
+                            let payload = self.serving.write(&goal, self.form).map_err(Fault::from)?;
+                            served::Kind::Goal(served::Goal { goal_id: id.to_vec().into(), payload })
+                        }
+                        ActionEvent::Cancel { id } => {
+                            served::Kind::Cancel(served::Cancel { goal_id: id.to_vec().into() })
+                        }
+                    };
+                    room.send(Ok(ServeActionResponse { kind: Some(kind) }));
+                }
+            }
+        }
+    }
+
+    async fn hear(&self, said: Said) -> Result<(), Fault> {
+        let content = |bytes| Content { form: self.form, bytes };
+        match said {
+            Said::Server(_) => return Err(ORDER_ACTION),
+            Said::Answer(said) => self.replier.answer(&goal_id(&said.goal_id)?, said.is_taken).await?,
+            Said::Feedback(said) => {
+                self.replier.feedback(&goal_id(&said.goal_id)?, &content(said.payload)).await?;
+            }
+            Said::Finish(Finish { goal_id: id, status, payload }) => {
+                let status = match proto::GoalStatus::try_from(status) {
+                    Ok(proto::GoalStatus::Unspecified | proto::GoalStatus::Succeeded) => {
+                        GoalStatus::Succeeded
+                    }
+                    Ok(proto::GoalStatus::Canceled) => GoalStatus::Canceled,
+                    Ok(proto::GoalStatus::Aborted) => GoalStatus::Aborted,
+                    Err(_) => return Err(Fault::Enumeration { what: "status of a goal", number: status }),
+                };
+                self.replier.finish(&goal_id(&id)?, status, &content(payload)).await?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn goal_id(said: &[u8]) -> Result<GoalId, Fault> {
+    said.try_into().map_err(|_| Fault::GoalId { bytes: said.len() })
+}

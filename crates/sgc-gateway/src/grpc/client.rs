@@ -1,0 +1,273 @@
+//! [`Clients`]: who was admitted. A [`Guest`] is one credential on one connection: it has a session, whose bounds all its
+//! streams share, and ends all of them once it is not admitted any more.
+
+use std::future::Future;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, Weak};
+use std::time::Duration;
+
+use aws_lc_rs::digest::{SHA256, digest};
+use sgc_wire::UnixMillis;
+use tokio::sync::watch;
+use tonic::{Request, Status};
+
+use super::GrpcOptions;
+use super::connection::Connection;
+use super::fault::Fault;
+use crate::access::{Access, Admission, Client, Denied};
+use crate::error::GatewayError;
+use crate::feed::{Subscription, SubscriptionEnd};
+use crate::hub::{Hub, lock};
+use crate::session::Session;
+
+/// Credentials that may be in use on one connection at a time.
+const CREDENTIALS_MAX: usize = 16;
+
+/// Access as it is at present.
+type Gate = Arc<dyn Fn() -> Access + Send + Sync>;
+
+/// Admits clients.
+pub(super) struct Clients {
+    hub: Hub,
+    access: Gate,
+    options: GrpcOptions,
+    stopping: watch::Receiver<bool>,
+}
+
+/// What was shown: of a token its hash, so that none is kept.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Shown {
+    token: Option<[u8; 32]>,
+    origin: Option<Box<str>>,
+}
+
+/// Who was admitted on a connection because of what.
+pub(super) struct Known {
+    shown: Shown,
+    guest: Arc<Guest>,
+}
+
+impl Clients {
+    pub(super) fn new(hub: Hub, access: Gate, options: GrpcOptions, stopping: watch::Receiver<bool>) -> Self {
+        Self { hub, access, options, stopping }
+    }
+
+    pub(super) fn hub(&self) -> &Hub {
+        &self.hub
+    }
+
+    /// Who makes a request.
+    pub(super) fn admit(&self, request: &Request<()>) -> Result<Arc<Guest>, Status> {
+        Ok(self.find(request)?)
+    }
+
+    fn find(&self, request: &Request<()>) -> Result<Arc<Guest>, Fault> {
+        if *self.stopping.borrow() {
+            return Err(GatewayError::Stopping.into());
+        }
+        let connection = request.extensions().get::<Connection>().ok_or(Fault::NoConnection)?;
+        let text = |name: &str| request.metadata().get(name).map(|value| value.to_str());
+        let token = match text("authorization").transpose().map_err(|_| Fault::Authorization)? {
+            Some(header) => Some(bearer(header).ok_or(Fault::Authorization)?),
+            None => None,
+        };
+        // One that is no text is one all the same, and of nobody.
+        let origin = text("origin").map(|origin| origin.unwrap_or("?"));
+        let shown = Shown {
+            token: token.map(|token| {
+                let mut hash = [0; 32];
+                hash.copy_from_slice(digest(&SHA256, token.as_bytes()).as_ref());
+                hash
+            }),
+            origin: origin.map(Box::from),
+        };
+        let access = (self.access)();
+        let mut known = lock(connection.known());
+        if let Some(at) = known.iter().position(|known| known.shown == shown) {
+            let guest = &known[at].guest;
+            match still_admits(&access, guest.session.client()) {
+                Ok(()) if !guest.has_ended() => return Ok(Arc::clone(guest)),
+                Ok(()) => drop(known.remove(at)),
+                // By the rules as they are now it may be admitted anew.
+                Err(why) => known.remove(at).guest.end(why),
+            }
+        }
+        let client = access.admit(&Admission {
+            peer: connection.peer(),
+            encrypted: connection.is_encrypted(),
+            origin,
+            token,
+            certificate: connection.certificate(),
+            now: now(),
+        });
+        let client = client.map_err(|why| {
+            tracing::debug!(%why, peer = %connection.peer(), "a gRPC client is not admitted");
+            Fault::Denied(why)
+        })?;
+        tracing::debug!(client = %client.name, peer = %connection.peer(), "a gRPC client is admitted");
+        if known.len() >= CREDENTIALS_MAX {
+            let idle = known.iter().position(|known| Arc::strong_count(&known.guest) == 1);
+            known.remove(idle.ok_or(Fault::Credentials { max: CREDENTIALS_MAX })?);
+        }
+        let guest = Arc::new(Guest {
+            session: Session::new(&self.hub, client, self.options.session),
+            counts: Counts::default(),
+            ended: watch::Sender::new(None),
+            heard: Mutex::default(),
+        });
+        known.push(Known { shown, guest: Arc::clone(&guest) });
+        tokio::spawn(watch_over(
+            Arc::downgrade(&guest),
+            Arc::clone(&self.access),
+            self.options.judge_interval,
+            self.stopping.clone(),
+        ));
+        Ok(guest)
+    }
+}
+
+fn now() -> UnixMillis {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    UnixMillis(since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX)))
+}
+
+fn still_admits(access: &Access, client: &Client) -> Result<(), Denied> {
+    access.still_admits(client, now())
+}
+
+/// The token in a header.
+fn bearer(header: &str) -> Option<&str> {
+    let (scheme, token) = header.split_once(' ')?;
+    let token = token.trim();
+    (scheme.eq_ignore_ascii_case("bearer") && !token.is_empty()).then_some(token)
+}
+
+/// Ends a guest once it is not admitted any more, or once nobody is.
+async fn watch_over(
+    guest: Weak<Guest>,
+    access: Gate,
+    interval: Duration,
+    mut stopping: watch::Receiver<bool>,
+) {
+    loop {
+        let is_stopping = tokio::select! {
+            () = tokio::time::sleep(interval) => false,
+            _ = stopping.wait_for(|is_stopping| *is_stopping) => true,
+        };
+        let Some(guest) = guest.upgrade() else { return };
+        if is_stopping {
+            return guest.end_with(GatewayError::Stopping.into());
+        }
+        if let Err(why) = still_admits(&access(), guest.session.client()) {
+            return guest.end(why);
+        }
+    }
+}
+
+/// What a guest has at present.
+#[derive(Debug, Default)]
+struct Counts {
+    subscriptions: AtomicUsize,
+    publications: AtomicUsize,
+    servings: AtomicUsize,
+    goals: AtomicUsize,
+}
+
+/// Of which of its bounds a stream takes one.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Taken {
+    Subscription,
+    Publication,
+    Serving,
+    Goal,
+}
+
+/// One credential on one connection.
+pub(super) struct Guest {
+    pub(super) session: Session,
+    counts: Counts,
+    ended: watch::Sender<Option<Fault>>,
+    /// Its subscriptions: each is held by a stream, which is not looked at while its client does not read.
+    heard: Mutex<Vec<SubscriptionEnd>>,
+}
+
+/// A stream of a guest's, counted while it lasts.
+pub(super) struct Place {
+    pub(super) guest: Arc<Guest>,
+    taken: Taken,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.guest.count(self.taken).0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Guest {
+    /// Who makes a request that was admitted.
+    pub(super) fn of<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
+        request.extensions().get::<Arc<Self>>().cloned().ok_or(Fault::NoConnection)
+    }
+
+    fn count(&self, taken: Taken) -> (&AtomicUsize, &'static str, usize) {
+        let limits = self.session.limits();
+        match taken {
+            Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
+            Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
+            Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
+        }
+    }
+
+    /// Counts a stream; refuses one too many.
+    pub(super) fn take(self: &Arc<Self>, taken: Taken) -> Result<Place, Fault> {
+        let (count, what, max) = self.count(taken);
+        let place = Place { guest: Arc::clone(self), taken };
+        let before = count.fetch_add(1, Ordering::Relaxed);
+        self.session.check_count(what, before, max)?;
+        Ok(place)
+    }
+
+    fn end(&self, why: Denied) {
+        tracing::debug!(client = %self.session.client().name, %why, "a gRPC client is not admitted any more");
+        self.end_with(Fault::Denied(why));
+    }
+
+    fn end_with(&self, why: Fault) {
+        self.ended.send_replace(Some(why));
+        std::mem::take(&mut *lock(&self.heard)).iter().for_each(SubscriptionEnd::end);
+    }
+
+    fn has_ended(&self) -> bool {
+        self.ended.borrow().is_some()
+    }
+
+    /// Has a subscription end with the guest, even if its client does not read.
+    pub(super) fn holds(&self, subscription: &Subscription) {
+        let mut heard = lock(&self.heard);
+        heard.retain(|other| !other.has_ended());
+        heard.push(subscription.ender());
+        drop(heard);
+        if self.has_ended() {
+            subscription.ender().end();
+        }
+    }
+
+    /// Waits until it is not admitted any more, and says why.
+    pub(super) async fn ended(&self) -> Fault {
+        let mut ended = self.ended.subscribe();
+        match ended.wait_for(Option::is_some).await.map(|why| why.clone()) {
+            Ok(Some(why)) => why,
+            _ => GatewayError::Stopping.into(),
+        }
+    }
+
+    /// Something that takes a while, while it is admitted.
+    pub(super) async fn admitted<T>(&self, work: impl Future<Output = Result<T, Fault>>) -> Result<T, Fault> {
+        tokio::select! {
+            biased;
+            why = self.ended() => Err(why),
+            done = work => done,
+        }
+    }
+}

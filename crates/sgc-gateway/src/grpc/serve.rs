@@ -1,0 +1,128 @@
+//! `Serve`: a service that a client serves. Calls go to it as they come; it answers them in any order.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use sgc_ros::RequestId;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Status, Streaming};
+
+use super::client::{Guest, Place, Taken};
+use super::fault::Fault;
+use super::proto::serve_request::{Kind as Said, Reply, Server};
+use super::proto::serve_response::{Kind, Refused, Request, Served};
+use super::proto::{ServeRequest, ServeResponse};
+use super::qos;
+use super::service::Responses;
+use crate::content::{Content, Form};
+use crate::error::GatewayError;
+use crate::service::{Replier, Serving};
+
+/// Calls that were not answered and are remembered: of more the oldest cannot be answered any more.
+const OPEN_MAX: usize = 4096;
+/// Responses that wait for a client: calls beyond them wait in the serving, then at those who call.
+const RESPONSES_MAX: usize = 16;
+/// What is to come first.
+const ORDER: Fault = Fault::Order { what: "the service" };
+
+type Told = mpsc::Sender<Result<ServeResponse, Status>>;
+
+/// A service that a client serves.
+struct Work {
+    place: Place,
+    serving: Serving,
+    replier: Replier,
+    form: Form,
+    open: BTreeMap<u64, RequestId>,
+    last: u64,
+}
+
+/// Serves a service for as long as its client listens and speaks.
+pub(super) async fn serve(
+    guest: Arc<Guest>,
+    mut requests: Streaming<ServeRequest>,
+) -> Result<Responses<ServeResponse>, Status> {
+    let place = guest.take(Taken::Serving)?;
+    let first = async { Ok(requests.message().await) };
+    let Some(ServeRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
+        return Err(ORDER.into());
+    };
+    let Server { service, r#type, encoding } = server;
+    let form = qos::form(encoding)?;
+    let said = Some(&*r#type).filter(|name| !name.is_empty());
+    let type_name = guest.session.service_type(&service, said).map_err(Fault::from);
+    let served = async { Ok(guest.session.serve(&service, said).await?) };
+    let serving = guest.admitted(served).await?;
+    let replier = serving.replier();
+    let (told, responses) = mpsc::channel(RESPONSES_MAX);
+    let served = Kind::Served(Served { r#type: type_name? });
+    let _ = told.try_send(Ok(ServeResponse { kind: Some(served) }));
+    let work = Work { place, serving, replier, form, open: BTreeMap::new(), last: 0 };
+    tokio::spawn(work.run(requests, told));
+    Ok(Box::pin(ReceiverStream::new(responses)))
+}
+
+impl Work {
+    async fn run(mut self, requests: Streaming<ServeRequest>, told: Told) {
+        let guest = Arc::clone(&self.place.guest);
+        let why = tokio::select! {
+            biased;
+            why = guest.ended() => Err(Status::from(why)),
+            // Its client has gone.
+            () = told.closed() => return,
+            done = self.work(requests, &told) => done,
+        };
+        // It ends before its client hears so: who does not read may take as long as it likes.
+        drop(self);
+        if let Err(why) = why {
+            let _ = told.send(Err(why)).await;
+        }
+    }
+
+    async fn work(&mut self, mut requests: Streaming<ServeRequest>, told: &Told) -> Result<(), Status> {
+        loop {
+            // A place for what may come of it is taken first, so that nothing is lost by being given up.
+            tokio::select! {
+                said = requests.message() => {
+                    let Some(said) = said? else { return Ok(()) };
+                    let Some(Said::Reply(reply)) = said.kind else { return Err(ORDER.into()) };
+                    let id = reply.id;
+                    if let Err(why) = self.answer(reply).await {
+                        let refused = Kind::Refused(Refused { id, reason: why.to_string() });
+                        let _ = told.send(Ok(ServeResponse { kind: Some(refused) })).await;
+                    }
+                }
+                request = async {
+                    let room = told.reserve().await.ok()?;
+                    Some((room, self.serving.next().await))
+                } => {
+                    let Some((room, request)) = request else { return Ok(()) };
+                    let request = request.ok_or(Fault::from(GatewayError::Stopping))?;
+                    match self.serving.write(&request, self.form) {
+                        Ok(payload) => {
+                            self.last += 1;
+                            self.open.insert(self.last, request.id);
+                            if self.open.len() > OPEN_MAX {
+                                self.open.pop_first();
+                            }
+                            let kind = Kind::Request(Request { id: self.last, payload });
+                            room.send(Ok(ServeResponse { kind: Some(kind) }));
+                        }
+                        Err(error) => {
+                            let service = self.serving.service();
+                            tracing::debug!(%error, service, "a request that cannot be read is left out");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    async fn answer(&mut self, Reply { id, payload }: Reply) -> Result<(), Fault> {
+        let open = *self.open.get(&id).ok_or(Fault::NotOpen { id })?;
+        self.replier.reply(open, &Content { form: self.form, bytes: payload }).await?;
+        self.open.remove(&id);
+        Ok(())
+    }
+}

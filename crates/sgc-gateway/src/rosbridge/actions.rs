@@ -1,0 +1,252 @@
+//! Actions of a client: [`Sent`] is a goal that it has sent, [`ServedAction`] an action that it serves.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use futures_util::FutureExt as _;
+use serde_json::Value as Json;
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
+
+use super::envelope::{Compression, Envelope};
+use super::input;
+use super::op::OpId;
+use super::outbox::{Level, Outbox};
+use super::topics::fragment_id;
+use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, GoalId, GoalStatus};
+use crate::content::{Content, Form};
+use crate::error::GatewayError;
+use crate::hub::lock;
+use crate::session::Session;
+
+/// How long a goal is waited for: as good as for ever.
+const OUTCOME_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
+/// How long an action may have no server before its goals are given up: one that starts anew knows them no more, but
+/// discovery may be late.
+const SERVER_GONE_MAX: Duration = Duration::from_secs(5);
+/// Goals that a client that serves has not ended; the oldest is forgotten for one more.
+const GOALS_MAX: usize = 1024;
+
+/// A goal as a client sends it.
+#[derive(Clone, Debug)]
+pub(super) struct Wanted {
+    pub(super) id: Option<OpId>,
+    pub(super) action: String,
+    pub(super) type_name: Option<String>,
+    pub(super) has_feedback: bool,
+    pub(super) fragment_size: Option<usize>,
+    pub(super) compression: Compression,
+}
+
+impl Wanted {
+    fn envelope(&self, op: &str, bytes: usize) -> Envelope {
+        Envelope::new(op, self.compression, bytes).id(self.id.as_ref()).text("action", &self.action)
+    }
+
+    /// What is said if there is no outcome.
+    async fn fail(&self, why: &str, outbox: &Outbox) {
+        let failed = self.envelope("action_result", why.len()).text("values", why);
+        let failed = failed.value("status", &Json::from(GoalStatus::Unknown as i8));
+        let _ = outbox.say(failed.value("result", &Json::Bool(false)).finish()).await;
+    }
+}
+
+/// Sends a goal and tells of it until it has ended; `cancel` is told when it is to be given up.
+pub(super) async fn pursue(
+    session: Arc<Session>,
+    wanted: Wanted,
+    args: String,
+    cancel: Arc<Notify>,
+    outbox: Outbox,
+) {
+    let send = |goal: Content| {
+        let (session, wanted) = (&session, &wanted);
+        async move { session.send_goal(&wanted.action, wanted.type_name.as_deref(), &goal).await }
+    };
+    match input::tolerate_later(&args, send).await {
+        Ok((goal, feedback)) => match follow(&session, &wanted, &goal, feedback, &cancel, &outbox).await {
+            Ok(()) => {}
+            Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+        },
+        Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+    }
+}
+
+async fn follow(
+    session: &Session,
+    wanted: &Wanted,
+    goal: &Goal,
+    mut feedback: Feedback,
+    cancel: &Notify,
+    outbox: &Outbox,
+) -> Result<(), GatewayError> {
+    let form = wanted.compression.form();
+    let outcome = goal.outcome(form, OUTCOME_MAX);
+    let gone = server_gone(session, &wanted.action);
+    tokio::pin!(outcome, gone);
+    let outcome = loop {
+        tokio::select! {
+            biased;
+            Some(said) = feedback.next(form), if wanted.has_feedback => {
+                tell(wanted, said, outbox).await;
+            }
+            () = cancel.notified() => {
+                if let Err(error) = goal.cancel().await {
+                    let told = format!("cancel_action_goal: {error}");
+                    let _ = outbox.status(Level::Error, &told, wanted.id.as_ref()).await;
+                }
+            }
+            outcome = &mut outcome => break outcome?,
+            () = &mut gone => return Err(GatewayError::NoServer { name: wanted.action.clone() }),
+        }
+    };
+    // What was said of it before comes first.
+    while let Some(Some(said)) = feedback.next(form).now_or_never().filter(|_| wanted.has_feedback) {
+        tell(wanted, said, outbox).await;
+    }
+    let result = wanted
+        .envelope("action_result", outcome.result.len())
+        .content("values", &outcome.result)
+        .value("status", &Json::from(outcome.status as i8))
+        .value("result", &Json::Bool(true));
+    let _ = outbox.say(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await;
+    Ok(())
+}
+
+async fn tell(wanted: &Wanted, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
+    match said {
+        Ok(values) => {
+            let said = wanted.envelope("action_feedback", values.len()).content("values", &values);
+            let _ = outbox.say(said.finish_in_pieces(wanted.fragment_size, fragment_id)).await;
+        }
+        Err(error) => outbox.try_status(Level::Error, &error.to_string(), wanted.id.as_ref()),
+    }
+}
+
+/// Waits until an action has had no server for a while.
+async fn server_gone(session: &Session, action: &str) {
+    let mut changes = session.hub().graph_changes();
+    let is_served = || session.hub().graph().actions.get(action).is_some_and(|info| !info.servers.is_empty());
+    loop {
+        if !is_served() {
+            tokio::time::sleep(SERVER_GONE_MAX).await;
+            if !is_served() {
+                return;
+            }
+        }
+        if changes.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Goals of an action that were passed on to a client.
+#[derive(Debug, Default)]
+struct Goals {
+    next: u64,
+    ids: BTreeMap<u64, GoalId>,
+}
+
+/// An action that a client serves; ends when dropped.
+#[derive(Debug)]
+pub(super) struct ServedAction {
+    replier: ActionReplier,
+    goals: Arc<Mutex<Goals>>,
+    prefix: Arc<str>,
+    task: JoinHandle<()>,
+}
+
+impl Drop for ServedAction {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl ServedAction {
+    pub(super) fn new(serving: ActionServing, type_name: String, outbox: Outbox) -> Self {
+        let replier = serving.replier();
+        let goals = Arc::default();
+        let prefix: Arc<str> = format!("action_goal:{}:", serving.action()).into();
+        let told = Told { type_name, goals: Arc::clone(&goals), prefix: Arc::clone(&prefix), outbox };
+        let task = tokio::spawn(told.pass_on(serving));
+        Self { replier, goals, prefix, task }
+    }
+
+    pub(super) fn replier(&self) -> &ActionReplier {
+        &self.replier
+    }
+
+    fn number(&self, id: Option<&OpId>) -> Option<u64> {
+        let Some(OpId::Text(id)) = id else { return None };
+        id.strip_prefix(&*self.prefix)?.parse().ok()
+    }
+
+    /// The goal of an id.
+    pub(super) fn goal(&self, id: Option<&OpId>) -> Option<GoalId> {
+        lock(&self.goals).ids.get(&self.number(id)?).copied()
+    }
+
+    /// A goal has ended.
+    pub(super) fn forget(&self, id: Option<&OpId>) {
+        if let Some(number) = self.number(id) {
+            lock(&self.goals).ids.remove(&number);
+        }
+    }
+}
+
+/// What passes goals on to a client.
+struct Told {
+    type_name: String,
+    goals: Arc<Mutex<Goals>>,
+    prefix: Arc<str>,
+    outbox: Outbox,
+}
+
+impl Told {
+    async fn pass_on(self, mut serving: ActionServing) {
+        let replier = serving.replier();
+        while let Some(event) = serving.next().await {
+            let frame = match event {
+                ActionEvent::Goal { id, goal } => {
+                    let Ok(args) = serving.write(&goal, Form::Json) else { continue };
+                    // Clients of this protocol take every goal.
+                    if replier.answer(&id, true).await.is_err() {
+                        continue;
+                    }
+                    let number = self.remember(id);
+                    Envelope::json("send_action_goal")
+                        .text("id", &format!("{}{number}", self.prefix))
+                        .text("action", serving.action())
+                        .text("action_type", &self.type_name)
+                        .content("args", &args)
+                        .value("feedback", &Json::Bool(true))
+                }
+                ActionEvent::Cancel { id } => {
+                    let Some(number) = self.number_of(&id) else { continue };
+                    Envelope::json("cancel_action_goal")
+                        .text("id", &format!("{}{number}", self.prefix))
+                        .text("action", serving.action())
+                }
+            };
+            if self.outbox.say(frame.finish()).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    fn remember(&self, id: GoalId) -> u64 {
+        let mut goals = lock(&self.goals);
+        let number = goals.next;
+        goals.next += 1;
+        goals.ids.insert(number, id);
+        if goals.ids.len() > GOALS_MAX {
+            goals.ids.pop_first();
+        }
+        number
+    }
+
+    fn number_of(&self, id: &GoalId) -> Option<u64> {
+        lock(&self.goals).ids.iter().find(|(_, known)| *known == id).map(|(number, _)| *number)
+    }
+}

@@ -1,0 +1,72 @@
+//! [`Call`]: a service that a client calls, on the network or of the gateway's own `rosapi`.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::Value as Json;
+
+use super::envelope::{Compression, Envelope};
+use super::input;
+use super::op::OpId;
+use super::options::RosbridgeOptions;
+use super::outbox::Outbox;
+use super::rosapi::{RosApi, local_name};
+use super::topics::fragment_id;
+use crate::content::Content;
+use crate::error::GatewayError;
+use crate::session::Session;
+
+/// A service that a client calls.
+#[derive(Clone, Debug)]
+pub(super) struct Call {
+    pub(super) id: Option<OpId>,
+    pub(super) service: String,
+    pub(super) type_name: Option<String>,
+    pub(super) args: Option<String>,
+    pub(super) max: Duration,
+    pub(super) fragment_size: Option<usize>,
+    pub(super) compression: Compression,
+}
+
+/// Calls it and tells what came of it.
+pub(super) async fn answer(
+    session: Arc<Session>,
+    options: Arc<RosbridgeOptions>,
+    call: Call,
+    outbox: Outbox,
+) {
+    let envelope = |bytes: usize| {
+        Envelope::new("service_response", call.compression, bytes)
+            .id(call.id.as_ref())
+            .text("service", &call.service)
+    };
+    let own = match local_name(&call.service) {
+        Some(name) => {
+            let api = RosApi { session: &session, options: &options };
+            api.answer(name, call.args.as_deref().unwrap_or("{}")).await
+        }
+        None => None,
+    };
+    let (answered, is_done) = match own {
+        Some(Ok(values)) => (envelope(0).value("values", &values), true),
+        Some(Err(why)) => (envelope(0).text("values", &why), false),
+        None => match on_network(&session, &call).await {
+            Ok(values) => (envelope(values.len()).content("values", &values), true),
+            Err(error) => (envelope(0).text("values", &error.to_string()), false),
+        },
+    };
+    let answered = answered.value("result", &Json::Bool(is_done));
+    let _ = outbox.say(answered.finish_in_pieces(call.fragment_size, fragment_id)).await;
+}
+
+async fn on_network(session: &Session, call: &Call) -> Result<bytes::Bytes, GatewayError> {
+    let layout = || {
+        let of = session.service_type(&call.service, call.type_name.as_deref())?;
+        session.hub().types().layout(&format!("{of}_Request"), None)
+    };
+    let args = input::arguments(call.args.as_deref(), layout)?;
+    let (service, type_name, form) = (&call.service, call.type_name.as_deref(), call.compression.form());
+    let ask =
+        |request: Content| async move { session.call(service, type_name, &request, form, call.max).await };
+    input::tolerate_later(&args, ask).await
+}

@@ -1,0 +1,608 @@
+//! [`Connection`]: what one client has, and what becomes of what it sends.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Notify;
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+
+use super::actions::{ServedAction, Wanted, pursue};
+use super::calls::{Call, answer};
+use super::envelope::Compression;
+use super::fragments::Fragments;
+use super::input;
+use super::op::{Op, OpError, OpId};
+use super::options::{RosbridgeError, RosbridgeOptions};
+use super::outbox::{Gone, Level, Outbox};
+use super::qos::Said;
+use super::services::Served;
+use super::topics::{Topic, Wish};
+use crate::access::Right;
+use crate::action::GoalStatus;
+use crate::content::Content;
+use crate::error::GatewayError;
+use crate::publisher::Publication;
+use crate::session::{Advertise, Session, Subscribe};
+use crate::types::InterfaceType;
+
+/// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
+const SETTLE_MAX: Duration = Duration::from_millis(500);
+/// Errors that a client may make at once, and a second: who makes more is disconnected.
+const ERRORS_BURST: u32 = 200;
+const ERRORS_PER_SECOND: u32 = 100;
+
+/// What a client publishes on a topic.
+struct Published {
+    publication: Publication,
+    ids: BTreeSet<Option<OpId>>,
+}
+
+/// Errors that a client may still make.
+struct Patience {
+    left: u32,
+    since: Instant,
+}
+
+impl Patience {
+    fn new() -> Self {
+        Self { left: ERRORS_BURST, since: Instant::now() }
+    }
+
+    /// Counts one; false if there were too many.
+    fn count(&mut self, now: Instant) -> bool {
+        let earned =
+            now.saturating_duration_since(self.since).as_millis() * u128::from(ERRORS_PER_SECOND) / 1000;
+        if earned > 0 {
+            self.left =
+                u32::try_from(earned).map_or(ERRORS_BURST, |n| self.left.saturating_add(n).min(ERRORS_BURST));
+            self.since = now;
+        }
+        let may = self.left > 0;
+        self.left = self.left.saturating_sub(1);
+        may
+    }
+}
+
+/// What one client has.
+pub(super) struct Connection {
+    session: Arc<Session>,
+    options: Arc<RosbridgeOptions>,
+    outbox: Outbox,
+    is_admitted: bool,
+    topics: BTreeMap<String, Topic>,
+    publications: BTreeMap<String, Published>,
+    services: BTreeMap<String, Served>,
+    actions: BTreeMap<String, ServedAction>,
+    goals: BTreeMap<OpId, Arc<Notify>>,
+    /// Calls and goals under way; ended with the connection.
+    tasks: JoinSet<Option<OpId>>,
+    fragments: Fragments,
+    patience: Patience,
+}
+
+/// How an op can end.
+enum Failure {
+    /// The client is told.
+    Op(OpError),
+    /// The connection ends.
+    End(RosbridgeError),
+}
+
+impl From<OpError> for Failure {
+    fn from(error: OpError) -> Self {
+        Self::Op(error)
+    }
+}
+
+impl From<Gone> for Failure {
+    fn from(_: Gone) -> Self {
+        let closed = tokio_tungstenite::tungstenite::Error::ConnectionClosed;
+        Self::End(RosbridgeError::Socket(Box::new(closed)))
+    }
+}
+
+type Done = Result<(), Failure>;
+
+impl Connection {
+    pub(super) fn new(session: Arc<Session>, options: Arc<RosbridgeOptions>, outbox: Outbox) -> Self {
+        let fragments = Fragments::new(options.message_bytes_max);
+        Self {
+            session,
+            is_admitted: !options.is_token_needed,
+            options,
+            outbox,
+            topics: BTreeMap::new(),
+            publications: BTreeMap::new(),
+            services: BTreeMap::new(),
+            actions: BTreeMap::new(),
+            goals: BTreeMap::new(),
+            tasks: JoinSet::new(),
+            fragments,
+            patience: Patience::new(),
+        }
+    }
+
+    pub(super) fn is_admitted(&self) -> bool {
+        self.is_admitted
+    }
+
+    pub(super) fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// Does what a client asks for; only what ends the connection is an error.
+    pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
+        while let Some(ended) = self.tasks.try_join_next() {
+            if let Ok(Some(id)) = ended {
+                self.goals.remove(&id);
+            }
+        }
+        let (done, id) = match Op::parse(text) {
+            Ok(op) if op.name == "fragment" && self.is_admitted => match self.put_together(&op) {
+                Ok(None) => (Ok(()), None),
+                Ok(Some(whole)) => match Op::parse(&whole) {
+                    // It is told with the id of the pieces if it has none.
+                    Ok(inner) => (self.run(&inner).await, inner.id.or(op.id)),
+                    Err(error) => (Err(error.into()), op.id),
+                },
+                Err(error) => (Err(error.into()), op.id),
+            },
+            Ok(op) => (self.run(&op).await, op.id),
+            Err(error) => (Err(error.into()), None),
+        };
+        match done {
+            Ok(()) => Ok(()),
+            Err(Failure::End(error)) => Err(error),
+            Err(Failure::Op(error)) => self.fail(&error, id.as_ref()).await,
+        }
+    }
+
+    async fn fail(&mut self, error: &OpError, id: Option<&OpId>) -> Result<(), RosbridgeError> {
+        if !self.patience.count(Instant::now()) {
+            return Err(RosbridgeError::TooManyErrors);
+        }
+        match self.outbox.status(Level::Error, &error.to_string(), id).await {
+            Ok(()) => Ok(()),
+            Err(gone) => match gone.into() {
+                Failure::End(error) => Err(error),
+                Failure::Op(_) => Ok(()),
+            },
+        }
+    }
+
+    async fn run(&mut self, op: &Op<'_>) -> Done {
+        if !self.is_admitted && op.name != "auth" {
+            let how = r#"say who you are first: {"op":"auth","token":"…"}"#;
+            return Err(op.refused(how).into());
+        }
+        match op.name.as_ref() {
+            "auth" => self.auth(op).await,
+            "set_level" => self.set_level(op),
+            "fragment" => Err(op.refused("a message in pieces is no piece itself").into()),
+            "advertise" => self.advertise(op).await,
+            "unadvertise" => self.unadvertise(op),
+            "publish" => self.publish(op).await,
+            "subscribe" => self.subscribe(op).await,
+            "unsubscribe" => self.unsubscribe(op),
+            "call_service" => self.call_service(op).await,
+            "advertise_service" => self.advertise_service(op).await,
+            "unadvertise_service" => self.unadvertise_service(op),
+            "service_response" => self.service_response(op).await,
+            "send_action_goal" => self.send_action_goal(op).await,
+            "cancel_action_goal" => self.cancel_action_goal(op),
+            "advertise_action" => self.advertise_action(op).await,
+            "unadvertise_action" => self.unadvertise_action(op),
+            "action_feedback" => self.action_feedback(op).await,
+            "action_result" => self.action_result(op).await,
+            "action_status" => self.action_status(op),
+            "status" => Ok(()),
+            "png" => Err(op.refused("png is not taken: send JSON").into()),
+            other => Err(OpError::UnknownOp(super::op::short(other)).into()),
+        }
+    }
+
+    async fn auth(&mut self, op: &Op<'_>) -> Done {
+        let Some(authenticate) = &self.options.authenticate else {
+            return Err(op.refused("this gateway takes no tokens here").into());
+        };
+        // Where clients can only say what the `rosauth` of ROS 1 wanted, the token stands for the code.
+        let token = match op.text("token")? {
+            Some(token) => token,
+            None => op.text("mac")?.ok_or_else(|| op.refused("\"token\" is missing"))?,
+        };
+        match authenticate(&token) {
+            Ok(client) => {
+                let told = format!("you are {}", client.name);
+                let limits = *self.session.limits();
+                self.session = Arc::new(Session::new(self.session.hub(), client, limits));
+                self.is_admitted = true;
+                Ok(self.outbox.status(Level::Info, &told, op.id.as_ref()).await?)
+            }
+            Err(why) => {
+                // Whoever guesses makes a connection for each guess.
+                let error = op.refused(why.clone());
+                self.outbox.status(Level::Error, &error.to_string(), op.id.as_ref()).await?;
+                Err(Failure::End(RosbridgeError::NotAdmitted(why)))
+            }
+        }
+    }
+
+    fn set_level(&mut self, op: &Op<'_>) -> Done {
+        let name = op.needed_text("level")?;
+        let level = Level::of(&name);
+        let level = level.ok_or_else(|| op.refused("\"level\" is none, error, warning or info"))?;
+        self.outbox.set_level(level);
+        Ok(())
+    }
+
+    /// The message of which this is the last piece, if it is.
+    fn put_together(&mut self, op: &Op<'_>) -> Result<Option<String>, OpError> {
+        let id = op.id.as_ref().ok_or_else(|| op.refused("\"id\" is missing"))?;
+        let number = op.count("num")?.ok_or_else(|| op.refused("\"num\" is missing"))?;
+        let total = op.count("total")?.ok_or_else(|| op.refused("\"total\" is missing"))?;
+        let data = op.needed_text("data")?;
+        self.fragments.take(id, number, total, data).map_err(|error| op.refused(error.to_string()))
+    }
+
+    async fn advertise(&mut self, op: &Op<'_>) -> Done {
+        let topic = op.needed_text("topic")?;
+        let type_name = op.text("type")?;
+        let said = match op.object("qos")? {
+            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
+            None => Said::default(),
+        };
+        let qos = said.offer(op.bool("latch")?.unwrap_or(false), op.count("queue_size")?);
+        if let Some(published) = self.publications.get_mut(&topic) {
+            let is_other = |full: &String| full != published.publication.type_name();
+            let full = match &type_name {
+                Some(name) => {
+                    Some(InterfaceType::Message.full_name(name).map_err(|error| op.gateway(error))?)
+                }
+                None => None,
+            };
+            if let Some(wanted) = full.filter(is_other) {
+                let actual = published.publication.type_name().to_owned();
+                return Err(op.gateway(GatewayError::OtherType { name: topic, actual, wanted }).into());
+            }
+            published.ids.insert(op.id.clone());
+            return Ok(());
+        }
+        let wanted = Advertise { topic, type_name, qos };
+        self.begin_publishing(op, wanted).await
+    }
+
+    async fn begin_publishing(&mut self, op: &Op<'_>, wanted: Advertise) -> Done {
+        let max = self.session.limits().publications_max;
+        let topic = wanted.topic.clone();
+        let made = async {
+            self.session.check_count("topics that are published", self.publications.len(), max)?;
+            self.session.advertise(wanted).await
+        };
+        let publication = made.await.map_err(|error| op.gateway(error))?;
+        publication.settle(SETTLE_MAX).await;
+        let ids = BTreeSet::from([op.id.clone().filter(|_| op.name == "advertise")]);
+        self.publications.insert(topic, Published { publication, ids });
+        Ok(())
+    }
+
+    fn unadvertise(&mut self, op: &Op<'_>) -> Done {
+        let topic = op.needed_text("topic")?;
+        let Some(published) = self.publications.get_mut(&topic) else {
+            let error = GatewayError::NotThere { name: topic, what: "advertised" };
+            return Err(op.gateway(error).into());
+        };
+        match &op.id {
+            Some(_) => drop(published.ids.remove(&op.id)),
+            None => published.ids.clear(),
+        }
+        if published.ids.is_empty() {
+            self.publications.remove(&topic);
+        }
+        Ok(())
+    }
+
+    async fn publish(&mut self, op: &Op<'_>) -> Done {
+        let topic = op.needed_text("topic")?;
+        let raw = op.needed_object("msg")?;
+        if !self.publications.contains_key(&topic) {
+            let qos = Said::default().offer(op.bool("latch")?.unwrap_or(false), None);
+            let wanted = Advertise { topic: topic.clone(), type_name: op.text("type")?, qos };
+            self.begin_publishing(op, wanted).await?;
+        }
+        let Some(published) = self.publications.get(&topic) else { return Ok(()) };
+        let publication = &published.publication;
+        let done = match input::message(publication.layout(), raw) {
+            Ok(value) => publication.publish_value(&value).await,
+            Err(error) => Err(error),
+        };
+        done.map_err(|error| {
+            let (op, why) = (op.name.to_string(), format!("{topic}: {error}"));
+            OpError::Refused { op, why }.into()
+        })
+    }
+
+    async fn subscribe(&mut self, op: &Op<'_>) -> Done {
+        let topic = op.needed_text("topic")?;
+        let type_name = op.text("type")?;
+        let said = match op.object("qos")? {
+            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
+            None => Said::default(),
+        };
+        let throttle_ms = op.count("throttle_rate")?.unwrap_or(0);
+        let queue_length = op.count("queue_length")?.unwrap_or(0);
+        let wish = Wish {
+            throttle: Duration::from_millis(throttle_ms as u64),
+            queue_length: said.depth.map_or(queue_length, |depth| depth as usize),
+            fragment_size: fragment_size(op)?,
+            compression: compression(op)?,
+        };
+        self.topics.retain(|_, topic| topic.is_alive());
+        let subscriptions: usize = self.topics.values().map(Topic::len).sum();
+        let max = self.session.limits().subscriptions_max;
+        let checked = self.session.check_count("subscriptions", subscriptions, max);
+        checked.map_err(|error| op.gateway(error))?;
+        if let Some(heard) = self.topics.get_mut(&topic) {
+            let said = type_name.filter(|name| !name.is_empty() && name != "*");
+            let full = said.map(|name| InterfaceType::Message.full_name(&name)).transpose();
+            let full = full.map_err(|error| op.gateway(error))?;
+            if let Some(wanted) = full.filter(|full| full != heard.type_name()) {
+                let actual = heard.type_name().to_owned();
+                return Err(op.gateway(GatewayError::OtherType { name: topic, actual, wanted }).into());
+            }
+            self.session.check(Right::Subscribe, &topic).map_err(|error| op.gateway(error))?;
+            heard.add(op.id.clone(), wish);
+            return Ok(());
+        }
+        let wanted = Subscribe {
+            topic: topic.clone(),
+            type_name,
+            qos: said.request(),
+            depth: Topic::depth(&wish),
+            ..Subscribe::default()
+        };
+        let subscription = self.session.subscribe(wanted).await.map_err(|error| op.gateway(error))?;
+        self.topics.insert(topic, Topic::new(subscription, op.id.clone(), wish, self.outbox.clone()));
+        Ok(())
+    }
+
+    fn unsubscribe(&mut self, op: &Op<'_>) -> Done {
+        let topic = op.needed_text("topic")?;
+        let Some(heard) = self.topics.get_mut(&topic) else {
+            let error = GatewayError::NotThere { name: topic, what: "subscribed to" };
+            return Err(op.gateway(error).into());
+        };
+        if !heard.remove(op.id.as_ref()) {
+            self.topics.remove(&topic);
+        }
+        Ok(())
+    }
+
+    async fn call_service(&mut self, op: &Op<'_>) -> Done {
+        let call = Call {
+            id: op.id.clone(),
+            service: op.needed_text("service")?,
+            type_name: op.text("type")?,
+            args: op.raw("args").map(str::to_owned),
+            max: op.seconds("timeout")?.unwrap_or(self.options.call_max),
+            fragment_size: fragment_size(op)?,
+            compression: match compression(op)? {
+                Compression::None => Compression::None,
+                // There is no form of its own for replies.
+                Compression::Cbor | Compression::CborRaw => Compression::Cbor,
+            },
+        };
+        self.check_tasks(op)?;
+        let (session, options) = (Arc::clone(&self.session), Arc::clone(&self.options));
+        let outbox = self.outbox.clone();
+        self.tasks.spawn(async move {
+            answer(session, options, call, outbox).await;
+            None
+        });
+        Ok(())
+    }
+
+    /// Calls and goals are tasks of their own, so there is a bound on them before they are made.
+    fn check_tasks(&self, op: &Op<'_>) -> Result<(), OpError> {
+        let max = self.session.limits().calls_max;
+        let checked = self.session.check_count("calls and goals under way", self.tasks.len(), max);
+        checked.map_err(|error| op.gateway(error))
+    }
+
+    async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
+        let service = op.needed_text("service")?;
+        let type_name = op.needed_text("type")?;
+        self.check_servings(op)?;
+        // Who advertises again means the new one.
+        self.services.remove(&service);
+        let serving = self.session.serve(&service, Some(&type_name)).await;
+        let serving = serving.map_err(|error| op.gateway(error))?;
+        self.services.insert(service, Served::new(serving, self.outbox.clone()));
+        Ok(())
+    }
+
+    fn check_servings(&self, op: &Op<'_>) -> Result<(), OpError> {
+        let (now, max) = (self.services.len() + self.actions.len(), self.session.limits().servings_max);
+        let checked = self.session.check_count("services and actions that are served", now, max);
+        checked.map_err(|error| op.gateway(error))
+    }
+
+    fn unadvertise_service(&mut self, op: &Op<'_>) -> Done {
+        let service = op.needed_text("service")?;
+        match self.services.remove(&service) {
+            Some(_) => Ok(()),
+            None => {
+                let error = GatewayError::NotThere { name: service, what: "served" };
+                Err(op.gateway(error).into())
+            }
+        }
+    }
+
+    async fn service_response(&mut self, op: &Op<'_>) -> Done {
+        let service = op.needed_text("service")?;
+        let is_done = op.bool("result")?.unwrap_or(true);
+        let Some(served) = self.services.get(&service) else {
+            let error = GatewayError::NotThere { name: service, what: "served" };
+            return Err(op.gateway(error).into());
+        };
+        let request = served.take(op.id.as_ref());
+        let request =
+            request.ok_or_else(|| op.refused(format!("{service}: no request waits under that id")))?;
+        let values = op.raw("values").filter(|raw| raw.starts_with(['{', '[']));
+        if !is_done && values.is_none() {
+            // ROS 2 has no reply that says so: whoever called hears nothing.
+            let why = op.raw("values").map_or_else(|| "no reason given".to_owned(), super::op::short);
+            tracing::debug!(%service, %why, "a client failed to answer");
+            return Ok(());
+        }
+        let layout = || Ok(Arc::clone(served.replier().reply_layout()));
+        let values = input::arguments(values, layout).map_err(|error| op.gateway(error))?;
+        let replier = served.replier();
+        let reply = |content: Content| async move { replier.reply(request, &content).await };
+        input::tolerate_later(&values, reply).await.map_err(|error| op.gateway(error).into())
+    }
+
+    async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
+        let action = op.needed_text("action")?;
+        let type_name = match op.text("action_type")? {
+            Some(name) => Some(name),
+            None => op.text("type")?,
+        };
+        let wanted = Wanted {
+            id: op.id.clone(),
+            action,
+            type_name,
+            has_feedback: op.bool("feedback")?.unwrap_or(false),
+            fragment_size: fragment_size(op)?,
+            compression: match compression(op)? {
+                Compression::None => Compression::None,
+                Compression::Cbor | Compression::CborRaw => Compression::Cbor,
+            },
+        };
+        if op.id.as_ref().is_some_and(|id| self.goals.contains_key(id)) {
+            return Err(op.refused("a goal of that id is under way").into());
+        }
+        self.check_tasks(op)?;
+        let layout = || {
+            let of = self.session.action_type(&wanted.action, wanted.type_name.as_deref())?;
+            self.session.hub().types().layout(&format!("{of}_Goal"), None)
+        };
+        let args = input::arguments(op.raw("args"), layout).map_err(|error| op.gateway(error))?;
+        let cancel: Arc<Notify> = Arc::default();
+        let id = op.id.clone();
+        if let Some(id) = &id {
+            self.goals.insert(id.clone(), Arc::clone(&cancel));
+        }
+        let (session, outbox) = (Arc::clone(&self.session), self.outbox.clone());
+        self.tasks.spawn(async move {
+            pursue(session, wanted, args, cancel, outbox).await;
+            id
+        });
+        Ok(())
+    }
+
+    fn cancel_action_goal(&mut self, op: &Op<'_>) -> Done {
+        let goal = op.id.as_ref().and_then(|id| self.goals.get(id));
+        let goal = goal.ok_or_else(|| op.refused("no goal of that id is under way"))?;
+        goal.notify_one();
+        Ok(())
+    }
+
+    async fn advertise_action(&mut self, op: &Op<'_>) -> Done {
+        let action = op.needed_text("action")?;
+        let type_name = op.needed_text("type")?;
+        self.check_servings(op)?;
+        self.actions.remove(&action);
+        let full = self.session.action_type(&action, Some(&type_name)).map_err(|error| op.gateway(error))?;
+        let serving = self.session.serve_action(&action, Some(&full)).await;
+        let serving = serving.map_err(|error| op.gateway(error))?;
+        self.actions.insert(action, ServedAction::new(serving, full, self.outbox.clone()));
+        Ok(())
+    }
+
+    fn unadvertise_action(&mut self, op: &Op<'_>) -> Done {
+        let action = op.needed_text("action")?;
+        match self.actions.remove(&action) {
+            Some(_) => Ok(()),
+            None => Err(op.gateway(GatewayError::NotThere { name: action, what: "served" }).into()),
+        }
+    }
+
+    /// The action that an op is of, which the client serves.
+    fn served_action(&self, op: &Op<'_>) -> Result<&ServedAction, OpError> {
+        let action = op.needed_text("action")?;
+        let served = self.actions.get(&action);
+        served.ok_or_else(|| op.gateway(GatewayError::NotThere { name: action, what: "served" }))
+    }
+
+    async fn action_feedback(&mut self, op: &Op<'_>) -> Done {
+        let served = self.served_action(op)?;
+        let goal =
+            served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
+        let values = op.object("values")?.unwrap_or("{}");
+        let (replier, goal) = (served.replier(), &goal);
+        let tell = |content: Content| async move { replier.feedback(goal, &content).await };
+        input::tolerate_later(values, tell).await.map_err(|error| op.gateway(error).into())
+    }
+
+    async fn action_result(&mut self, op: &Op<'_>) -> Done {
+        let served = self.served_action(op)?;
+        let goal =
+            served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
+        let is_done = op.bool("result")?.unwrap_or(true);
+        let status = match (is_done, op.integer("status")?) {
+            (true, None) => GoalStatus::Succeeded,
+            (_, Some(status)) if GoalStatus::of(status).is_end() => GoalStatus::of(status),
+            (false, _) => GoalStatus::Aborted,
+            (true, Some(status)) => {
+                return Err(op.refused(format!("status {status} is no end of a goal")).into());
+            }
+        };
+        let values = op.raw("values").filter(|raw| raw.starts_with('{')).unwrap_or("{}");
+        let (replier, goal) = (served.replier(), &goal);
+        let finish = |content: Content| async move { replier.finish(goal, status, &content).await };
+        input::tolerate_later(values, finish).await.map_err(|error| op.gateway(error))?;
+        served.forget(op.id.as_ref());
+        Ok(())
+    }
+
+    /// What a client says of a goal that it works on; ROS 2 is told by the gateway itself.
+    fn action_status(&mut self, op: &Op<'_>) -> Done {
+        let served = self.served_action(op)?;
+        served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
+        Ok(())
+    }
+}
+
+fn compression(op: &Op<'_>) -> Result<Compression, OpError> {
+    let name = op.text("compression")?.unwrap_or_default();
+    Compression::of(&name).map_err(|why| op.refused(why))
+}
+
+/// At least one byte.
+fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
+    match op.count("fragment_size")? {
+        Some(0) => Err(op.refused("\"fragment_size\" is 1 or more")),
+        size => Ok(size),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn who_errs_now_and_then_is_forgiven() {
+        let mut patience = Patience::new();
+        for _ in 0..10_000 {
+            assert!(patience.count(Instant::now()));
+            tokio::time::advance(Duration::from_millis(11)).await;
+        }
+        let mut errors = 0;
+        while patience.count(Instant::now()) {
+            errors += 1;
+        }
+        assert_eq!(errors, ERRORS_BURST);
+    }
+}

@@ -1,0 +1,136 @@
+//! [`Fragments`]: messages that clients send in pieces (op `fragment`), put together within bounds.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use super::op::OpId;
+
+/// Messages of which pieces are there; with one more the oldest is given up.
+const MESSAGES_MAX: usize = 16;
+/// Pieces of one message.
+const PIECES_MAX: usize = 65_536;
+/// What a piece is counted for beyond its bytes.
+const PIECE_OVERHEAD_BYTES: usize = 64;
+
+/// Why a piece is refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub(super) enum FragmentError {
+    #[error("a message of {0} pieces: 1 to {PIECES_MAX}")]
+    Total(usize),
+    #[error("piece {number} of {total}: they count from 0")]
+    Number { number: usize, total: usize },
+    #[error("the pieces of one message say different totals")]
+    Differ,
+    #[error("the pieces are more than {0} bytes")]
+    TooLong(usize),
+}
+
+/// What came in pieces so far.
+#[derive(Debug)]
+pub(super) struct Fragments {
+    bytes_max: usize,
+    bytes: usize,
+    /// The oldest first.
+    messages: VecDeque<Partial>,
+}
+
+#[derive(Debug)]
+struct Partial {
+    id: OpId,
+    total: usize,
+    bytes: usize,
+    pieces: BTreeMap<usize, String>,
+}
+
+impl Fragments {
+    pub(super) fn new(bytes_max: usize) -> Self {
+        Self { bytes_max, bytes: 0, messages: VecDeque::new() }
+    }
+
+    /// Takes a piece; the message, if it is whole now. A piece that came before is left out. After an error all of the
+    /// message is forgotten.
+    pub(super) fn take(
+        &mut self,
+        id: &OpId,
+        number: usize,
+        total: usize,
+        data: String,
+    ) -> Result<Option<String>, FragmentError> {
+        if total == 0 || total > PIECES_MAX {
+            return Err(FragmentError::Total(total));
+        }
+        if number >= total {
+            return Err(FragmentError::Number { number, total });
+        }
+        let mut partial = match self.messages.iter().position(|partial| partial.id == *id) {
+            Some(at) => self.remove(at),
+            None => None,
+        }
+        .unwrap_or_else(|| Partial { id: id.clone(), total, bytes: 0, pieces: BTreeMap::new() });
+        if partial.total != total {
+            return Err(FragmentError::Differ);
+        }
+        if let std::collections::btree_map::Entry::Vacant(place) = partial.pieces.entry(number) {
+            partial.bytes += data.len() + PIECE_OVERHEAD_BYTES;
+            place.insert(data);
+        }
+        if partial.pieces.len() == total {
+            let texts = partial.pieces.into_values();
+            return Ok(Some(texts.collect()));
+        }
+        if partial.bytes > self.bytes_max {
+            return Err(FragmentError::TooLong(self.bytes_max));
+        }
+        while self.messages.len() >= MESSAGES_MAX || self.bytes + partial.bytes > self.bytes_max {
+            if self.remove(0).is_none() {
+                break;
+            }
+        }
+        self.bytes += partial.bytes;
+        self.messages.push_back(partial);
+        Ok(None)
+    }
+
+    fn remove(&mut self, at: usize) -> Option<Partial> {
+        let partial = self.messages.remove(at)?;
+        self.bytes -= partial.bytes;
+        Some(partial)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn id(number: i64) -> OpId {
+        OpId::Number(number)
+    }
+
+    #[test]
+    fn pieces_in_any_order_are_put_together_once() {
+        let mut fragments = Fragments::new(1000);
+        let mut take = |number, data: &str| fragments.take(&id(1), number, 3, data.into()).unwrap();
+        assert_eq!(take(2, "c"), None);
+        assert_eq!(take(0, "a"), None);
+        assert_eq!(take(0, "other"), None);
+        assert_eq!(take(1, "b"), Some("abc".into()));
+        assert_eq!((fragments.bytes, fragments.messages.len()), (0, 0));
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded() {
+        let mut fragments = Fragments::new(1000);
+        for number in 0..100 {
+            assert_eq!(fragments.take(&id(number), 0, 2, "x".repeat(200)), Ok(None));
+            assert!(fragments.bytes <= 1000 && fragments.messages.len() <= MESSAGES_MAX);
+        }
+        let long = "x".repeat(1000);
+        assert_eq!(fragments.take(&id(7), 0, 2, long), Err(FragmentError::TooLong(1000)));
+        assert_eq!(fragments.take(&id(7), 2, 2, String::new()).unwrap_err().to_string(), {
+            "piece 2 of 2: they count from 0"
+        });
+        assert!(fragments.take(&id(7), 0, 1 << 40, String::new()).is_err());
+        fragments.take(&id(8), 0, 2, String::new()).unwrap();
+        assert_eq!(fragments.take(&id(8), 1, 3, String::new()), Err(FragmentError::Differ));
+        assert_eq!(fragments.take(&id(8), 1, 2, String::new()), Ok(None));
+    }
+}

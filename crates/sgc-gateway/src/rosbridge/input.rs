@@ -1,0 +1,190 @@
+//! Messages as rosbridge's clients write them: times of ROS 1, arguments in a list, headers without a stamp.
+//!
+//! What `docs/spec/json.md` says is tried first, and taken as it is; only what is not right by it is looked at again.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde::Deserialize;
+use serde_json::value::RawValue;
+use serde_json::{Map, Value as Json};
+use sgc_cdr::{Layout, Value};
+
+use crate::content::Content;
+use crate::error::GatewayError;
+
+/// A message of a topic. If its type begins with a header whose stamp is left out, that is now.
+pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError> {
+    let mut value = tolerate(raw, |raw| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value))?;
+    if layout.begins_with_header() && !has_stamp(raw) {
+        stamp(&mut value, now());
+    }
+    Ok(value)
+}
+
+/// Reads something; if it is no message of its type, it is read again as ROS 1 would have written it.
+fn tolerate<T>(raw: &str, read: impl Fn(&str) -> Result<T, GatewayError>) -> Result<T, GatewayError> {
+    match read(raw) {
+        Err(error @ GatewayError::Value(_)) => match of_ros_1(raw) {
+            Some(other) => read(&other),
+            None => Err(error),
+        },
+        result => result,
+    }
+}
+
+/// The same for what is read by something that waits.
+pub(super) async fn tolerate_later<T, F>(raw: &str, read: impl Fn(Content) -> F) -> Result<T, GatewayError>
+where
+    F: Future<Output = Result<T, GatewayError>>,
+{
+    match read(Content::json(raw.to_owned())).await {
+        Err(error @ GatewayError::Value(_)) => match of_ros_1(raw) {
+            Some(other) => read(Content::json(other)).await,
+            None => Err(error),
+        },
+        result => result,
+    }
+}
+
+/// Arguments, which may be an object, or a list of its members in their order, or left out.
+pub(super) fn arguments(
+    raw: Option<&str>,
+    layout: impl FnOnce() -> Result<Arc<Layout>, GatewayError>,
+) -> Result<String, GatewayError> {
+    let Some(raw) = raw else { return Ok("{}".to_owned()) };
+    let Ok(list) = serde_json::from_str::<Vec<&RawValue>>(raw) else { return Ok(raw.to_owned()) };
+    if list.is_empty() {
+        return Ok("{}".to_owned());
+    }
+    let empty = layout()?.from_json(b"{}").map_err(GatewayError::Value)?;
+    let names = match &empty {
+        Value::Record(members) => members.iter().map(|(name, _)| name.to_string()).collect(),
+        _ => Vec::new(),
+    };
+    // What is too much has a name that the type has not, so it is refused as such.
+    let name = |index: usize| names.get(index).cloned().unwrap_or_else(|| format!("[{index}]"));
+    let members = list.iter().enumerate().map(|(index, raw)| format!("{}:{raw}", Json::from(name(index))));
+    Ok(format!("{{{}}}", members.collect::<Vec<_>>().join(",")))
+}
+
+/// The same JSON with `secs` and `nsecs` as ROS 2 calls them, and without stamps that are null. None if there are none.
+fn of_ros_1(raw: &str) -> Option<String> {
+    let mut value: Json = serde_json::from_str(raw).ok()?;
+    rename(&mut value).then(|| value.to_string())
+}
+
+fn rename(value: &mut Json) -> bool {
+    match value {
+        Json::Array(all) => all.iter_mut().fold(false, |any, value| rename(value) || any),
+        Json::Object(members) => {
+            let mut any = rename_time(members);
+            if members.get("stamp").is_some_and(Json::is_null) {
+                members.remove("stamp");
+                any = true;
+            }
+            members.values_mut().fold(any, |any, value| rename(value) || any)
+        }
+        _ => false,
+    }
+}
+
+fn rename_time(members: &mut Map<String, Json>) -> bool {
+    let is_time = members.len() <= 2 && members.keys().all(|key| key == "secs" || key == "nsecs");
+    if !is_time || members.is_empty() {
+        return false;
+    }
+    for (of_ros_1, of_ros_2) in [("secs", "sec"), ("nsecs", "nanosec")] {
+        if let Some(value) = members.remove(of_ros_1) {
+            members.insert(of_ros_2.to_owned(), value);
+        }
+    }
+    true
+}
+
+#[derive(Deserialize)]
+struct Headed<'a> {
+    #[serde(borrow)]
+    header: Option<&'a RawValue>,
+}
+
+#[derive(Deserialize)]
+struct Stamped<'a> {
+    #[serde(borrow)]
+    stamp: Option<&'a RawValue>,
+}
+
+fn has_stamp(raw: &str) -> bool {
+    let header = serde_json::from_str::<Headed<'_>>(raw).ok().and_then(|headed| headed.header);
+    let stamped = header.and_then(|header| serde_json::from_str::<Stamped<'_>>(header.get()).ok());
+    stamped.is_some_and(|stamped| stamped.stamp.is_some())
+}
+
+fn stamp(value: &mut Value, now: Duration) {
+    let Value::Record(members) = value else { return };
+    let Some((_, Value::Record(header))) = members.first_mut() else { return };
+    let Some((_, stamp)) = header.iter_mut().find(|(name, _)| &**name == "stamp") else { return };
+    *stamp = Value::Record(vec![
+        (Arc::from("sec"), Value::Int(now.as_secs().try_into().unwrap_or(i64::MAX))),
+        (Arc::from("nanosec"), Value::Uint(now.subsec_nanos().into())),
+    ]);
+}
+
+/// This host's time, since the Unix epoch.
+pub(super) fn now() -> Duration {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::types::{Shipped, Types};
+
+    fn layout(name: &str) -> Arc<Layout> {
+        Types::new(Shipped).layout(name, None).unwrap()
+    }
+
+    #[test]
+    fn times_of_ros_1_are_taken() {
+        let layout = layout("geometry_msgs/msg/PointStamped");
+        let raw = r#"{"header":{"stamp":{"secs":3,"nsecs":4},"frame_id":"base"}}"#;
+        let read = message(&layout, raw).unwrap();
+        assert_eq!(read.at("header.stamp.sec"), Some(Value::Int(3)));
+        assert_eq!(read.at("header.stamp.nanosec"), Some(Value::Uint(4)));
+        // Members that only look like it stay wrong.
+        let wrong = message(&layout, r#"{"point":{"secs":1,"x":2}}"#).unwrap_err();
+        assert_eq!(wrong.to_string(), "not a message of that type: point: there is no member \"secs\"");
+    }
+
+    #[test]
+    fn stamps_that_are_left_out_are_now() {
+        let layout = layout("geometry_msgs/msg/PointStamped");
+        let sec = |raw: &str| match message(&layout, raw).unwrap().at("header.stamp.sec") {
+            Some(Value::Int(sec)) => sec,
+            other => panic!("{other:?}"),
+        };
+        let begun = now().as_secs().cast_signed();
+        for raw in [
+            "{}",
+            r#"{"header":{}}"#,
+            r#"{"header":{"frame_id":"base","stamp":null}}"#,
+            r#"{"point":{"x":1}}"#,
+        ] {
+            assert!((begun..begun + 60).contains(&sec(raw)), "{raw}");
+        }
+        assert_eq!(sec(r#"{"header":{"stamp":{}}}"#), 0);
+        assert_eq!(sec(r#"{"header":{"stamp":{"sec":0,"nanosec":0}}}"#), 0);
+    }
+
+    #[test]
+    fn arguments_may_be_a_list() {
+        let layout = || Ok(layout("std_srvs/srv/SetBool_Request"));
+        let read = |raw| arguments(raw, layout).unwrap();
+        assert_eq!(read(None), "{}");
+        assert_eq!(read(Some("[]")), "{}");
+        assert_eq!(read(Some(r#"{"data":true}"#)), r#"{"data":true}"#);
+        assert_eq!(read(Some("[true]")), r#"{"data":true}"#);
+        assert_eq!(read(Some("[true, 3]")), r#"{"data":true,"[1]":3}"#);
+    }
+}

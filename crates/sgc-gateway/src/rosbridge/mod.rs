@@ -1,0 +1,146 @@
+//! The rosbridge protocol (version 2, as `rosbridge_suite` of ROS 2 speaks it): what roslibjs and roslibpy talk.
+//!
+//! [`serve`] serves one WebSocket. It listens to nothing and admits nobody by itself: the socket comes accepted, with the
+//! session of who was admitted. What the protocol does here, op by op, is in `docs/gateway-rosbridge.md`.
+
+mod actions;
+mod calls;
+mod connection;
+mod envelope;
+mod fragments;
+mod input;
+mod op;
+mod options;
+mod outbox;
+mod params;
+mod qos;
+mod rosapi;
+mod services;
+mod topics;
+mod typedefs;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::{SinkExt as _, StreamExt as _};
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::time::Instant;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+
+use crate::session::Session;
+use connection::Connection;
+pub use options::{
+    Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
+    ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions, StillAdmits,
+};
+use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
+
+/// How long a client may take to hear why its connection ends.
+const FAREWELL_MAX: Duration = Duration::from_secs(2);
+
+/// Serves a client until it leaves; with it ends all that it had. Accept the socket with
+/// [`RosbridgeOptions::websocket`], so that bounds hold from its first byte. May be dropped at any time.
+///
+/// # Errors
+/// Why the connection ended, if it was not by the client's wish.
+pub async fn serve<S>(
+    socket: WebSocketStream<S>,
+    session: Arc<Session>,
+    options: RosbridgeOptions,
+) -> Result<(), RosbridgeError>
+where
+    S: AsyncRead + AsyncWrite + Unpin + Send,
+{
+    let options = Arc::new(options);
+    let (outbox, mut outgoing) = Outbox::new();
+    let pulse = Pulse::default();
+    let (mut sink, mut stream) = socket.split();
+    let mut connection = Connection::new(session, Arc::clone(&options), outbox);
+    let ended = {
+        let reading = read_all(&mut stream, &mut connection, &pulse, &options);
+        let writing = write_all(&mut sink, &mut outgoing, &pulse, options.silence_max);
+        tokio::select! {
+            ended = reading => ended,
+            error = writing => Err(error),
+        }
+    };
+    drop(connection);
+    if let Some((code, why)) = ended.as_ref().err().and_then(RosbridgeError::close) {
+        let farewell = farewell(&mut sink, &mut outgoing, code, why);
+        let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
+        // What the client sent meanwhile is taken from the socket, so that it hears this before the connection is gone.
+        let until_closed = async { while let Some(Ok(_)) = stream.next().await {} };
+        let _ = tokio::time::timeout(FAREWELL_MAX, until_closed).await;
+    }
+    ended
+}
+
+async fn farewell<W>(sink: &mut W, outgoing: &mut Outgoing, code: u16, why: String)
+where
+    W: futures_util::Sink<Message, Error = tokio_tungstenite::tungstenite::Error> + Unpin,
+{
+    // A close frame has room for 123 bytes of words (RFC 6455, 5.5).
+    let mut end = why.len().min(123);
+    while !why.is_char_boundary(end) {
+        end -= 1;
+    }
+    let reason = why[..end].to_owned();
+    if write_rest(sink, outgoing).await.is_ok() {
+        let close = CloseFrame { code: code.into(), reason: reason.into() };
+        let _ = sink.send(Message::Close(Some(close))).await;
+    }
+}
+
+/// Takes what the client sends until it leaves.
+async fn read_all<R>(
+    stream: &mut R,
+    connection: &mut Connection,
+    pulse: &Pulse,
+    options: &RosbridgeOptions,
+) -> Result<(), RosbridgeError>
+where
+    R: futures_util::Stream<Item = Result<Message, tokio_tungstenite::tungstenite::Error>> + Unpin,
+{
+    let begun = Instant::now();
+    let mut looks = tokio::time::interval(options.silence_max / 4);
+    loop {
+        let message = tokio::select! {
+            message = stream.next() => message,
+            _ = looks.tick() => {
+                look(connection, pulse, options)?;
+                continue;
+            }
+            () = tokio::time::sleep_until(begun + ROSBRIDGE_ADMISSION_MAX), if !connection.is_admitted() => {
+                return Err(RosbridgeError::NotAdmitted("no token was shown in time".to_owned()));
+            }
+        };
+        let Some(message) = message else { return Ok(()) };
+        pulse.heard();
+        match message.map_err(|error| RosbridgeError::socket(error, options.message_bytes_max))? {
+            Message::Text(text) => connection.take(&text).await?,
+            // As `rosbridge_suite` has it, JSON may come as bytes.
+            Message::Binary(bytes) => match std::str::from_utf8(&bytes) {
+                Ok(text) => connection.take(text).await?,
+                // It is no JSON, and said to be none.
+                Err(_) => connection.take("\u{fffd}").await?,
+            },
+            Message::Close(_) => return Ok(()),
+            Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
+        }
+    }
+}
+
+/// Whether the client is there, and may be.
+fn look(connection: &Connection, pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
+    if pulse.unanswered().is_some_and(|since| since.elapsed() >= options.silence_max) {
+        return Err(RosbridgeError::Silent(options.silence_max));
+    }
+    match &options.still_admits {
+        Some(still_admits) if connection.is_admitted() => {
+            still_admits(connection.session().client()).map_err(RosbridgeError::NotAdmitted)
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,228 @@
+//! [`Op`]: what a client sends, as its members; nothing of it is believed before it is asked for.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::value::RawValue;
+
+use crate::error::GatewayError;
+
+/// Longest id that is echoed, bytes.
+const ID_BYTES_MAX: usize = 1024;
+/// Characters of what somebody wrote that are shown.
+const SHOWN_MAX: usize = 80;
+/// Longest time that a client can say, seconds.
+const SECONDS_MAX: f64 = 1e9;
+
+/// The id of an op, by which what comes of it is known.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum OpId {
+    Number(i64),
+    Text(Arc<str>),
+}
+
+impl fmt::Display for OpId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Number(number) => number.fmt(f),
+            Self::Text(text) => text.fmt(f),
+        }
+    }
+}
+
+/// Why an op is refused, in words for the client's user.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub(super) enum OpError {
+    #[error("not JSON: {0}")]
+    NotJson(String),
+    #[error("not an object with a member \"op\"")]
+    NoOp,
+    #[error("there is no op {0:?}")]
+    UnknownOp(String),
+    #[error("{op}: {member:?} is missing")]
+    Missing { op: String, member: &'static str },
+    #[error("{op}: {member:?} is no {expected}: {found}")]
+    Kind { op: String, member: &'static str, expected: &'static str, found: String },
+    #[error("{op}: {source}")]
+    Gateway { op: String, source: GatewayError },
+    #[error("{op}: {why}")]
+    Refused { op: String, why: String },
+}
+
+/// What a client sent.
+#[derive(Debug)]
+pub(super) struct Op<'a> {
+    pub(super) name: Cow<'a, str>,
+    pub(super) id: Option<OpId>,
+    members: BTreeMap<Cow<'a, str>, &'a RawValue>,
+}
+
+impl<'a> Op<'a> {
+    /// Reads the members, and none of their values but the op and its id.
+    pub(super) fn parse(text: &'a str) -> Result<Self, OpError> {
+        let members: BTreeMap<Cow<'a, str>, &'a RawValue> = serde_json::from_str(text).map_err(|error| {
+            let is_object = text.trim_start().starts_with('{');
+            if error.is_data() && !is_object { OpError::NoOp } else { OpError::NotJson(error.to_string()) }
+        })?;
+        let name = members.get("op").and_then(|name| text_of(name)).ok_or(OpError::NoOp)?;
+        let mut op = Self { name, id: None, members };
+        op.id = op.read_id()?;
+        Ok(op)
+    }
+
+    fn read_id(&self) -> Result<Option<OpId>, OpError> {
+        let Some(raw) = self.raw("id") else { return Ok(None) };
+        if let Ok(number) = raw.parse() {
+            return Ok(Some(OpId::Number(number)));
+        }
+        let text = serde_json::from_str::<String>(raw).ok().filter(|text| text.len() <= ID_BYTES_MAX);
+        let text = text.ok_or_else(|| self.no("id", "text or integer", raw))?;
+        Ok(Some(OpId::Text(text.into())))
+    }
+
+    fn no(&self, member: &'static str, expected: &'static str, found: &str) -> OpError {
+        OpError::Kind { op: self.name.to_string(), member, expected, found: short(found) }
+    }
+
+    pub(super) fn refused(&self, why: impl Into<String>) -> OpError {
+        OpError::Refused { op: self.name.to_string(), why: why.into() }
+    }
+
+    pub(super) fn gateway(&self, source: GatewayError) -> OpError {
+        OpError::Gateway { op: self.name.to_string(), source }
+    }
+
+    fn missing(&self, member: &'static str) -> OpError {
+        OpError::Missing { op: self.name.to_string(), member }
+    }
+
+    /// A member as it was sent; `null` is none.
+    pub(super) fn raw(&self, member: &str) -> Option<&'a str> {
+        self.members.get(member).map(|raw| raw.get()).filter(|raw| *raw != "null")
+    }
+
+    pub(super) fn text(&self, member: &'static str) -> Result<Option<String>, OpError> {
+        let Some(raw) = self.raw(member) else { return Ok(None) };
+        let text = serde_json::from_str(raw).map_err(|_| self.no(member, "text", raw))?;
+        Ok(Some(text))
+    }
+
+    pub(super) fn needed_text(&self, member: &'static str) -> Result<String, OpError> {
+        self.text(member)?.ok_or_else(|| self.missing(member))
+    }
+
+    /// An object, as it was sent.
+    pub(super) fn object(&self, member: &'static str) -> Result<Option<&'a str>, OpError> {
+        match self.raw(member) {
+            Some(raw) if !raw.starts_with('{') => Err(self.no(member, "object", raw)),
+            raw => Ok(raw),
+        }
+    }
+
+    pub(super) fn needed_object(&self, member: &'static str) -> Result<&'a str, OpError> {
+        self.object(member)?.ok_or_else(|| self.missing(member))
+    }
+
+    pub(super) fn bool(&self, member: &'static str) -> Result<Option<bool>, OpError> {
+        match self.raw(member) {
+            None => Ok(None),
+            Some("true") => Ok(Some(true)),
+            Some("false") => Ok(Some(false)),
+            Some(raw) => Err(self.no(member, "bool", raw)),
+        }
+    }
+
+    /// A number that is not negative. Whole ones may come as floats.
+    pub(super) fn count(&self, member: &'static str) -> Result<Option<usize>, OpError> {
+        let Some(raw) = self.raw(member) else { return Ok(None) };
+        if let Ok(count) = raw.parse() {
+            return Ok(Some(count));
+        }
+        match raw.parse::<f64>() {
+            Ok(count) if (0.0..=u32::MAX.into()).contains(&count) && count.fract() == 0.0 => {
+                Ok(Some(count as usize))
+            }
+            _ => Err(self.no(member, "number of 0 or more", raw)),
+        }
+    }
+
+    pub(super) fn integer(&self, member: &'static str) -> Result<Option<i64>, OpError> {
+        let Some(raw) = self.raw(member) else { return Ok(None) };
+        raw.parse().map(Some).map_err(|_| self.no(member, "integer", raw))
+    }
+
+    /// Seconds; what is not positive is none.
+    pub(super) fn seconds(&self, member: &'static str) -> Result<Option<Duration>, OpError> {
+        let Some(raw) = self.raw(member) else { return Ok(None) };
+        let seconds: f64 = raw.parse().map_err(|_| self.no(member, "number of seconds", raw))?;
+        Ok((seconds > 0.0).then(|| Duration::from_secs_f64(seconds.min(SECONDS_MAX))))
+    }
+}
+
+fn text_of<'a>(raw: &'a RawValue) -> Option<Cow<'a, str>> {
+    let raw = raw.get();
+    match serde_json::from_str::<&'a str>(raw) {
+        Ok(text) => Some(Cow::Borrowed(text)),
+        Err(_) => serde_json::from_str::<String>(raw).ok().map(Cow::Owned),
+    }
+}
+
+pub(super) fn short(text: &str) -> String {
+    let mut shown: String = text.chars().take(SHOWN_MAX).collect();
+    if shown.len() < text.len() {
+        shown.push('…');
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn members_are_read_as_what_they_are() {
+        let op = Op::parse(
+            r#"{"op":"x","id":"a\"b","n":3,"f":2.0,"no":null,"t":true,"o":{"a":[1]},"s":0.25,"m":-1}"#,
+        )
+        .unwrap();
+        assert_eq!((op.name.as_ref(), &op.id), ("x", &Some(OpId::Text("a\"b".into()))));
+        assert_eq!((op.count("n").unwrap(), op.count("f").unwrap()), (Some(3), Some(2)));
+        assert_eq!((op.text("no").unwrap(), op.bool("t").unwrap()), (None, Some(true)));
+        assert_eq!(op.object("o").unwrap(), Some(r#"{"a":[1]}"#));
+        assert_eq!(op.seconds("s").unwrap(), Some(Duration::from_millis(250)));
+        assert_eq!((op.seconds("m").unwrap(), op.integer("m").unwrap()), (None, Some(-1)));
+        let errors = [
+            op.count("m").unwrap_err(),
+            op.text("n").unwrap_err(),
+            op.object("n").unwrap_err(),
+            op.needed_text("topic").unwrap_err(),
+        ];
+        let told: Vec<_> = errors.iter().map(ToString::to_string).collect();
+        assert_eq!(
+            told,
+            [
+                r#"x: "m" is no number of 0 or more: -1"#,
+                r#"x: "n" is no text: 3"#,
+                r#"x: "n" is no object: 3"#,
+                r#"x: "topic" is missing"#,
+            ]
+        );
+    }
+
+    #[test]
+    fn what_is_no_op_is_told_as_such() {
+        for wrong in ["[]", "3", "null", "{}", r#"{"op":3}"#] {
+            assert_eq!(Op::parse(wrong).unwrap_err(), OpError::NoOp, "{wrong}");
+        }
+        for wrong in ["", "{", r#"{"op":"x""#, r#"{"op":"x"} x"#, "{'op':1}", "nonsense"] {
+            assert!(matches!(Op::parse(wrong).unwrap_err(), OpError::NotJson(_)), "{wrong}");
+        }
+        let deep = format!(r#"{{"op":"x","msg":{}{}}}"#, "[".repeat(100_000), "]".repeat(100_000));
+        assert!(Op::parse(&deep).is_ok());
+        assert!(Op::parse(r#"{"op":"x","id":1.5}"#).is_err());
+        assert_eq!(Op::parse(r#"{"op":"x","id":7}"#).unwrap().id, Some(OpId::Number(7)));
+    }
+}

@@ -1,0 +1,232 @@
+//! [`Outbox`]: what waits to be written to a client, in two lanes, and [`write_all`], which writes it.
+//!
+//! Replies, requests and status go before messages of topics. Both lanes are short: who has something to say waits for a
+//! place, so that of a client that does not read nothing gathers here, and its subscriptions drop what is old.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use futures_util::{Sink, SinkExt as _};
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+use tokio_tungstenite::tungstenite::{self, Message};
+
+use super::envelope::{Envelope, Frame};
+use super::op::OpId;
+use super::options::RosbridgeError;
+
+/// Replies, requests and status that wait.
+const CONTROL_MAX: usize = 64;
+/// Batches of messages that wait.
+const BATCHES_MAX: usize = 4;
+/// What is written before it is flushed, bytes.
+const FLUSH_BYTES: usize = 256 << 10;
+/// Bytes a second that a client has to take in the long run.
+const PACE_BYTES_MIN: u64 = 16 << 10;
+
+/// How much a client is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u8)]
+pub(super) enum Level {
+    None,
+    Error,
+    Warning,
+    Info,
+}
+
+impl Level {
+    pub(super) fn of(name: &str) -> Option<Self> {
+        Some(match name {
+            "none" => Self::None,
+            "error" => Self::Error,
+            "warning" | "warn" => Self::Warning,
+            "info" => Self::Info,
+            _ => return None,
+        })
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Error => "error",
+            Self::Warning => "warning",
+            Self::Info => "info",
+        }
+    }
+}
+
+/// What waits to be written to a client.
+#[derive(Clone, Debug)]
+pub(super) struct Outbox {
+    control: mpsc::Sender<Frame>,
+    batches: mpsc::Sender<Vec<Frame>>,
+    level: Arc<AtomicU8>,
+}
+
+/// The other end of it.
+#[derive(Debug)]
+pub(super) struct Outgoing {
+    control: mpsc::Receiver<Frame>,
+    batches: mpsc::Receiver<Vec<Frame>>,
+}
+
+/// The connection has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Gone;
+
+impl Outbox {
+    pub(super) fn new() -> (Self, Outgoing) {
+        let (control, control_out) = mpsc::channel(CONTROL_MAX);
+        let (batches, batches_out) = mpsc::channel(BATCHES_MAX);
+        let level = Arc::new(AtomicU8::new(Level::Error as u8));
+        (Self { control, batches, level }, Outgoing { control: control_out, batches: batches_out })
+    }
+
+    pub(super) fn set_level(&self, level: Level) {
+        self.level.store(level as u8, Ordering::Relaxed);
+    }
+
+    /// Says something once there is room.
+    pub(super) async fn say(&self, frame: Frame) -> Result<(), Gone> {
+        self.control.send(frame).await.map_err(|_| Gone)
+    }
+
+    fn status_frame(&self, level: Level, told: &str, id: Option<&OpId>) -> Option<Frame> {
+        let is_wanted = level as u8 <= self.level.load(Ordering::Relaxed);
+        let status = || Envelope::json("status").text("level", level.name()).text("msg", told).id(id);
+        is_wanted.then(|| status().finish())
+    }
+
+    /// Tells of something, if the client wants to be told.
+    pub(super) async fn status(&self, level: Level, told: &str, id: Option<&OpId>) -> Result<(), Gone> {
+        match self.status_frame(level, told, id) {
+            Some(frame) => self.say(frame).await,
+            None => Ok(()),
+        }
+    }
+
+    /// The same from where nothing may be waited for: left out if there is no room.
+    pub(super) fn try_status(&self, level: Level, told: &str, id: Option<&OpId>) {
+        if let Some(frame) = self.status_frame(level, told, id) {
+            let _ = self.control.try_send(frame);
+        }
+    }
+
+    /// A place for messages, once there is one: so that they are written out only then.
+    pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, Gone> {
+        self.batches.reserve().await.map_err(|_| Gone)
+    }
+}
+
+/// Since when a ping has not been answered.
+#[derive(Debug, Default)]
+pub(super) struct Pulse(Mutex<Option<Instant>>);
+
+impl Pulse {
+    fn asked(&self) {
+        self.lock().get_or_insert_with(Instant::now);
+    }
+
+    /// Something came.
+    pub(super) fn heard(&self) {
+        *self.lock() = None;
+    }
+
+    pub(super) fn unanswered(&self) -> Option<Instant> {
+        *self.lock()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Instant>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Writes until the connection ends.
+pub(super) async fn write_all<W>(
+    sink: &mut W,
+    outgoing: &mut Outgoing,
+    pulse: &Pulse,
+    silence_max: Duration,
+) -> RosbridgeError
+where
+    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+{
+    let mut pings = tokio::time::interval(silence_max / 4);
+    pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    pings.reset();
+    loop {
+        let (frames, is_ping) = tokio::select! {
+            biased;
+            _ = pings.tick() => (Vec::new(), true),
+            Some(frame) = outgoing.control.recv() => (vec![frame], false),
+            Some(batch) = outgoing.batches.recv() => (batch, false),
+            else => return RosbridgeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)),
+        };
+        let written = async {
+            if is_ping {
+                timed(silence_max, 0, sink.send(Message::Ping(Default::default()))).await?;
+                pulse.asked();
+            }
+            let mut bytes = 0;
+            let mut frames = frames;
+            loop {
+                for frame in frames {
+                    bytes += feed(sink, frame, silence_max).await?;
+                }
+                if bytes >= FLUSH_BYTES {
+                    break;
+                }
+                let next = outgoing.control.try_recv().map(|frame| vec![frame]);
+                frames = match next.or_else(|_| outgoing.batches.try_recv()) {
+                    Ok(next) => next,
+                    Err(_) => break,
+                };
+            }
+            timed(silence_max, bytes, sink.flush()).await
+        };
+        if let Err(error) = written.await {
+            return error;
+        }
+    }
+}
+
+/// Writes what is still to be said, and nothing of topics.
+pub(super) async fn write_rest<W>(sink: &mut W, outgoing: &mut Outgoing) -> Result<(), tungstenite::Error>
+where
+    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+{
+    outgoing.batches.close();
+    outgoing.control.close();
+    while let Ok(frame) = outgoing.control.try_recv() {
+        for message in frame.messages() {
+            sink.feed(message).await?;
+        }
+    }
+    sink.flush().await
+}
+
+async fn feed<W>(sink: &mut W, frame: Frame, silence_max: Duration) -> Result<usize, RosbridgeError>
+where
+    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+{
+    let bytes = frame.bytes();
+    for message in frame.messages() {
+        let length = message.len();
+        timed(silence_max, length, sink.feed(message)).await?;
+    }
+    Ok(bytes)
+}
+
+/// So long a write may take.
+async fn timed(
+    silence_max: Duration,
+    bytes: usize,
+    write: impl Future<Output = Result<(), tungstenite::Error>>,
+) -> Result<(), RosbridgeError> {
+    let max = silence_max + Duration::from_secs(bytes as u64 / PACE_BYTES_MIN);
+    match tokio::time::timeout(max, write).await {
+        Ok(result) => result.map_err(|error| RosbridgeError::Socket(Box::new(error))),
+        Err(_) => Err(RosbridgeError::Silent(max)),
+    }
+}

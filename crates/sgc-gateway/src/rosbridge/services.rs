@@ -1,0 +1,91 @@
+//! [`Served`]: a service that a client serves. Requests go to it as the op `call_service`, and what it answers comes back as
+//! `service_response`.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use sgc_ros::RequestId;
+use tokio::task::JoinHandle;
+
+use super::envelope::Envelope;
+use super::op::OpId;
+use super::outbox::{Level, Outbox};
+use crate::content::Form;
+use crate::hub::lock;
+use crate::service::{Replier, Serving};
+
+/// Requests that a client has not answered; the oldest is given up for one more.
+const PENDING_MAX: usize = 1024;
+
+/// Requests that were passed on, by their number.
+#[derive(Debug, Default)]
+struct Pending {
+    next: u64,
+    asked: BTreeMap<u64, RequestId>,
+}
+
+/// A service that a client serves; ends when dropped.
+#[derive(Debug)]
+pub(super) struct Served {
+    replier: Replier,
+    pending: Arc<Mutex<Pending>>,
+    prefix: Arc<str>,
+    task: JoinHandle<()>,
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl Served {
+    pub(super) fn new(serving: Serving, outbox: Outbox) -> Self {
+        let replier = serving.replier();
+        let pending = Arc::default();
+        let prefix: Arc<str> = format!("service_request:{}:", serving.service()).into();
+        let task = tokio::spawn(ask(serving, Arc::clone(&pending), Arc::clone(&prefix), outbox));
+        Self { replier, pending, prefix, task }
+    }
+
+    pub(super) fn replier(&self) -> &Replier {
+        &self.replier
+    }
+
+    /// The request that an answer is for, which has no other then.
+    pub(super) fn take(&self, id: Option<&OpId>) -> Option<RequestId> {
+        let Some(OpId::Text(id)) = id else { return None };
+        let number = id.strip_prefix(&*self.prefix)?.parse().ok()?;
+        lock(&self.pending).asked.remove(&number)
+    }
+}
+
+/// Passes requests on as fast as the client takes them.
+async fn ask(mut serving: Serving, pending: Arc<Mutex<Pending>>, prefix: Arc<str>, outbox: Outbox) {
+    while let Some(request) = serving.next().await {
+        let args = match serving.write(&request, Form::Json) {
+            Ok(args) => args,
+            Err(error) => {
+                outbox.try_status(Level::Error, &format!("{}: {error}", serving.service()), None);
+                continue;
+            }
+        };
+        let number = {
+            let mut pending = lock(&pending);
+            let number = pending.next;
+            pending.next += 1;
+            pending.asked.insert(number, request.id);
+            if pending.asked.len() > PENDING_MAX {
+                pending.asked.pop_first();
+            }
+            number
+        };
+        let call = Envelope::json("call_service")
+            .text("id", &format!("{prefix}{number}"))
+            .text("service", serving.service())
+            .content("args", &args);
+        if outbox.say(call.finish()).await.is_err() {
+            return;
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! A gateway of gRPC on a network in memory, and clients of it over TCP.
+
+#![allow(dead_code, reason = "each test program uses a part")]
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use rand_chacha::ChaCha20Rng;
+use rand_chacha::rand_core::SeedableRng as _;
+use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
+use sgc_gateway::grpc::{Accepted, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
+use sgc_gateway::{Access, AccessGrant, AccessRules, Anonymous, Scope, TokenId};
+use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_wire::UnixMillis;
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::metadata::AsciiMetadataValue;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Status};
+
+use crate::support::Site;
+
+/// A gateway, and the network that it is on.
+pub(crate) struct Gateway {
+    pub(crate) site: Site,
+    pub(crate) grpc: Grpc,
+    pub(crate) address: SocketAddr,
+    pub(crate) serving: JoinHandle<()>,
+    access: Arc<Mutex<Access>>,
+    identity: Identity,
+}
+
+pub(crate) type Client = GatewayClient<InterceptedService<Channel, Bearer>>;
+
+/// Shows a token with each call.
+#[derive(Clone)]
+pub(crate) struct Bearer(Option<AsciiMetadataValue>);
+
+impl tonic::service::Interceptor for Bearer {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(header) = &self.0 {
+            request.metadata_mut().insert("authorization", header.clone());
+        }
+        Ok(request)
+    }
+}
+
+pub(crate) fn now() -> UnixMillis {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
+    UnixMillis(since.as_millis() as u64)
+}
+
+impl Gateway {
+    /// One that admits programs of this host.
+    pub(crate) async fn new() -> Self {
+        Self::with(GrpcOptions::default()).await
+    }
+
+    pub(crate) async fn with(options: GrpcOptions) -> Self {
+        let options = GrpcOptions { judge_interval: Duration::from_millis(20), ..options };
+        let site = Site::new().await;
+        let mut rng = ChaCha20Rng::seed_from_u64(8);
+        let began = UnixMillis(now().0 - 1000);
+        let mut fleet = Fleet::create("lab".parse().unwrap(), began, &mut rng).unwrap();
+        let identity = fleet.enroll(&EnrollRequest::new("robot".parse().unwrap(), began), &mut rng).unwrap();
+        let access = Arc::new(Mutex::new(Access::default()));
+        let present = Arc::clone(&access);
+        let grpc = Grpc::new(site.hub.clone(), move || present.lock().unwrap().clone(), options);
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let (send, accepted) = mpsc::channel(1);
+        tokio::spawn(async move {
+            while let Ok((stream, peer)) = listener.accept().await {
+                stream.set_nodelay(true).unwrap();
+                if send.send(Accepted::new(stream, Connection::plain(peer))).await.is_err() {
+                    return;
+                }
+            }
+        });
+        let served = grpc.clone();
+        let serving = tokio::spawn(async move { served.serve(ReceiverStream::new(accepted)).await.unwrap() });
+        let gateway = Self { site, grpc, address, serving, access, identity };
+        gateway.admit(Anonymous::Local);
+        gateway
+    }
+
+    /// Has the gateway admit these from now on, and whoever has a token.
+    pub(crate) fn admit(&self, anonymous: Anonymous) {
+        let gateway = Some(self.identity.as_peer().clone());
+        *self.access.lock().unwrap() =
+            Access::new(AccessRules { anonymous, gateway, ..AccessRules::default() });
+    }
+
+    /// A token for a client of this name.
+    pub(crate) fn token(&self, label: &str, scope: Scope, expires: UnixMillis) -> String {
+        let (id, gateway, issued) = (TokenId([7; 16]), self.identity.node_id(), UnixMillis(now().0 - 1));
+        let grant = AccessGrant { id, gateway, label: label.into(), scope, issued, expires };
+        grant.sign(&self.identity).unwrap().to_text().to_string()
+    }
+
+    pub(crate) fn endpoint(&self) -> Endpoint {
+        Endpoint::from_shared(format!("http://{}", self.address)).unwrap()
+    }
+
+    /// A client without a token, on a connection of its own.
+    pub(crate) async fn client(&self) -> Client {
+        client(self.endpoint().connect().await.unwrap(), None)
+    }
+
+    pub(crate) async fn client_with(&self, token: &str) -> Client {
+        client(self.endpoint().connect().await.unwrap(), Some(token))
+    }
+}
+
+pub(crate) fn client(channel: Channel, token: Option<&str>) -> Client {
+    let bearer = Bearer(token.map(|token| format!("Bearer {token}").parse().unwrap()));
+    GatewayClient::with_interceptor(channel, bearer)
+        .max_decoding_message_size(MESSAGE_BYTES_MAX)
+        .max_encoding_message_size(MESSAGE_BYTES_MAX)
+}

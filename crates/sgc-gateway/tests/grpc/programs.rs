@@ -1,0 +1,154 @@
+//! Programs of others as clients: Python's grpcio with the client of `clients/python`, and Node's grpc-js with nothing but
+//! `gateway.proto`. Both have to be installed, as `make peers` does.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_gateway::{Advertise, Content, Scope};
+use sgc_ros::{RosNetwork as _, RosWriter as _, Sample, SampleKind};
+use sgc_wire::{Durability, History, Qos, UnixMillis};
+use tokio::process::Command;
+
+use crate::gateway::{Gateway, now};
+use crate::support::{spec, string};
+
+/// Longest that all of it takes, with much to spare.
+const PATIENCE: Duration = Duration::from_secs(120);
+/// Between two messages of the talker.
+const TALK: Duration = Duration::from_millis(10);
+
+/// What the programs find on the network.
+struct Scene {
+    gateway: Gateway,
+    token: String,
+    talks: Arc<AtomicBool>,
+    commands: mpsc::Receiver<Bytes>,
+    _held: Box<dyn std::any::Any>,
+}
+
+impl Scene {
+    async fn new() -> Self {
+        let gateway = Gateway::new().await;
+        let all = |but: &str| {
+            vec!["/chatter".into(), "/camera".into(), "/echoed".into(), "/large".into(), but.into()]
+        };
+        let scope = Scope {
+            subscribe: all("/py/**"),
+            publish: all("/py/**"),
+            call: vec!["/py/**".into(), "/js/**".into()],
+            serve: vec!["/py/**".into(), "/js/**".into()],
+        };
+        let token = gateway.token("program", scope, UnixMillis(now().0 + 3_600_000));
+        let site = &gateway.site;
+        let secret = site.writer("/secret", Qos::default());
+        let talker = site.writer("/chatter", Qos::default());
+        let talks = Arc::new(AtomicBool::new(true));
+        let goes_on = Arc::clone(&talks);
+        std::thread::spawn(move || {
+            for n in 0.. {
+                if !goes_on.load(Ordering::Relaxed) {
+                    return;
+                }
+                let stamp = now().0 as i64 * 1_000_000;
+                talker.write(SampleKind::Write, stamp, string(&format!("hello {n}"))).unwrap();
+                std::thread::sleep(TALK);
+            }
+        });
+        // A picture of four pixels: blue, green, red, white.
+        let latched =
+            Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
+        let camera = Advertise {
+            topic: "/camera".into(),
+            type_name: Some("sensor_msgs/msg/Image".into()),
+            qos: latched,
+        };
+        let camera = site.session("camera").advertise(camera).await.unwrap();
+        let image = r#"{"width":4,"height":1,"step":12,"encoding":"bgr8","data":"/wAAAP8AAAD/////"}"#;
+        camera.publish(&Content::json(image)).await.unwrap();
+        let (send, commands) = mpsc::channel();
+        let heard = Box::new(move |sample: Sample| drop(send.send(sample.payload)));
+        let wheels = spec("/cmd_vel", "geometry_msgs/msg/Twist", Qos::default());
+        let wheels = site.ros.create_reader(&wheels, heard).unwrap();
+        let _held = Box::new((secret, camera, wheels));
+        Self { gateway, token, talks, commands, _held }
+    }
+
+    /// Runs a program to its end, which has to be a good one.
+    async fn run(&self, mut command: Command) -> String {
+        command.arg(self.gateway.address.port().to_string()).arg(&self.token);
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
+        let program = format!("{command:?}");
+        let child = command.spawn().unwrap_or_else(|why| panic!("{why}: run `make peers` first: {program}"));
+        let output = tokio::time::timeout(PATIENCE, child.wait_with_output()).await;
+        let output = output.expect("it should have ended by now").unwrap();
+        let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        assert!(output.status.success(), "{}\n{}", said(&output.stdout), said(&output.stderr));
+        said(&output.stdout)
+    }
+}
+
+impl Drop for Scene {
+    fn drop(&mut self) {
+        self.talks.store(false, Ordering::Relaxed);
+    }
+}
+
+fn repository(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../").join(file)
+}
+
+fn python() -> Command {
+    Command::new(repository(".venv/bin/python"))
+}
+
+/// The wheel of the Python client, built in a directory from what its users get.
+async fn wheel(dir: &Path) -> PathBuf {
+    let source = dir.join("source");
+    let copied = Command::new("cp").arg("-r").args([&repository("clients/python"), &source]).status().await;
+    assert!(copied.unwrap().success());
+    let mut pip = python();
+    pip.args([
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "--wheel-dir",
+    ]);
+    let built = pip.args([dir, &source]).output().await.expect("run `make peers` first");
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    let is_wheel = |path: &PathBuf| path.extension().is_some_and(|kind| kind == "whl");
+    std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).find(is_wheel).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn python_does_all_that_there_is() {
+    let scene = Scene::new().await;
+    let dir = tempfile::tempdir().unwrap();
+    let mut python = python();
+    python.env("PYTHONPATH", wheel(dir.path()).await).arg("-B");
+    python.arg(repository("clients/python/tests/against_gateway.py"));
+    let said = scene.run(python).await;
+    assert!(said.ends_with("all is well\n"), "{said}");
+    // The wheels turned, and stand.
+    let commands: Vec<_> = scene.commands.try_iter().collect();
+    let speed = |payload: &Bytes| f64::from_le_bytes(payload[4..12].try_into().unwrap());
+    assert!(commands.len() >= 3 && speed(&commands[0]) == 0.2, "{commands:?}");
+    assert_eq!(commands.last().map(speed), Some(0.0));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn node_needs_nothing_but_the_proto() {
+    let scene = Scene::new().await;
+    let mut node = Command::new("node");
+    node.arg(repository("tests/js/grpc.cjs"));
+    node.arg(repository("crates/sgc-gateway/proto/sgc/gateway/v1/gateway.proto"));
+    let said = scene.run(node).await;
+    assert!(said.ends_with("all is well\n"), "{said}");
+}
