@@ -4,12 +4,12 @@ import assert from "node:assert/strict";
 
 import { parse } from "@foxglove/rosmsg";
 import { MessageReader, MessageWriter } from "@foxglove/rosmsg2-serialization";
-import { FoxgloveClient } from "@foxglove/ws-protocol";
+import foxglove from "@foxglove/ws-protocol";
 import WebSocket from "ws";
 
 const [url, subprotocol] = process.argv.slice(2);
 const ws = new WebSocket(url, [subprotocol]);
-const client = new FoxgloveClient({ ws });
+const client = new foxglove.FoxgloveClient({ ws });
 const heard = [];
 const waiting = [];
 

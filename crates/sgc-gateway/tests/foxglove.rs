@@ -32,7 +32,7 @@ impl Program {
         let types = Types::new(Shipped);
         let options = HubOptions { node: node.to_owned() };
         let hub = Hub::start(Arc::new(site.domain.join(false)), types, options).await.unwrap();
-        let client = Client { name: node.into(), scope: Arc::new(Scope::everything()) };
+        let client = Client::own(node);
         Self { session: Arc::new(Session::new(&hub, client, SessionLimits::default())) }
     }
 
@@ -396,11 +396,11 @@ async fn types_that_nobody_knows_are_shown_and_what_to_do_is_said() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
     const MESSAGES: usize = 600;
-    const BYTES: usize = 64 << 10;
+    const BYTES: usize = 60_000;
     let site = Site::new().await;
     let talker = site.writer("/fast", Qos::default());
     site.knows("/fast").await;
-    let client = Client { name: "slow".into(), scope: Arc::new(Scope::everything()) };
+    let client = Client::own("slow");
     let limits = SessionLimits { waiting_bytes_max: 1 << 20, ..SessionLimits::default() };
     let (mut slow, _) = Viewer::new(Session::new(&site.hub, client, limits)).await;
     let (mut fast, _) = Viewer::new(site.session("fast")).await;
@@ -425,6 +425,42 @@ async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
     assert_eq!(said["level"], 1);
     let removed = slow.text("removeStatus").await;
     assert_eq!(removed["statusIds"], json!([said["id"]]));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_asks_and_does_not_read_is_not_read_from() {
+    const ASKED: u32 = 2000;
+    const STUCK: Duration = Duration::from_secs(1);
+    let site = Site::new().await;
+    let (mut viewer, _) = Viewer::new(site.session("desk")).await;
+    let uri = "x".repeat(60_000);
+    let mut asked = 0;
+    // Each answer is as long as its question, so all that may wait on the way are 120 MB.
+    let mut is_stuck = false;
+    while asked < ASKED && !is_stuck {
+        let question = json!({"op": "fetchAsset", "uri": uri, "requestId": asked}).to_string();
+        is_stuck = !viewer.try_send(Frame::text(question), STUCK).await;
+        asked += 1;
+    }
+    assert!(is_stuck, "{asked} questions were read without one answer being taken");
+    for request in 0..asked {
+        let answer = viewer.binary_of(4).await;
+        assert_eq!(answer[..4], request.to_le_bytes());
+    }
+    viewer.leave().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_command_has_few_answers_however_much_it_asks_for() {
+    let site = Site::new().await;
+    let (mut viewer, _) = Viewer::new(site.session("desk")).await;
+    let subscriptions: Vec<_> = (0..1000).map(|id| json!({"id": id, "channelId": 9})).collect();
+    viewer.say(json!({"op": "subscribe", "subscriptions": subscriptions})).await;
+    viewer.status("so were 984 more").await;
+    let names: Vec<_> = (0..20_000).map(|n| format!("/n.{n}")).collect();
+    viewer.say(json!({"op": "getParameters", "parameterNames": names, "id": "many"})).await;
+    viewer.status("parameters in a question").await;
+    viewer.leave().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -455,8 +491,8 @@ async fn who_leaves_leaves_nothing_behind() {
 async fn who_falls_silent_is_left() {
     let site = Site::new().await;
     let options = Options {
-        ping_interval: Duration::from_millis(50),
-        silence_max: Duration::from_millis(300),
+        ping_interval: Duration::from_millis(100),
+        silence_max: Duration::from_millis(1500),
         ..Options::default()
     };
     let (viewer, _) = Viewer::with(site.session("gone"), options.clone()).await;
@@ -470,7 +506,7 @@ async fn who_falls_silent_is_left() {
     tokio::select! {
         ended = viewer.ended => {
             let ended = ended.unwrap();
-            assert!(matches!(ended, Err(FoxgloveError::Silent { silence_ms }) if silence_ms >= 300), "{ended:?}");
+            assert!(matches!(ended, Err(FoxgloveError::Silent { silence_ms }) if silence_ms >= 1500), "{ended:?}");
         }
         () = reads => {}
     }

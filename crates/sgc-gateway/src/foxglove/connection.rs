@@ -1,5 +1,7 @@
 //! [`Connection`]: one client's, from what it asks for to what it is told.
 
+mod catalogue;
+
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,22 +14,17 @@ use sgc_wire::Qos;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_tungstenite::tungstenite::{Error as SocketError, Message as Frame};
 
-use crate::access::Right;
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::feed::{Delivery, Subscription};
-use crate::graph::{Graph, is_hidden};
 use crate::publisher::Publication;
-use crate::session::{Advertise, Session, Subscribe, action_of};
-use crate::types::Types;
+use crate::session::{Advertise, Session, Subscribe};
 
 use super::connections::Connections;
-use super::listing::{Listing, Offer};
+use super::listing::Listing;
 use super::outbox::{LANE_MESSAGES_MAX, Outbox};
-use super::parameters::{self, Answer, Parameters, Watched};
-use super::protocol::{
-    self, Channel, ClientChannel, Command, Half, Metadata, Parameter, Sent, Service, Told, Wanted,
-};
+use super::parameters::{self, ASKED_MAX, Answer, Parameters, Watched};
+use super::protocol::{self, ClientChannel, Command, Metadata, Parameter, Sent, Told, Wanted};
 use super::refusal::Refusal;
 use super::{FoxgloveError, Options};
 
@@ -35,8 +32,6 @@ use super::{FoxgloveError, Options};
 const ENCODINGS: [&str; 2] = [CDR, JSON];
 const CDR: &str = "cdr";
 const JSON: &str = "json";
-/// How definitions are written.
-const SCHEMA_ENCODING: &str = "ros2msg";
 /// Encapsulation header of a serialised message, bytes (RTPS 2.5, 10.2).
 const CDR_HEADER_BYTES: usize = 4;
 
@@ -48,12 +43,12 @@ const LOOK_AGAIN: Duration = Duration::from_secs(10);
 const REPORT: Duration = Duration::from_secs(2);
 /// How long readers of what a client begins to publish may take to be matched.
 const MATCH_MAX: Duration = Duration::from_millis(200);
-/// Topics, and services, that a client is told of at once.
-const TOLD_AT_ONCE: usize = 32;
 /// Calls and questions for parameters under way; then nothing more is read.
 const JOBS_MAX: usize = 512;
 /// Questions for parameters under way.
 const PARAMETER_JOBS_MAX: usize = 8;
+/// Things of one command that are said to be refused, each for itself.
+const REFUSALS_MAX: usize = 16;
 /// Statuses that are remembered, so that none is said twice.
 const STATUSES_MAX: usize = 1024;
 /// Messages of a topic of events that may wait.
@@ -91,6 +86,15 @@ enum Question {
     Set(Vec<Parameter>),
 }
 
+impl Question {
+    fn names(&self) -> usize {
+        match self {
+            Self::Get(names) => names.len(),
+            Self::Set(wanted) => wanted.len(),
+        }
+    }
+}
+
 /// What came of work that was done beside.
 enum Done {
     Called { service: u32, call: u32, encoding: String, bytes: usize, reply: Result<Bytes, Refusal> },
@@ -102,7 +106,7 @@ enum Event {
     Frame(Option<Result<Frame, SocketError>>),
     Done(Done),
     Message(u32, Delivery),
-    ParameterEvent(Option<Delivery>),
+    ParametersChanged(Option<Delivery>),
     GraphChanged,
     TellGraph,
     Tick,
@@ -179,7 +183,7 @@ impl<'o> Connection<'o> {
                 frame = frames.next(), if has_room && self.jobs.len() < JOBS_MAX => Event::Frame(frame),
                 Some(done) = self.jobs.next(), if has_room => Event::Done(done),
                 Some((id, delivery)) = self.deliveries.next() => Event::Message(id, delivery),
-                event = next_event(&mut self.events), if has_room => Event::ParameterEvent(event),
+                event = next_event(&mut self.events), if has_room => Event::ParametersChanged(event),
                 _ = graph.changed(), if tell_at.is_none() => Event::GraphChanged,
                 () = tokio::time::sleep_until(at), if has_room && tell_at.is_some() => Event::TellGraph,
                 () = self.outbox.room(), if !has_room => Event::Nothing,
@@ -199,8 +203,8 @@ impl<'o> Connection<'o> {
                 }
                 Event::Done(done) => self.done(done),
                 Event::Message(id, delivery) => self.message(id, delivery),
-                Event::ParameterEvent(Some(delivery)) => self.parameter_event(&delivery),
-                Event::ParameterEvent(None) => self.events = None,
+                Event::ParametersChanged(Some(delivery)) => self.parameter_event(&delivery),
+                Event::ParametersChanged(None) => self.events = None,
                 Event::GraphChanged => tell_at = Some(Instant::now() + SETTLE),
                 Event::TellGraph => {
                     graph.mark_unchanged();
@@ -294,30 +298,28 @@ impl<'o> Connection<'o> {
     async fn command(&mut self, command: Command) {
         match command {
             Command::Subscribe { subscriptions } => {
+                let mut refused = Vec::new();
                 for wanted in subscriptions {
-                    if let Err(error) = self.subscribe(wanted).await {
-                        self.status(Level::Error, &error.to_string(), None);
-                    }
+                    refused.extend(self.subscribe(wanted).await.err());
                 }
+                self.refused(&refused);
             }
             // A channel that went took its subscription along, and clients end it all the same.
             Command::Unsubscribe { subscription_ids } => {
                 subscription_ids.into_iter().for_each(|id| self.unsubscribe(id));
             }
             Command::Advertise { channels } => {
+                let mut refused = Vec::new();
                 for channel in channels {
-                    if let Err(error) = self.advertise(channel).await {
-                        self.status(Level::Error, &error.to_string(), None);
-                    }
+                    refused.extend(self.advertise(channel).await.err());
                 }
+                self.refused(&refused);
             }
             Command::Unadvertise { channel_ids } => {
-                for id in channel_ids {
-                    if self.published.remove(&id).is_none() {
-                        let error = Refusal::NotAdvertised(id);
-                        self.status(Level::Warning, &error.to_string(), None);
-                    }
-                }
+                let mut was = |id: &u32| self.published.remove(id).is_some();
+                let unknown = channel_ids.into_iter().filter(|id| !was(id));
+                let refused: Vec<_> = unknown.map(Refusal::NotAdvertised).collect();
+                self.refused(&refused);
             }
             Command::GetParameters { parameter_names, id } => {
                 self.ask_parameters(id, true, Question::Get(parameter_names));
@@ -337,15 +339,22 @@ impl<'o> Connection<'o> {
                     self.events = None;
                 }
             }
-            Command::SubscribeConnectionGraph => {
-                self.connections = Some(Connections::default());
-                self.tell_connections(&self.session.graph());
-            }
+            Command::SubscribeConnectionGraph => self.begin_connections(),
             Command::UnsubscribeConnectionGraph => self.connections = None,
             Command::FetchAsset { uri, request_id } => {
                 let why = format!("{uri} is not sent: this server has no assets");
                 self.outbox.answer(Frame::Binary(protocol::asset_refusal(request_id, &why)));
             }
+        }
+    }
+
+    /// Says what was refused of a command, which may have asked for any number of things.
+    fn refused(&mut self, refused: &[Refusal]) {
+        for refusal in refused.iter().take(REFUSALS_MAX) {
+            self.status(Level::Error, &refusal.to_string(), None);
+        }
+        if let Some(more @ 1..) = refused.len().checked_sub(REFUSALS_MAX) {
+            self.status(Level::Error, &format!("so were {more} more of the same command"), None);
         }
     }
 
@@ -491,8 +500,11 @@ impl<'o> Connection<'o> {
     }
 
     fn ask_parameters(&mut self, id: Option<String>, is_asked: bool, question: Question) {
-        let under_way = self.parameter_jobs;
-        let bounded = self.session.check_count("questions for parameters", under_way, PARAMETER_JOBS_MAX);
+        let (under_way, names) = (self.parameter_jobs, question.names());
+        let session = &self.session;
+        let bounded = session
+            .check_count("questions for parameters", under_way, PARAMETER_JOBS_MAX)
+            .and_then(|()| session.check_count("parameters in a question", names, ASKED_MAX));
         if let Err(error) = bounded {
             return self.status(Level::Error, &error.to_string(), None);
         }
@@ -524,7 +536,7 @@ impl<'o> Connection<'o> {
                 for node in &answer.answered {
                     self.remove_status(&parameters_id(node));
                 }
-                for (what, why) in &answer.failed {
+                for (what, why) in answer.failed.iter().take(REFUSALS_MAX) {
                     let message = format!("parameters of {what}: {why}");
                     self.status(Level::Warning, &message, Some(parameters_id(what)));
                 }
@@ -560,155 +572,6 @@ impl<'o> Connection<'o> {
             }
         }
     }
-
-    fn is_shown(&self, name: &str) -> bool {
-        self.options.shows_hidden || !is_hidden(name)
-    }
-
-    fn tell_connections(&mut self, graph: &Graph) {
-        let shows_hidden = self.options.shows_hidden;
-        let Some(connections) = &mut self.connections else { return };
-        if let Some(update) = connections.update(graph, |name| shows_hidden || !is_hidden(name)) {
-            self.outbox.answer(Frame::text(update));
-        }
-    }
-
-    /// Topics and services that the client may use.
-    fn offers(&self, graph: &Graph) -> (BTreeMap<String, Offer>, BTreeMap<String, Offer>) {
-        let may = |right, name: &str| self.session.check(right, name).is_ok();
-        let mut topics = BTreeMap::new();
-        for (name, info) in graph.topics.iter().filter(|(name, _)| self.is_shown(name)) {
-            // A reader of the gateway's own is there for those who subscribe, and makes no topic.
-            let is_there = !info.publishers.is_empty() || info.subscribers.iter().any(|end| !end.is_own);
-            if let Some(type_name) = info.type_name().filter(|_| is_there && may(Right::Subscribe, name)) {
-                let hash = info.type_hash(type_name).map(str::to_owned);
-                topics.insert(name.clone(), Offer { type_name: type_name.to_owned(), hash });
-            }
-        }
-        let mut services = BTreeMap::new();
-        for (name, info) in graph.services.iter().filter(|(name, _)| self.is_shown(name)) {
-            if !info.servers.is_empty() && may(Right::Call, action_of(name)) {
-                services.insert(name.clone(), Offer { type_name: info.type_name.clone(), hash: None });
-            }
-        }
-        (topics, services)
-    }
-
-    /// Tells what has changed of the graph, a part at a time; false while there is more.
-    async fn tell_graph(&mut self) -> bool {
-        let graph = self.session.graph();
-        self.tell_connections(&graph);
-        let (topics, services) = self.offers(&graph);
-        let gone = self.channels.retain(&topics);
-        let heard = self.heard.iter().filter(|(_, heard)| gone.contains(&heard.channel));
-        let heard: Vec<u32> = heard.map(|(id, _)| *id).collect();
-        heard.into_iter().for_each(|id| self.unsubscribe(id));
-        if !gone.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &gone });
-        }
-        let gone = self.services.retain(&services);
-        if !gone.is_empty() {
-            self.tell(&Told::UnadvertiseServices { service_ids: &gone });
-        }
-        let topics = self.channels.untold(&topics, self.attempt, TOLD_AT_ONCE);
-        let services = self.services.untold(&services, self.attempt, TOLD_AT_ONCE);
-        let is_all = topics.len() < TOLD_AT_ONCE && services.len() < TOLD_AT_ONCE;
-        if topics.is_empty() && services.is_empty() && !self.is_first {
-            return is_all;
-        }
-        let hub = self.session.hub();
-        let described = hub.shared.run(move |shared| {
-            let topics = topics.into_iter().map(|(name, offer)| {
-                let schema = schema(&shared.types, &offer.type_name, offer.hash.as_deref());
-                (name, offer, schema)
-            });
-            let services = services.into_iter().map(|(name, offer)| {
-                let half = |half: &str| schema(&shared.types, &format!("{}_{half}", offer.type_name), None);
-                let schemas = half("Request").and_then(|request| Ok((request, half("Response")?)));
-                (name, offer, schemas)
-            });
-            Ok((topics.collect::<Vec<_>>(), services.collect::<Vec<_>>()))
-        });
-        let Ok((topics, services)) = described.await else { return true };
-        self.tell_topics(topics);
-        self.tell_services(services);
-        is_all
-    }
-
-    fn tell_topics(&mut self, topics: Vec<(String, Offer, Result<String, GatewayError>)>) {
-        let (mut channels, mut replaced) = (Vec::new(), Vec::new());
-        for (topic, offer, schema) in topics {
-            let schema_name = offer.type_name.clone();
-            let channel = |id, topic, schema_name, schema| Channel {
-                id,
-                topic,
-                encoding: CDR,
-                schema_name,
-                schema,
-                schema_encoding: SCHEMA_ENCODING,
-            };
-            match schema {
-                Ok(schema) => {
-                    let (id, old) = self.channels.tell(&topic, offer);
-                    replaced.extend(old);
-                    self.known(&schema_name);
-                    channels.push(channel(id, topic, schema_name, schema));
-                }
-                Err(error) => {
-                    // It is shown as there; that it cannot be subscribed to is said, and why.
-                    let id = self.channels.tell_unknown(&topic, offer, self.attempt, true);
-                    self.unknown(&schema_name, &error);
-                    channels.extend(id.map(|id| channel(id, topic, schema_name, String::new())));
-                }
-            }
-        }
-        if !replaced.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &replaced });
-        }
-        if !channels.is_empty() || self.is_first {
-            self.is_first = false;
-            self.tell(&Told::Advertise { channels: &channels });
-        }
-    }
-
-    fn tell_services(&mut self, services: Vec<(String, Offer, Result<(String, String), GatewayError>)>) {
-        let mut told = Vec::new();
-        for (name, offer, schemas) in services {
-            let type_name = offer.type_name.clone();
-            match schemas {
-                Ok((request, response)) => {
-                    let half = |half: &str, schema| Half {
-                        encoding: CDR,
-                        schema_name: format!("{type_name}_{half}"),
-                        schema_encoding: SCHEMA_ENCODING,
-                        schema,
-                    };
-                    let (request, response) = (half("Request", request), half("Response", response));
-                    let (id, _) = self.services.tell(&name, offer);
-                    self.known(&type_name);
-                    told.push(Service { id, name, type_name, request, response });
-                }
-                Err(error) => {
-                    self.services.tell_unknown(&name, offer, self.attempt, false);
-                    self.unknown(&type_name, &error);
-                }
-            }
-        }
-        if !told.is_empty() {
-            self.tell(&Told::AdvertiseServices { services: &told });
-        }
-    }
-
-    fn unknown(&mut self, type_name: &str, error: &GatewayError) {
-        let message = format!("{type_name} cannot be shown: {error}");
-        self.status(Level::Warning, &message, Some(definition_id(type_name)));
-    }
-
-    fn known(&mut self, type_name: &str) {
-        if !self.channels.is_unknown(type_name) && !self.services.is_unknown(type_name) {
-            self.remove_status(&definition_id(type_name));
-        }
-    }
 }
 
 /// The next event of a subscription, if there is one.
@@ -717,11 +580,6 @@ async fn next_event(events: &mut Option<Subscription>) -> Option<Delivery> {
         Some(events) => events.next().await,
         None => std::future::pending().await,
     }
-}
-
-/// What messages of a type look like, as text. May read files.
-fn schema(types: &Types, type_name: &str, hash: Option<&str>) -> Result<String, GatewayError> {
-    Ok(types.layout(type_name, hash)?.to_ros2msg())
 }
 
 fn form(encoding: &str) -> Option<Form> {
@@ -738,8 +596,4 @@ fn dropped_id(topic: &str) -> String {
 
 fn parameters_id(node: &str) -> String {
     format!("parameters:{node}")
-}
-
-fn definition_id(type_name: &str) -> String {
-    format!("definition:{type_name}")
 }

@@ -21,7 +21,7 @@ mod refusal;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use futures_util::{SinkExt, StreamExt};
+use futures_util::{Sink, SinkExt, StreamExt};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Error as SocketError;
@@ -101,24 +101,9 @@ where
     let (mut sink, mut frames) = socket.split();
     let outbox = Outbox::new(session.limits().waiting_bytes_max);
     let mut connection = Connection::new(session, options, &outbox);
-    let ended = {
-        let write = async {
-            loop {
-                match outbox.pop() {
-                    Some(frame) => sink.feed(frame).await?,
-                    None => {
-                        sink.flush().await?;
-                        outbox.filled().await;
-                    }
-                }
-            }
-        };
-        let written: std::pin::Pin<Box<dyn Future<Output = Result<(), SocketError>> + Send>> =
-            Box::pin(write);
-        tokio::select! {
-            ended = connection.run(&mut frames) => ended,
-            failed = written => failed.map_err(FoxgloveError::Socket),
-        }
+    let ended = tokio::select! {
+        ended = connection.run(&mut frames) => ended,
+        failed = write(&mut sink, &outbox) => Err(FoxgloveError::Socket(failed)),
     };
     drop(connection);
     let farewell = async {
@@ -131,5 +116,25 @@ where
     match ended {
         Err(FoxgloveError::Socket(SocketError::ConnectionClosed | SocketError::AlreadyClosed)) => Ok(()),
         ended => ended,
+    }
+}
+
+/// Writes what waits, for as long as that can be.
+async fn write<K>(sink: &mut K, outbox: &Outbox) -> SocketError
+where
+    K: Sink<Frame, Error = SocketError> + Unpin,
+{
+    loop {
+        let written = match outbox.pop() {
+            Some(frame) => sink.feed(frame).await,
+            None => {
+                let flushed = sink.flush().await;
+                outbox.filled().await;
+                flushed
+            }
+        };
+        if let Err(error) = written {
+            return error;
+        }
     }
 }

@@ -40,6 +40,8 @@ const NODES_AT_ONCE: usize = 8;
 const NODES_MAX: usize = 1024;
 /// Parameters of one node.
 const NODE_PARAMETERS_MAX: usize = 4096;
+/// Parameters of one question, and of one answer.
+pub(super) const ASKED_MAX: usize = 16_384;
 /// Parameters asked for at once: an answer has all of their values.
 const ASKED_AT_ONCE: usize = 128;
 /// Parameters that a client may hear of; with all, any number.
@@ -205,6 +207,9 @@ impl Parameters {
         while let Ok(Some((node, got))) = tokio::time::timeout_at(until, asked.next()).await {
             left.remove(&node);
             match got {
+                Ok(parameters) if answer.parameters.len() + parameters.len() > ASKED_MAX => {
+                    answer.failed.push((node, format!("there are more than {ASKED_MAX} parameters")));
+                }
                 Ok(parameters) => {
                     answer.parameters.extend(parameters);
                     answer.answered.push(node);

@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "each test program uses a part")]
 
+use std::future::poll_fn;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -75,6 +76,11 @@ impl Viewer {
         self.socket.send(frame).await.unwrap();
     }
 
+    /// Sends if it can be sent in that time; else it is still sent, with what is received next.
+    pub(crate) async fn try_send(&mut self, frame: Frame, max: Duration) -> bool {
+        tokio::time::timeout(max, self.socket.send(frame)).await.is_ok_and(|sent| sent.is_ok())
+    }
+
     /// Sends an opcode, numbers, and a payload behind them.
     pub(crate) async fn binary(&mut self, opcode: u8, numbers: &[u32], payload: &[u8]) {
         let mut bytes = vec![opcode];
@@ -89,7 +95,13 @@ impl Viewer {
             return self.kept.remove(at);
         }
         loop {
-            let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
+            let socket = &mut self.socket;
+            // What could not be sent is sent meanwhile.
+            let next = poll_fn(|cx| {
+                let _ = socket.poll_flush_unpin(cx);
+                socket.poll_next_unpin(cx)
+            });
+            let next = tokio::time::timeout(PATIENCE, next).await;
             let frame = next.unwrap_or_else(|_| panic!("no {what}, but {:?}", self.kept));
             let frame = frame.unwrap_or_else(|| panic!("the end, and no {what}")).unwrap();
             if is(&frame) {
