@@ -37,10 +37,12 @@ impl Definitions {
 
     /// What messages of a type look like, or what a service consists of. Reads files.
     pub fn layout(&self, name: &TypeName) -> Result<Layout, TypeError> {
-        Library::empty().layout(name, &mut |file| self.find(file))
+        Library::empty().layout(name, &mut |file| self.text(file))
     }
 
-    fn find(&self, file: &TypeName) -> Option<String> {
+    /// The text of the file that defines a type, beyond those that ship inside; of a message of a service that of the service:
+    /// `file` is named as [`sgc_cdr::LookUp`] has it. Reads files.
+    pub fn text(&self, file: &TypeName) -> Option<String> {
         let (package, kind) = (file.package(), file.kind());
         // Packages install both, of which the first says more.
         let files =
