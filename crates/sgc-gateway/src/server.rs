@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use rustls::ServerConfig;
 use rustls::sign::CertifiedKey;
+use sgc_trust::TrustAnchors;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Semaphore, mpsc, watch};
@@ -236,8 +237,15 @@ impl Server {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
+        let access = access.after(&self.shared.door.access());
         self.shared.door.set_access(access);
         Ok(())
+    }
+
+    /// Other CAs, or other revocation lists of theirs.
+    pub fn set_anchors(&self, anchors: TrustAnchors) {
+        let access = self.shared.door.access().with_anchors(anchors);
+        self.shared.door.set_access(access);
     }
 
     /// What goes on.

@@ -372,7 +372,7 @@ async fn status(events: &mpsc::Sender<CoreEvent>, gateway: &Gateway) -> Option<S
     let (reply, status) = oneshot::channel();
     events.send(CoreEvent::Status(reply)).await.ok()?;
     let mut status = status.await.ok()?;
-    status.gateway = gateway.status().await;
+    status.gateway = gateway.status();
     serde_json::to_string(&status).ok()
 }
 

@@ -40,6 +40,7 @@ use crate::core::types::{TypeOutcome, Types};
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
 use crate::finding::Board;
+use crate::gateway::Gateway;
 use crate::graph::Graph;
 use crate::heart::{Heart, Patience};
 use crate::links::ControlTx;
@@ -238,6 +239,7 @@ pub(crate) struct Core<N: RosNetwork> {
     /// Told when a source has published as many.
     epoch_over: Arc<Notify>,
     credentials: CredentialStore,
+    gateway: Arc<Gateway>,
     /// The fleet's file, if this node is the authority of its fleet.
     authority: Option<PathBuf>,
     keeper: Keeper,
@@ -270,6 +272,8 @@ pub(crate) struct CoreParts<N> {
     pub identity: Arc<Identity>,
     /// What links are made with.
     pub credentials: CredentialStore,
+    /// Whose clients' certificates follow what this node trusts.
+    pub gateway: Arc<Gateway>,
     /// What peers may send into this node.
     pub(crate) rates: PeerRates,
     /// The fleet's file, if this node is the authority of its fleet.
@@ -347,6 +351,7 @@ impl<N: RosNetwork> Core<N> {
             epoch_messages_max: parts.epoch_messages_max,
             epoch_over: Arc::default(),
             credentials: parts.credentials,
+            gateway: parts.gateway,
             authority: parts.authority,
             keeper: parts.keeper,
             renew_due: None,

@@ -7,7 +7,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, MutexGuard, PoisonError};
 
 use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
@@ -16,7 +16,7 @@ use sgc_gateway::{
     Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
 use sgc_ros::RosError;
-use sgc_trust::Identity;
+use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, OnceCell};
 use zeroize::Zeroizing;
@@ -64,7 +64,7 @@ pub(crate) struct Gateway {
     /// The ROS 2 node's.
     node: String,
     hub: OnceCell<Hub>,
-    server: Mutex<Option<Server>>,
+    server: std::sync::Mutex<Option<Arc<Server>>>,
 }
 
 impl Gateway {
@@ -76,7 +76,7 @@ impl Gateway {
         let fits = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
         let (types, hub, server) =
-            (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), Mutex::new(None));
+            (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
         Arc::new(Self { open, types, name: node_name.to_owned(), node, hub, server })
     }
 
@@ -109,30 +109,41 @@ impl Gateway {
         let name = format!("sgc {}", self.name);
         let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
-        *self.server.lock().await = Some(server);
+        *self.lock() = Some(Arc::new(server));
         Ok(())
     }
 
     /// Other rules and another certificate from now on.
-    pub(crate) async fn reconfigure(
-        &self,
-        access: Access,
-        key: &Arc<CertifiedKey>,
-    ) -> Result<(), ServerError> {
-        match &*self.server.lock().await {
+    pub(crate) fn reconfigure(&self, access: Access, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
+        match self.server() {
             Some(server) => server.reconfigure(access, Some(key)),
             None => Ok(()),
         }
     }
 
     /// What goes on, if there are sockets.
-    pub(crate) async fn status(&self) -> Option<GatewayStatus> {
-        self.server.lock().await.as_ref().map(Server::status)
+    pub(crate) fn status(&self) -> Option<GatewayStatus> {
+        self.server().map(|server| server.status())
+    }
+
+    /// Other CAs, or other revocation lists of theirs: whose certificate was revoked is disconnected.
+    pub(crate) fn set_anchors(&self, anchors: &TrustAnchors) {
+        if let Some(server) = self.server() {
+            server.set_anchors(anchors.clone());
+        }
+    }
+
+    fn server(&self) -> Option<Arc<Server>> {
+        self.lock().clone()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Option<Arc<Server>>> {
+        self.server.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Ends the sockets, and leaves the local network.
     pub(crate) async fn stop(&self) {
-        drop(self.server.lock().await.take());
+        drop(self.lock().take());
         if let Some(hub) = self.hub.get() {
             hub.stop().await;
         }

@@ -400,6 +400,7 @@ pub async fn run_on<N: RosNetwork>(
         alive,
         identity: identity.clone(),
         credentials: credentials.clone(),
+        gateway: gateway.clone(),
         router,
         endpoint,
         routes,

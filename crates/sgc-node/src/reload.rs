@@ -120,7 +120,8 @@ impl Reloader {
         if let Some(own) = config.uses.iter().find(|one| one.from == *certified) {
             return Err(format!("[[use]] from {:?}: that is this node itself", own.from.as_str()));
         }
-        let wants_ros = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
+        let has_rules = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
+        let wants_ros = has_rules || config.gateway.is_some();
         if wants_ros && !self.has_ros {
             let why = "this node joined no ROS network when it started, so it can neither share nor use";
             return Err(format!("{why}: restart it"));
@@ -165,7 +166,7 @@ impl Reloader {
         // Before the control task looks at the links that are up.
         self.credentials.set_admitted(rules.partners.admitted.clone());
         if let Some((access, key)) = gateway {
-            self.gateway.reconfigure(access, &key).await.map_err(|error| error.to_string())?;
+            self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())?;
             if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
                 report.changed.push("who may connect to the gateway changed".to_owned());
             }

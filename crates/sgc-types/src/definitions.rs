@@ -40,7 +40,8 @@ impl Definitions {
         Library::empty().layout(name, &mut |file| self.text(file))
     }
 
-    /// The text of the file that defines a type, `.msg`, `.srv`, `.action` or `.idl`. Reads files.
+    /// The text of the file that defines a type, beyond those that ship inside; of a message of a service that of the service:
+    /// `file` is named as [`sgc_cdr::LookUp`] has it. Reads files.
     pub fn text(&self, file: &TypeName) -> Option<String> {
         let (package, kind) = (file.package(), file.kind());
         // Packages install both, of which the first says more.

@@ -150,6 +150,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
         self.keeper.anchors(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
+        self.gateway.set_anchors(&anchors);
         self.endpoint.set_anchors(now(), anchors);
     }
 }

@@ -1,6 +1,5 @@
 //! `[gateway]`: the draft of one → its configuration.
 
-
 use sgc_gateway::{Anonymous, Scope};
 
 use super::super::draft::{GatewayClientDraft, GatewayDraft, Located, PartnerDraft};
