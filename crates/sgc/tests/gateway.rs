@@ -25,7 +25,10 @@ fn lab(gateway: &str) -> Lab {
         + &uses("service", "/add_two_ints", "robot")
         + &share("topic", "/command", "robot")
         + gateway;
-    Lab::new(PLAN, [robot, desk])
+    let mut lab = Lab::silent(PLAN, [robot, desk]);
+    lab.reconfigure(Site::Desk, "[node]\n", "[node]\nstate = \"desk.state\"\n");
+    lab.start_all();
+    lab
 }
 
 fn talker(lab: &Lab) -> Peer {
@@ -70,7 +73,7 @@ fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
         let mut program = lab.python(Site::Desk, "gateway.py", &args);
         assert_eq!(program.wait("the sum", |event| event["event"] == "sum")["sum"], 42, "{protocol}");
         assert!(!heard(&mut program).is_empty());
-        listener.wait("what it publishes", |event| event["event"] == "message");
+        listener.wait("what it publishes", |event| event["event"] == "received");
         assert_eq!(clients(&lab).len(), 1);
         assert_eq!(clients(&lab)[0].0, protocol);
         program.end();
