@@ -116,7 +116,7 @@ fn a_token_opens_what_it_says_until_it_is_taken_back() {
     );
     let address = "grpcs://10.92.2.2:50443";
     let ca = lab.dir().join("lab-ca.pem");
-    let ca_text = said(&lab.sgc(None, &["fleet", "ca", "lab.fleet"]).output().unwrap());
+    let ca_text = said(&lab.sgc(None, &["fleet", "ca"]).output().unwrap());
     std::fs::write(&ca, ca_text).unwrap();
     let common = ["grpc", address, "--ca", ca.to_str().unwrap()];
     let mut stranger = lab.python(Site::Cloud, "gateway.py", &common);

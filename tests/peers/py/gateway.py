@@ -39,7 +39,7 @@ def grpc(args: argparse.Namespace) -> None:
 
 
 def hear_by_grpc(gateway: object, args: argparse.Namespace) -> None:
-    emit("topics", topics=sorted(topic.name for topic in gateway.graph().topics))
+    emit("topics", topics=sorted(gateway.graph().topics))
     if args.publish:
         publisher = gateway.publisher(args.publish, "std_msgs/msg/String")
         publish(lambda text: publisher.publish(data=text))
