@@ -21,6 +21,19 @@ if ! cmp -s "$requirements" "$installed"; then
     cp "$requirements" "$installed"
 fi
 
+# roslibpy's own tests, of the version that is installed.
+source_of=tests/peers/py/roslibpy-source.txt
+if ! cmp -s "$source_of" .peers/roslibpy/installed.txt; then
+    say "roslibpy's own tests in .peers/roslibpy"
+    rm -rf .peers/roslibpy .peers/roslibpy.new
+    mkdir .peers/roslibpy.new
+    .venv/bin/pip download --quiet --disable-pip-version-check --no-deps --no-binary :all: --no-build-isolation \
+        --require-hashes -r "$source_of" -d .peers/roslibpy.new
+    tar -xzf .peers/roslibpy.new/roslibpy-*.tar.gz -C .peers/roslibpy.new --strip-components 1
+    cp "$source_of" .peers/roslibpy.new/installed.txt
+    mv .peers/roslibpy.new .peers/roslibpy
+fi
+
 # What they depend on is pinned with its hashes, and runs nothing while it is installed.
 lock=tests/js/package-lock.json
 if ! cmp -s "$lock" tests/js/node_modules/installed.json; then

@@ -63,7 +63,8 @@ impl Clients {
     }
 
     fn find(&self, request: &Request<()>) -> Result<Arc<Guest>, Fault> {
-        if *self.stopping.borrow() {
+        // Also once nobody can say that it is, since the front end is gone.
+        if *self.stopping.borrow() || self.stopping.has_changed().is_err() {
             return Err(GatewayError::Stopping.into());
         }
         let connection = request.extensions().get::<Connection>().ok_or(Fault::NoConnection)?;

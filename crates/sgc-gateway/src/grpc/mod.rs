@@ -94,7 +94,7 @@ impl Default for GrpcOptions {
     }
 }
 
-/// The front end. Clones are the same one.
+/// The front end. Clones are the same one; when the last is dropped, as with [`Grpc::stop`], streams end.
 #[derive(Clone)]
 pub struct Grpc {
     clients: Arc<Clients>,

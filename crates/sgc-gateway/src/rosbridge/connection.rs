@@ -230,7 +230,7 @@ impl Connection {
     }
 
     fn set_level(&mut self, op: &Op<'_>) -> Done {
-        let name = op.needed_text("level")?;
+        let name = op.needed_name("level")?;
         let level = Level::of(&name);
         let level = level.ok_or_else(|| op.refused("\"level\" is none, error, warning or info"))?;
         self.outbox.set_level(level);
@@ -247,8 +247,8 @@ impl Connection {
     }
 
     async fn advertise(&mut self, op: &Op<'_>) -> Done {
-        let topic = op.needed_text("topic")?;
-        let type_name = op.text("type")?;
+        let topic = op.needed_name("topic")?;
+        let type_name = op.name("type")?;
         let said = match op.object("qos")? {
             Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
             None => Said::default(),
@@ -282,13 +282,14 @@ impl Connection {
         };
         let publication = made.await.map_err(|error| op.gateway(error))?;
         publication.settle(SETTLE_MAX).await;
-        let ids = BTreeSet::from([op.id.clone().filter(|_| op.name == "advertise")]);
+        // Published without being advertised, the topic goes with whatever is unadvertised next.
+        let ids = (op.name == "advertise").then(|| op.id.clone()).into_iter().collect();
         self.publications.insert(topic, Published { publication, ids });
         Ok(())
     }
 
     fn unadvertise(&mut self, op: &Op<'_>) -> Done {
-        let topic = op.needed_text("topic")?;
+        let topic = op.needed_name("topic")?;
         let Some(published) = self.publications.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "advertised" };
             return Err(op.gateway(error).into());
@@ -304,11 +305,11 @@ impl Connection {
     }
 
     async fn publish(&mut self, op: &Op<'_>) -> Done {
-        let topic = op.needed_text("topic")?;
+        let topic = op.needed_name("topic")?;
         let raw = op.needed_object("msg")?;
         if !self.publications.contains_key(&topic) {
             let qos = Said::default().offer(op.bool("latch")?.unwrap_or(false), None);
-            let wanted = Advertise { topic: topic.clone(), type_name: op.text("type")?, qos };
+            let wanted = Advertise { topic: topic.clone(), type_name: op.name("type")?, qos };
             self.begin_publishing(op, wanted).await?;
         }
         let Some(published) = self.publications.get(&topic) else { return Ok(()) };
@@ -324,8 +325,8 @@ impl Connection {
     }
 
     async fn subscribe(&mut self, op: &Op<'_>) -> Done {
-        let topic = op.needed_text("topic")?;
-        let type_name = op.text("type")?;
+        let topic = op.needed_name("topic")?;
+        let type_name = op.name("type")?;
         let said = match op.object("qos")? {
             Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
             None => Said::default(),
@@ -368,7 +369,7 @@ impl Connection {
     }
 
     fn unsubscribe(&mut self, op: &Op<'_>) -> Done {
-        let topic = op.needed_text("topic")?;
+        let topic = op.needed_name("topic")?;
         let Some(heard) = self.topics.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "subscribed to" };
             return Err(op.gateway(error).into());
@@ -382,8 +383,8 @@ impl Connection {
     async fn call_service(&mut self, op: &Op<'_>) -> Done {
         let call = Call {
             id: op.id.clone(),
-            service: op.needed_text("service")?,
-            type_name: op.text("type")?,
+            service: op.needed_name("service")?,
+            type_name: op.name("type")?,
             args: op.raw("args").map(str::to_owned),
             max: op.seconds("timeout")?.unwrap_or(self.options.call_max),
             fragment_size: fragment_size(op)?,
@@ -411,8 +412,8 @@ impl Connection {
     }
 
     async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
-        let service = op.needed_text("service")?;
-        let type_name = op.needed_text("type")?;
+        let service = op.needed_name("service")?;
+        let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
         // Who advertises again means the new one.
         self.services.remove(&service);
@@ -429,7 +430,7 @@ impl Connection {
     }
 
     fn unadvertise_service(&mut self, op: &Op<'_>) -> Done {
-        let service = op.needed_text("service")?;
+        let service = op.needed_name("service")?;
         match self.services.remove(&service) {
             Some(_) => Ok(()),
             None => {
@@ -440,13 +441,13 @@ impl Connection {
     }
 
     async fn service_response(&mut self, op: &Op<'_>) -> Done {
-        let service = op.needed_text("service")?;
+        let service = op.needed_name("service")?;
         let is_done = op.bool("result")?.unwrap_or(true);
         let Some(served) = self.services.get(&service) else {
             let error = GatewayError::NotThere { name: service, what: "served" };
             return Err(op.gateway(error).into());
         };
-        let request = served.take(op.id.as_ref());
+        let request = served.request(op.id.as_ref());
         let request =
             request.ok_or_else(|| op.refused(format!("{service}: no request waits under that id")))?;
         let values = op.raw("values").filter(|raw| raw.starts_with(['{', '[']));
@@ -454,20 +455,23 @@ impl Connection {
             // ROS 2 has no reply that says so: whoever called hears nothing.
             let why = op.raw("values").map_or_else(|| "no reason given".to_owned(), super::op::short);
             tracing::debug!(%service, %why, "a client failed to answer");
+            served.answered(op.id.as_ref());
             return Ok(());
         }
         let layout = || Ok(Arc::clone(served.replier().reply_layout()));
         let values = input::arguments(values, layout).map_err(|error| op.gateway(error))?;
         let replier = served.replier();
         let reply = |content: Content| async move { replier.reply(request, &content).await };
-        input::tolerate_later(&values, reply).await.map_err(|error| op.gateway(error).into())
+        input::tolerate_later(&values, reply).await.map_err(|error| op.gateway(error))?;
+        served.answered(op.id.as_ref());
+        Ok(())
     }
 
     async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
-        let action = op.needed_text("action")?;
-        let type_name = match op.text("action_type")? {
+        let action = op.needed_name("action")?;
+        let type_name = match op.name("action_type")? {
             Some(name) => Some(name),
-            None => op.text("type")?,
+            None => op.name("type")?,
         };
         let wanted = Wanted {
             id: op.id.clone(),
@@ -510,8 +514,8 @@ impl Connection {
     }
 
     async fn advertise_action(&mut self, op: &Op<'_>) -> Done {
-        let action = op.needed_text("action")?;
-        let type_name = op.needed_text("type")?;
+        let action = op.needed_name("action")?;
+        let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
         self.actions.remove(&action);
         let full = self.session.action_type(&action, Some(&type_name)).map_err(|error| op.gateway(error))?;
@@ -522,7 +526,7 @@ impl Connection {
     }
 
     fn unadvertise_action(&mut self, op: &Op<'_>) -> Done {
-        let action = op.needed_text("action")?;
+        let action = op.needed_name("action")?;
         match self.actions.remove(&action) {
             Some(_) => Ok(()),
             None => Err(op.gateway(GatewayError::NotThere { name: action, what: "served" }).into()),
@@ -531,7 +535,7 @@ impl Connection {
 
     /// The action that an op is of, which the client serves.
     fn served_action(&self, op: &Op<'_>) -> Result<&ServedAction, OpError> {
-        let action = op.needed_text("action")?;
+        let action = op.needed_name("action")?;
         let served = self.actions.get(&action);
         served.ok_or_else(|| op.gateway(GatewayError::NotThere { name: action, what: "served" }))
     }
@@ -576,7 +580,7 @@ impl Connection {
 }
 
 fn compression(op: &Op<'_>) -> Result<Compression, OpError> {
-    let name = op.text("compression")?.unwrap_or_default();
+    let name = op.name("compression")?.unwrap_or_default();
     Compression::of(&name).map_err(|why| op.refused(why))
 }
 

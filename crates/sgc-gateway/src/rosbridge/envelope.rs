@@ -132,7 +132,28 @@ impl Envelope {
                 let _ = write!(out, r#"{{"op":"{op}""#);
                 Self::Json(out)
             }
-            _ => Self::Cbor { members: 0, out: Vec::with_capacity(content_bytes + 256) }.text("op", op),
+            _ => {
+                let mut out = Vec::with_capacity(content_bytes + 256);
+                // The head, in which the number of members is said once it is known.
+                out.push(0);
+                Self::Cbor { members: 0, out }.text("op", op)
+            }
+        }
+    }
+
+    /// The same begin again, with room for content.
+    pub(super) fn again(&self, content_bytes: usize) -> Self {
+        match self {
+            Self::Json(begin) => {
+                let mut out = String::with_capacity(begin.len() + content_bytes + 16);
+                out.push_str(begin);
+                Self::Json(out)
+            }
+            Self::Cbor { members, out: begin } => {
+                let mut out = Vec::with_capacity(begin.len() + content_bytes + 64);
+                out.extend_from_slice(begin);
+                Self::Cbor { members: *members, out }
+            }
         }
     }
 
@@ -201,7 +222,9 @@ impl Envelope {
             }
             Self::Cbor { members, mut out } => {
                 // Fewer than 24 members: their number is in the head.
-                out.insert(0, 0xa0 | members.min(23));
+                if let Some(head) = out.first_mut() {
+                    *head = 0xa0 | members.min(23);
+                }
                 Frame::Binary(out.into())
             }
         }

@@ -37,6 +37,8 @@ pub use options::{
 };
 use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
 
+/// Between two pings at least.
+const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
 /// How long a client may take to hear why its connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
@@ -104,7 +106,7 @@ where
     R: futures_util::Stream<Item = Result<Message, tokio_tungstenite::tungstenite::Error>> + Unpin,
 {
     let begun = Instant::now();
-    let mut looks = tokio::time::interval(options.silence_max / 4);
+    let mut looks = tokio::time::interval(ping_interval(options.silence_max));
     loop {
         let message = tokio::select! {
             message = stream.next() => message,
@@ -130,6 +132,11 @@ where
             Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
         }
     }
+}
+
+/// How often a client is pinged, and looked after.
+fn ping_interval(silence_max: Duration) -> Duration {
+    (silence_max / 4).max(PING_INTERVAL_MIN)
 }
 
 /// Whether the client is there, and may be.

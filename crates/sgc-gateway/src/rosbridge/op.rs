@@ -12,6 +12,8 @@ use crate::error::GatewayError;
 
 /// Longest id that is echoed, bytes.
 const ID_BYTES_MAX: usize = 1024;
+/// Longest name of a topic, a type or anything else, bytes: names are echoed, too.
+const NAME_BYTES_MAX: usize = 1024;
 /// Characters of what somebody wrote that are shown.
 const SHOWN_MAX: usize = 80;
 /// Longest time that a client can say, seconds.
@@ -46,6 +48,8 @@ pub(super) enum OpError {
     Missing { op: String, member: &'static str },
     #[error("{op}: {member:?} is no {expected}: {found}")]
     Kind { op: String, member: &'static str, expected: &'static str, found: String },
+    #[error("{op}: {member:?} is longer than {NAME_BYTES_MAX} bytes")]
+    TooLong { op: String, member: &'static str },
     #[error("{op}: {source}")]
     Gateway { op: String, source: Box<GatewayError> },
     #[error("{op}: {why}")]
@@ -108,6 +112,20 @@ impl<'a> Op<'a> {
         let Some(raw) = self.raw(member) else { return Ok(None) };
         let text = serde_json::from_str(raw).map_err(|_| self.no(member, "text", raw))?;
         Ok(Some(text))
+    }
+
+    /// A text that is no longer than a name can be.
+    pub(super) fn name(&self, member: &'static str) -> Result<Option<String>, OpError> {
+        match self.text(member)? {
+            Some(name) if name.len() > NAME_BYTES_MAX => {
+                Err(OpError::TooLong { op: self.name.to_string(), member })
+            }
+            name => Ok(name),
+        }
+    }
+
+    pub(super) fn needed_name(&self, member: &'static str) -> Result<String, OpError> {
+        self.name(member)?.ok_or_else(|| self.missing(member))
     }
 
     pub(super) fn needed_text(&self, member: &'static str) -> Result<String, OpError> {
@@ -198,7 +216,7 @@ mod tests {
             op.count("m").unwrap_err(),
             op.text("n").unwrap_err(),
             op.object("n").unwrap_err(),
-            op.needed_text("topic").unwrap_err(),
+            op.needed_name("topic").unwrap_err(),
         ];
         let told: Vec<_> = errors.iter().map(ToString::to_string).collect();
         assert_eq!(

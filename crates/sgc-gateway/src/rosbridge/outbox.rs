@@ -152,7 +152,7 @@ pub(super) async fn write_all<W>(
 where
     W: Sink<Message, Error = tungstenite::Error> + Unpin,
 {
-    let mut pings = tokio::time::interval(silence_max / 4);
+    let mut pings = tokio::time::interval(super::ping_interval(silence_max));
     pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     pings.reset();
     loop {

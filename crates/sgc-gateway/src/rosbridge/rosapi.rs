@@ -15,6 +15,9 @@ use crate::graph::{Graph, NodeInfo, is_hidden};
 use crate::session::Session;
 use crate::types::InterfaceType;
 
+/// Longest arguments, bytes: what is wrong in them is echoed.
+const ARGS_BYTES_MAX: usize = 64 << 10;
+
 /// The name of a service within `rosapi`, if it is one. Clients call `rosapi/topics`, too.
 pub(super) fn local_name(service: &str) -> Option<&str> {
     service.strip_prefix('/').unwrap_or(service).strip_prefix("rosapi/")
@@ -78,6 +81,9 @@ impl RosApi<'_> {
         ];
         if !known.contains(&service) {
             return None;
+        }
+        if args.len() > ARGS_BYTES_MAX {
+            return Some(Err(format!("the arguments are longer than {ARGS_BYTES_MAX} bytes")));
         }
         // No arguments are an empty list, too.
         let args = if args.starts_with('[') { "{}" } else { args };

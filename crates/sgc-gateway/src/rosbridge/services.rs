@@ -52,11 +52,21 @@ impl Served {
         &self.replier
     }
 
-    /// The request that an answer is for, which has no other then.
-    pub(super) fn take(&self, id: Option<&OpId>) -> Option<RequestId> {
+    fn number(&self, id: Option<&OpId>) -> Option<u64> {
         let Some(OpId::Text(id)) = id else { return None };
-        let number = id.strip_prefix(&*self.prefix)?.parse().ok()?;
-        lock(&self.pending).asked.remove(&number)
+        id.strip_prefix(&*self.prefix)?.parse().ok()
+    }
+
+    /// The request that an answer is for.
+    pub(super) fn request(&self, id: Option<&OpId>) -> Option<RequestId> {
+        lock(&self.pending).asked.get(&self.number(id)?).copied()
+    }
+
+    /// A request has its answer.
+    pub(super) fn answered(&self, id: Option<&OpId>) {
+        if let Some(number) = self.number(id) {
+            lock(&self.pending).asked.remove(&number);
+        }
     }
 }
 

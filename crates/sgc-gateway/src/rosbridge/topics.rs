@@ -139,6 +139,9 @@ async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace
     let mut pace = *followed.borrow_and_update();
     subscription.set_pace(pace.depth, pace.interval_min);
     let mut told = Told::default();
+    let begin_of =
+        |pace: &Pace, topic: &str| Envelope::new("publish", pace.compression, 0).text("topic", topic);
+    let mut begin = begin_of(&pace, subscription.topic());
     loop {
         let first = tokio::select! {
             biased;
@@ -152,6 +155,7 @@ async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace
                     subscription.replay();
                 }
                 pace = next;
+                begin = begin_of(&pace, subscription.topic());
                 continue;
             }
             first = subscription.next() => first,
@@ -166,7 +170,7 @@ async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace
         let mut bytes = 0;
         let mut next = Some(first);
         while let Some(delivery) = next {
-            match frame(&subscription, &delivery, &pace) {
+            match frame(&subscription, &delivery, &pace, &begin) {
                 Ok(frame) => {
                     bytes += frame.bytes();
                     batch.push(frame);
@@ -186,11 +190,16 @@ async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace
 }
 
 /// What is written to the client of a message.
-fn frame(subscription: &Subscription, delivery: &Delivery, pace: &Pace) -> Result<Frame, GatewayError> {
+fn frame(
+    subscription: &Subscription,
+    delivery: &Delivery,
+    pace: &Pace,
+    begin: &Envelope,
+) -> Result<Frame, GatewayError> {
     let compression = pace.compression;
     let message = &delivery.message;
     let content = subscription.write(message, compression.form())?;
-    let envelope = Envelope::new("publish", compression, content.len()).text("topic", subscription.topic());
+    let envelope = begin.again(content.len());
     let envelope = match compression {
         Compression::CborRaw => {
             let received = Duration::from_nanos(message.received_ns.max(0).unsigned_abs());

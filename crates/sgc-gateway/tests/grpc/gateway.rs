@@ -10,7 +10,7 @@ use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
 use sgc_gateway::grpc::{Accepted, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
-use sgc_gateway::{Access, AccessGrant, AccessRules, Anonymous, Scope, TokenId};
+use sgc_gateway::{Access, AccessGrant, AccessRules, Anonymous, ClientRule, Scope, TokenId};
 use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::UnixMillis;
 use tokio::net::TcpListener;
@@ -32,6 +32,7 @@ pub(crate) struct Gateway {
     pub(crate) serving: JoinHandle<()>,
     access: Arc<Mutex<Access>>,
     identity: Identity,
+    desk: Identity,
 }
 
 pub(crate) type Client = GatewayClient<InterceptedService<Channel, Bearer>>;
@@ -67,6 +68,7 @@ impl Gateway {
         let began = UnixMillis(now().0 - 1000);
         let mut fleet = Fleet::create("lab".parse().unwrap(), began, &mut rng).unwrap();
         let identity = fleet.enroll(&EnrollRequest::new("robot".parse().unwrap(), began), &mut rng).unwrap();
+        let desk = fleet.enroll(&EnrollRequest::new("desk".parse().unwrap(), began), &mut rng).unwrap();
         let access = Arc::new(Mutex::new(Access::default()));
         let present = Arc::clone(&access);
         let grpc = Grpc::new(site.hub.clone(), move || present.lock().unwrap().clone(), options);
@@ -83,16 +85,26 @@ impl Gateway {
         });
         let served = grpc.clone();
         let serving = tokio::spawn(async move { served.serve(ReceiverStream::new(accepted)).await.unwrap() });
-        let gateway = Self { site, grpc, address, serving, access, identity };
+        let gateway = Self { site, grpc, address, serving, access, identity, desk };
         gateway.admit(Anonymous::Local);
         gateway
     }
 
     /// Has the gateway admit these from now on, and whoever has a token.
     pub(crate) fn admit(&self, anonymous: Anonymous) {
-        let gateway = Some(self.identity.as_peer().clone());
-        *self.access.lock().unwrap() =
-            Access::new(AccessRules { anonymous, gateway, ..AccessRules::default() });
+        *self.access.lock().unwrap() = self.access_of(anonymous, Vec::new());
+    }
+
+    /// Access for these, for these nodes, and for whoever has a token.
+    pub(crate) fn access_of(&self, anonymous: Anonymous, clients: Vec<ClientRule>) -> Access {
+        let (gateway, anchors) =
+            (Some(self.identity.as_peer().clone()), Some(self.identity.anchors().clone()));
+        Access::new(AccessRules { anonymous, clients, gateway, anchors, ..AccessRules::default() })
+    }
+
+    /// Another node of the gateway's fleet.
+    pub(crate) fn desk(&self) -> &Identity {
+        &self.desk
     }
 
     /// A token for a client of this name.

@@ -626,6 +626,21 @@ async fn a_gateway_that_stops_says_so_and_lets_its_connections_end() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn streams_end_with_a_gateway_that_is_dropped() {
+    let Gateway { site, grpc, serving, address, .. } = Gateway::new().await;
+    let _talker = site.writer("/chatter", RosQos::default());
+    site.knows("/chatter").await;
+    let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}")).unwrap();
+    let mut client = client(channel.connect().await.unwrap(), None);
+    let mut heard = subscribe(&mut client, hear("/chatter")).await;
+    serving.abort();
+    drop(grpc);
+    assert_eq!(end(&mut heard).await, Some(Code::Unavailable));
+    drop(heard);
+    eventually(|| site.hub.readers() == 0).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn reflection_and_health_answer() {
     use tonic_health::pb::health_client::HealthClient;
     use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus};

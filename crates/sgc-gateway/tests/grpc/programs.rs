@@ -8,8 +8,12 @@ use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_gateway::{Advertise, Content, Scope};
+use sgc_gateway::{
+    Advertise, Anonymous, ClientRule, Content, ListenAt, Protocol, Scope, Server, ServerOptions,
+    SessionLimits, certified_key,
+};
 use sgc_ros::{RosNetwork as _, RosWriter as _, Sample, SampleKind};
+use sgc_trust::Grantees;
 use sgc_wire::{Durability, History, Qos, UnixMillis};
 use tokio::process::Command;
 
@@ -78,8 +82,13 @@ impl Scene {
     }
 
     /// Runs a program to its end, which has to be a good one.
-    async fn run(&self, mut command: Command) -> String {
-        command.arg(self.gateway.address.port().to_string()).arg(&self.token);
+    async fn run(&self, command: Command) -> String {
+        self.run_at(self.gateway.address.port(), command).await
+    }
+
+    /// The same with another door of the same gateway.
+    async fn run_at(&self, port: u16, mut command: Command) -> String {
+        command.arg(port.to_string()).arg(&self.token);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
         let program = format!("{command:?}");
         let child = command.spawn().unwrap_or_else(|why| panic!("{why}: run `make peers` first: {program}"));
@@ -150,5 +159,35 @@ async fn node_needs_nothing_but_the_proto() {
     node.arg(repository("tests/js/grpc.cjs"));
     node.arg(repository("crates/sgc-gateway/proto/sgc/gateway/v1/gateway.proto"));
     let said = scene.run(node).await;
+    assert!(said.ends_with("all is well\n"), "{said}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn python_comes_over_tls_with_the_certificate_of_a_node_or_a_token() {
+    let scene = Scene::new().await;
+    let dir = tempfile::tempdir().unwrap();
+    let (ca, identity) = (dir.path().join("ca.pem"), dir.path().join("desk.identity"));
+    let door = rcgen::generate_simple_self_signed(["localhost".to_owned()]).unwrap();
+    std::fs::write(&ca, door.cert.pem()).unwrap();
+    let desk = scene.gateway.desk();
+    std::fs::write(&identity, desk.to_text().as_bytes()).unwrap();
+    let who = Grantees { nodes: [desk.node_id()].into(), ..Grantees::default() };
+    let scope = Scope { subscribe: vec!["/chatter".into()], ..Scope::default() };
+    let access = scene.gateway.access_of(Anonymous::None, vec![ClientRule { who, scope }]);
+    let key = certified_key(door.cert.pem().as_bytes(), door.signing_key.serialize_pem().as_bytes()).unwrap();
+    let at = ListenAt { protocol: Protocol::Grpc, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: vec![at],
+        access,
+        key: Some(key),
+        clients_max: 16,
+        limits: SessionLimits::default(),
+    };
+    let server = Server::start(scene.gateway.site.hub.clone(), options).await.unwrap();
+    let mut python = python();
+    python.env("PYTHONPATH", wheel(dir.path()).await).arg("-B");
+    python.arg(repository("clients/python/tests/over_tls.py")).args([&ca, &identity]);
+    let said = scene.run_at(server.local()[0].addr.port(), python).await;
     assert!(said.ends_with("all is well\n"), "{said}");
 }

@@ -93,6 +93,8 @@ async fn members_of_the_wrong_kind_are_named() {
     }
     browser.send(json!({"op": "publish", "id": {"a": 1}, "topic": "/a"})).await;
     assert_eq!(browser.status().await.0, r#"publish: "id" is no text or integer: {"a":1}"#);
+    let told = browser.told(json!({"op": "subscribe", "topic": "/a".repeat(1000)})).await;
+    assert_eq!(told, r#"subscribe: "topic" is longer than 1024 bytes"#);
     // An unknown type, by whose definition it fails.
     let told = browser.told(json!({"op": "advertise", "topic": "/a", "type": "nobody/Knows"})).await;
     assert!(told.starts_with("advertise: no definition: no definition of nobody/msg/Knows"), "{told}");

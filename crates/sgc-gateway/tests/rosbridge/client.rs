@@ -138,6 +138,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         assert!(is_done);
     }
 
+    /// The same where other things come, too.
+    pub(crate) async fn settle_amid(&mut self) {
+        self.send(json!({ "op": "call_service", "id": "settle", "service": "/rosapi/get_time" })).await;
+        while self.next().await["id"] != "settle" {}
+    }
+
     pub(crate) async fn subscribe(&mut self, topic: &str) {
         self.send(json!({ "op": "subscribe", "topic": topic, "type": "std_msgs/String" })).await;
         self.settle().await;

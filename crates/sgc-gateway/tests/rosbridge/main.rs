@@ -9,6 +9,7 @@ mod bad;
 mod client;
 mod pace;
 mod parameters;
+mod programs;
 mod rosapi;
 mod services;
 mod topics;

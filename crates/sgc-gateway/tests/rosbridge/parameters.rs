@@ -9,10 +9,10 @@ use sgc_gateway::{Content, Form};
 use crate::client::client;
 use crate::support::Site;
 
-type Parameters = Arc<Mutex<BTreeMap<String, Json>>>;
+pub(crate) type Parameters = Arc<Mutex<BTreeMap<String, Json>>>;
 
 /// A node with the services that every node has for its parameters.
-async fn serve_parameters(site: &Site, node: &str, parameters: &Parameters) {
+pub(crate) async fn serve_parameters(site: &Site, node: &str, parameters: &Parameters) {
     for (service, of) in [
         ("list_parameters", "ListParameters"),
         ("get_parameters", "GetParameters"),

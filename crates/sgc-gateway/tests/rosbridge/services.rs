@@ -89,6 +89,10 @@ async fn a_client_serves_a_service() {
     assert_eq!(call["args"], json!({"data": true}));
     let id = call["id"].clone();
     let response = |id: &Json, values: Json, result: bool| json!({"op": "service_response", "id": id, "service": "/switch", "values": values, "result": result});
+    // One that is wrong can be said again.
+    server.send(response(&id, json!({"success": 3}), true)).await;
+    let told = server.status().await.0;
+    assert_eq!(told, "service_response: not a message of that type: success: 3, not bool");
     server.send(response(&id, json!({"success": true, "message": "on"}), true)).await;
     assert_eq!(caller.next().await["values"], json!({"success": true, "message": "on"}));
     // Answered once, it is not waiting any more.

@@ -283,6 +283,32 @@ async fn a_client_that_leaves_leaves_nothing_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn clients_that_come_and_go_leave_nothing_behind() {
+    let site = Site::new().await;
+    let _talker = site.writer("/chatter", Qos::default());
+    site.knows("/chatter").await;
+    let before = site.hub.graph();
+    for round in 0..100 {
+        let mut browser = client(&site).await;
+        browser.send(json!({"op": "subscribe", "topic": "/chatter", "type": STRING})).await;
+        browser.send(json!({"op": "advertise", "topic": "/cmd", "type": STRING})).await;
+        browser.send(json!({"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"})).await;
+        browser.send(json!({"op": "call_service", "service": "/s"})).await;
+        if round % 2 == 0 {
+            browser.settle_amid().await;
+        }
+        drop(browser.socket);
+        let _ = browser.served.await.unwrap();
+    }
+    // But for what calls the service, which is kept for others who call.
+    let is_clean = || {
+        let graph = site.hub.graph();
+        graph.topics == before.topics && graph.services.values().all(|info| info.servers.is_empty())
+    };
+    eventually(|| site.hub.readers() == 0 && is_clean()).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn topics_of_another_type_are_refused_by_name() {
     let site = Site::new().await;
     let _talker = site.writer("/chatter", Qos::default());
