@@ -7,7 +7,7 @@
 mod lab;
 mod support;
 
-use std::process::Output;
+use std::process::{Command, Output};
 
 use lab::{Lab, Plan, Site, share, uses};
 use rustix::process::Signal;
@@ -104,7 +104,28 @@ fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
 
 #[test]
 fn a_token_opens_what_it_says_until_it_is_taken_back() {
-    let lab = lab("[gateway]\nlisten = [\"grpcs://0.0.0.0:50443\"]\n");
+    let keys = tempfile::tempdir().unwrap();
+    let [certificate, key] = ["gateway.pem", "gateway.key"].map(|name| keys.path().join(name));
+    let (certificate, key) = (certificate.to_str().unwrap(), key.to_str().unwrap());
+    let made = Command::new("openssl")
+        .args([
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+            "-nodes",
+            "-days",
+            "2",
+        ])
+        .args(["-subj", "/CN=gateway", "-addext", "subjectAltName=IP:10.92.2.2"])
+        .args(["-keyout", key, "-out", certificate])
+        .output();
+    assert!(made.unwrap().status.success());
+    let lab = lab(&format!(
+        "[gateway]\nlisten = [\"grpcs://0.0.0.0:50443\"]\ncertificate = \"{certificate}\"\nkey = \"{key}\"\n"
+    ));
     if lab.namespace(Site::Desk).is_none() {
         // On this host alone nobody is elsewhere, and the ports are everybody's.
         return support::say("without namespaces nobody is elsewhere: the token is not tried");
@@ -115,10 +136,7 @@ fn a_token_opens_what_it_says_until_it_is_taken_back() {
         &lab.sgc(Some(Site::Desk), &[&create[..], &["--subscribe", "/chatter"]].concat()).output().unwrap(),
     );
     let address = "grpcs://10.92.2.2:50443";
-    let ca = lab.dir().join("lab-ca.pem");
-    let ca_text = said(&lab.sgc(None, &["fleet", "ca"]).output().unwrap());
-    std::fs::write(&ca, ca_text).unwrap();
-    let common = ["grpc", address, "--ca", ca.to_str().unwrap()];
+    let common = ["grpc", address, "--ca", certificate];
     let mut stranger = lab.python(Site::Cloud, "gateway.py", &common);
     let refused = stranger.wait("it is refused", |event| event["event"] == "failed");
     assert_eq!(refused["code"], "UNAUTHENTICATED", "{refused}");
