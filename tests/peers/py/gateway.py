@@ -53,7 +53,7 @@ def rosbridge(args: argparse.Namespace) -> None:
 
     ros = roslibpy.Ros(args.address)
     ros.run(timeout=30)
-    emit("topics", topics=sorted(ros.get_topics()["topics"]))
+    emit("topics", topics=sorted(ros.get_topics()))
     if args.publish:
         topic = roslibpy.Topic(ros, args.publish, "std_msgs/msg/String")
         topic.advertise()
