@@ -456,10 +456,12 @@ impl ActionServer {
             goal.result = Some(result.clone());
             std::mem::take(&mut goal.waiting)
         };
+        // Who has the result finds the status as it says.
+        let published = self.publish_status().await;
         for asked in waiting {
             self.reply_result(asked, status, result.clone()).await;
         }
-        self.publish_status().await
+        published
     }
 
     async fn reply_result(&self, asked: RequestId, status: GoalStatus, result: Value) {

@@ -151,13 +151,19 @@ pub enum NodeError {
     Access(#[from] AccessError),
     /// The gateway does not start.
     #[error(transparent)]
-    Gateway(#[from] GatewayStartError),
+    Gateway(Box<GatewayStartError>),
     /// The local network's threads did not start, or no keys could be made.
     #[error("starting ended in a panic; this is a bug")]
     Panicked,
     /// The system gives no randomness.
     #[error("the system gives no randomness: {0}")]
     Randomness(String),
+}
+
+impl From<GatewayStartError> for NodeError {
+    fn from(error: GatewayStartError) -> Self {
+        Self::Gateway(Box::new(error))
+    }
 }
 
 /// What else a caller may want of a running node.
