@@ -13,9 +13,7 @@ use bytes::Bytes;
 use sgc_cdr::{Layout, Value};
 use sgc_ros::RequestId;
 use sgc_wire::{Durability, History, Qos};
-use tokio::runtime::Handle;
 use tokio::sync::mpsc;
-use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use crate::access::Right;
@@ -38,6 +36,8 @@ const EVENTS_MAX: usize = 256;
 const GOALS_MAX: usize = 1024;
 /// How long the result of a goal is kept (`rcl_action`'s default).
 const RESULT_KEPT: Duration = Duration::from_secs(900);
+/// How long an action that nobody serves any more says how its goals ended.
+const FAREWELL: Duration = Duration::from_secs(2);
 /// Where the id of a goal is in a message of feedback: behind the encapsulation header.
 const GOAL_ID_AT: std::ops::Range<usize> = 4..20;
 
@@ -304,13 +304,12 @@ pub enum ActionEvent {
     },
 }
 
-/// An action that a client serves; ends when dropped, and with it goals that were taken: they are aborted.
+/// An action that a client serves; ends when dropped, and with it goals that were taken: they are aborted, and who asks within
+/// two seconds is told so.
 #[derive(Debug)]
 pub struct ActionServing {
     events: mpsc::Receiver<ActionEvent>,
     server: Arc<ActionServer>,
-    task: JoinHandle<()>,
-    runtime: Handle,
 }
 
 /// What answers at an action that a client serves.
@@ -369,8 +368,8 @@ impl ActionServing {
             status,
         });
         let (send, events) = mpsc::channel(EVENTS_MAX);
-        let task = tokio::spawn(serve(Arc::clone(&server), [goals, results, cancels], send));
-        Ok(Self { events, server, task, runtime: shared.runtime.clone() })
+        tokio::spawn(serve(Arc::clone(&server), [goals, results, cancels], send));
+        Ok(Self { events, server })
     }
 
     /// The action.
@@ -391,14 +390,6 @@ impl ActionServing {
     /// What answers.
     pub fn replier(&self) -> ActionReplier {
         ActionReplier(Arc::clone(&self.server))
-    }
-}
-
-impl Drop for ActionServing {
-    fn drop(&mut self) {
-        self.task.abort();
-        let server = Arc::clone(&self.server);
-        self.runtime.spawn(async move { server.abort_all().await });
     }
 }
 
@@ -525,12 +516,19 @@ impl ActionServer {
             is_new
         });
         match found {
-            Some((id, goal)) if is_new => drop(events.send(ActionEvent::Goal { id, goal }).await),
-            _ => {
-                let reply = record([("accepted", Value::Bool(false)), ("stamp", stamp(0))]);
-                let _ = self.send_goal.reply_value(request.id, &reply).await;
+            Some((id, goal)) if is_new => {
+                if events.send(ActionEvent::Goal { id, goal }).await.is_err() {
+                    lock(&self.goals).remove(&id);
+                    self.reject(request.id).await;
+                }
             }
+            _ => self.reject(request.id).await,
         }
+    }
+
+    async fn reject(&self, asked: RequestId) {
+        let reply = record([("accepted", Value::Bool(false)), ("stamp", stamp(0))]);
+        let _ = self.send_goal.reply_value(asked, &reply).await;
     }
 
     async fn take_result(&self, serving: &Serving, request: Request) {
@@ -600,7 +598,7 @@ impl ActionServer {
     }
 }
 
-/// Takes what comes at the three services of an action.
+/// Takes what comes at the three services of an action, until nobody works on goals any more; then for a while to say so.
 async fn serve(
     server: Arc<ActionServer>,
     [mut goals, mut results, mut cancels]: [Serving; 3],
@@ -611,6 +609,16 @@ async fn serve(
             Some(request) = goals.next() => server.take_goal(&goals, request, &events).await,
             Some(request) = results.next() => server.take_result(&results, request).await,
             Some(request) = cancels.next() => server.take_cancel(&cancels, request, &events).await,
+            () = events.closed() => break,
+            else => return,
+        }
+    }
+    server.abort_all().await;
+    let end = Instant::now() + FAREWELL;
+    loop {
+        tokio::select! {
+            Some(request) = results.next() => server.take_result(&results, request).await,
+            () = tokio::time::sleep_until(end) => return,
             else => return,
         }
     }

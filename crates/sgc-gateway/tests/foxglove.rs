@@ -1,4 +1,5 @@
 //! Foxglove's protocol on loopback, beside programs of a network in memory.
+#![allow(clippy::unwrap_used)]
 
 mod support;
 #[path = "support/viewer.rs"]

@@ -7,7 +7,7 @@
 mod lab;
 mod support;
 
-use std::process::Output;
+use std::process::{Command, Output};
 
 use lab::{Lab, Plan, Site, share, uses};
 use rustix::process::Signal;
@@ -25,7 +25,10 @@ fn lab(gateway: &str) -> Lab {
         + &uses("service", "/add_two_ints", "robot")
         + &share("topic", "/command", "robot")
         + gateway;
-    Lab::new(PLAN, [robot, desk])
+    let mut lab = Lab::silent(PLAN, [robot, desk]);
+    lab.reconfigure(Site::Desk, "[node]\n", "[node]\nstate = \"desk.state\"\n");
+    lab.start_all();
+    lab
 }
 
 fn talker(lab: &Lab) -> Peer {
@@ -70,7 +73,7 @@ fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
         let mut program = lab.python(Site::Desk, "gateway.py", &args);
         assert_eq!(program.wait("the sum", |event| event["event"] == "sum")["sum"], 42, "{protocol}");
         assert!(!heard(&mut program).is_empty());
-        listener.wait("what it publishes", |event| event["event"] == "message");
+        listener.wait("what it publishes", |event| event["event"] == "received");
         assert_eq!(clients(&lab).len(), 1);
         assert_eq!(clients(&lab)[0].0, protocol);
         program.end();
@@ -101,7 +104,28 @@ fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
 
 #[test]
 fn a_token_opens_what_it_says_until_it_is_taken_back() {
-    let lab = lab("[gateway]\nlisten = [\"grpcs://0.0.0.0:50443\"]\n");
+    let keys = tempfile::tempdir().unwrap();
+    let [certificate, key] = ["gateway.pem", "gateway.key"].map(|name| keys.path().join(name));
+    let (certificate, key) = (certificate.to_str().unwrap(), key.to_str().unwrap());
+    let made = Command::new("openssl")
+        .args([
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+            "-nodes",
+            "-days",
+            "2",
+        ])
+        .args(["-subj", "/CN=gateway", "-addext", "subjectAltName=IP:10.92.2.2"])
+        .args(["-keyout", key, "-out", certificate])
+        .output();
+    assert!(made.unwrap().status.success());
+    let lab = lab(&format!(
+        "[gateway]\nlisten = [\"grpcs://0.0.0.0:50443\"]\ncertificate = \"{certificate}\"\nkey = \"{key}\"\n"
+    ));
     if lab.namespace(Site::Desk).is_none() {
         // On this host alone nobody is elsewhere, and the ports are everybody's.
         return support::say("without namespaces nobody is elsewhere: the token is not tried");
@@ -112,10 +136,7 @@ fn a_token_opens_what_it_says_until_it_is_taken_back() {
         &lab.sgc(Some(Site::Desk), &[&create[..], &["--subscribe", "/chatter"]].concat()).output().unwrap(),
     );
     let address = "grpcs://10.92.2.2:50443";
-    let ca = lab.dir().join("lab-ca.pem");
-    let ca_text = said(&lab.sgc(None, &["fleet", "ca", "lab.fleet"]).output().unwrap());
-    std::fs::write(&ca, ca_text).unwrap();
-    let common = ["grpc", address, "--ca", ca.to_str().unwrap()];
+    let common = ["grpc", address, "--ca", certificate];
     let mut stranger = lab.python(Site::Cloud, "gateway.py", &common);
     let refused = stranger.wait("it is refused", |event| event["event"] == "failed");
     assert_eq!(refused["code"], "UNAUTHENTICATED", "{refused}");

@@ -39,11 +39,11 @@ def grpc(args: argparse.Namespace) -> None:
 
 
 def hear_by_grpc(gateway: object, args: argparse.Namespace) -> None:
-    emit("topics", topics=sorted(topic.name for topic in gateway.graph().topics))
+    emit("topics", topics=sorted(gateway.graph().topics))
     if args.publish:
         publisher = gateway.publisher(args.publish, "std_msgs/msg/String")
         publish(lambda text: publisher.publish(data=text))
-        emit("sum", sum=gateway.call("/add_two_ints", CALL, timeout=30)["sum"])
+        emit("sum", sum=until_served(lambda: gateway.call("/add_two_ints", CALL, timeout=30)["sum"]))
     for message in gateway.subscribe(args.topic, "std_msgs/msg/String", depth=100):
         emit("heard", text=message["data"])
 
@@ -53,16 +53,26 @@ def rosbridge(args: argparse.Namespace) -> None:
 
     ros = roslibpy.Ros(args.address)
     ros.run(timeout=30)
-    emit("topics", topics=sorted(ros.get_topics()["topics"]))
+    emit("topics", topics=sorted(ros.get_topics()))
     if args.publish:
         topic = roslibpy.Topic(ros, args.publish, "std_msgs/msg/String")
         topic.advertise()
         publish(lambda text: topic.publish(roslibpy.Message({"data": text})))
         service = roslibpy.Service(ros, "/add_two_ints", "example_interfaces/srv/AddTwoInts")
-        emit("sum", sum=service.call(roslibpy.ServiceRequest(CALL), timeout=30)["sum"])
+        emit("sum", sum=until_served(lambda: service.call(roslibpy.ServiceRequest(CALL), timeout=30)["sum"]))
     heard = roslibpy.Topic(ros, args.topic, "std_msgs/msg/String", queue_length=100)
     heard.subscribe(lambda message: emit("heard", text=message["data"]))
     threading.Event().wait()
+
+
+def until_served(call: object) -> int:
+    """Calls until somebody answers: what is far away takes a moment to be known."""
+    while True:
+        try:
+            return call()
+        except Exception as error:  # each client has its own
+            emit("not_served", reason=str(error))
+            time.sleep(0.2)
 
 
 def publish(say: object) -> None:

@@ -5,7 +5,7 @@
 //! its own: neither a scope for each client nor bounds in bytes can be put into it, and schemas and MCAP come with it.
 //!
 //! A connection is one task. It holds nothing that grows with what a client does not take: answers bound what is read,
-//! and messages give way, which the client is told ([`Options::waiting_bytes_max`] of its [`Session`]'s limits).
+//! and messages give way, which the client is told ([`SessionLimits::waiting_bytes_max`](crate::SessionLimits)).
 //!
 //! `foxglove.sdk.v1` and `foxglove.websocket.v1` are the same on the wire but for the name: the former adds control of
 //! playback, which is an offer of servers that play recordings.
