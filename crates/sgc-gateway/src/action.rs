@@ -326,6 +326,7 @@ struct ActionServer {
     cancel_goal: Replier,
     feedback: Publication,
     status: Publication,
+    telling: tokio::sync::Mutex<()>,
 }
 
 type Goals = BTreeMap<GoalId, Served>;
@@ -366,6 +367,7 @@ impl ActionServing {
             cancel_goal: cancels.replier(),
             feedback,
             status,
+            telling: tokio::sync::Mutex::default(),
         });
         let (send, events) = mpsc::channel(EVENTS_MAX);
         tokio::spawn(serve(Arc::clone(&server), [goals, results, cancels], send));
@@ -480,6 +482,8 @@ impl ActionServer {
     }
 
     async fn publish_status(&self) -> Result<(), GatewayError> {
+        // One at a time, so that what is said last is how they stand.
+        let _turn = self.telling.lock().await;
         let list = lock(&self.goals)
             .iter()
             .filter(|(_, goal)| goal.asked.is_none())

@@ -177,7 +177,9 @@ async fn goals_are_canceled_aborted_and_given_up_with_their_server() {
     client.send(goal("left", 2)).await;
     server.next().await;
     drop(server);
-    assert_eq!(client.next().await["status"], 6);
+    // It is aborted, or its server is gone before it could say so.
+    let told = client.next().await;
+    assert!(told["status"] == 6 || told["result"] == false, "{told}");
     let told = client.told(json!({"op": "cancel_action_goal", "id": "none", "action": "/fib"})).await;
     assert_eq!(told, "cancel_action_goal: no goal of that id is under way");
     // Nobody serves it now.
