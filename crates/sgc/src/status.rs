@@ -49,6 +49,28 @@ pub(crate) struct Status {
     pub(crate) drops: BTreeMap<String, u64>,
     pub(crate) refused: BTreeMap<String, u64>,
     router: RouterSize,
+    gateway: Option<Gateway>,
+}
+
+/// Programs without ROS at a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Gateway {
+    listen: Vec<String>,
+    clients: Vec<GatewayClient>,
+    refused: BTreeMap<String, u64>,
+    readers: usize,
+}
+
+/// One of them.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct GatewayClient {
+    name: String,
+    protocol: String,
+    address: String,
+    /// Milliseconds since the Unix epoch.
+    since: u64,
 }
 
 /// A link of a node.
@@ -272,12 +294,30 @@ impl Status {
         };
         section("Drops", &["reason", "count"], counts(&self.drops));
         section("Refused peers", &["reason", "count"], counts(&self.refused));
+        if let Some(gateway) = &self.gateway {
+            section(
+                "Programs without ROS",
+                &["client", "protocol", "address", "since"],
+                gateway.clients.iter().map(GatewayClient::row).collect(),
+            );
+            if !gateway.refused.is_empty() {
+                section("Refused there", &["reason", "count"], counts(&gateway.refused));
+            }
+            lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers));
+        }
         let RouterSize { nodes, names, routed_names, branches } = self.router;
         lines.push(String::new());
         lines.push(format!(
             "Router: {nodes} nodes and {names} names known, {routed_names} with a route, {branches} branches"
         ));
         lines
+    }
+}
+
+impl GatewayClient {
+    fn row(&self) -> Vec<String> {
+        let since = sgc_wire::UnixMillis(self.since).to_string();
+        vec![self.name.clone(), self.protocol.clone(), self.address.clone(), since]
     }
 }
 

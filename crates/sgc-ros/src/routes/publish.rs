@@ -4,12 +4,16 @@
 //! this node publish. A share route on which others may publish has a local writer while any of them is there.
 
 use rand_core::RngCore;
-use sgc_wire::{Metadata, Name, Qos};
+use sgc_wire::{History, Metadata, Name, Qos};
 
 use super::{Cause, Command, Direction, Routes, Shaping, same_reader};
 use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
+
+/// Messages of others that the owner's local writer keeps for reliable readers. Whoever writes waits for acknowledgements once
+/// so many came at once, some 15 ms with Cyclone; and so many are held for a reader that stands still.
+const PUBLISHERS_DEPTH: u32 = 100;
 
 impl<R: RngCore> Routes<R> {
     /// Others than this node publish on one of its shares, or none any more.
@@ -23,7 +27,7 @@ impl<R: RngCore> Routes<R> {
             type_name: share.type_name.clone(),
             keyless: share.keyless,
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
-            qos: Qos::default(),
+            qos: Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() },
         });
         if share.writer.is_some() == spec.is_some() {
             return;
