@@ -86,8 +86,8 @@ impl Door {
     }
 
     /// Other rules from now on: who is no longer admitted is disconnected.
-    pub(crate) fn set_access(&self, access: Access) {
-        self.access.send_replace(access);
+    pub(crate) fn change_access(&self, change: impl FnOnce(&Access) -> Access) {
+        self.access.send_modify(|access| *access = change(access));
     }
 
     pub(crate) fn access(&self) -> Access {

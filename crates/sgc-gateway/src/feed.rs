@@ -33,6 +33,8 @@ pub(crate) struct FeedKey {
     pub(crate) type_name: String,
     /// What to request; none takes each publisher as it is.
     pub(crate) qos: Option<Qos>,
+    /// Whether its only subscriber is waited for.
+    pub(crate) waits: bool,
 }
 
 /// A reader and its subscribers.
@@ -75,10 +77,18 @@ impl Latched {
         self.bytes -= gone;
     }
 
-    /// Whether it was heard before: a reader that is made anew hears again what writers kept.
+    /// Whether it was heard before: a reader that is made anew hears again what writers kept. By time and content, since
+    /// clocks are set back.
     fn has(&self, sample: &Sample) -> bool {
-        let newest = self.writers.get(&sample.writer).and_then(|kept| kept.back());
-        self.is_on && newest.is_some_and(|newest| sample.source_timestamp_ns <= newest.source_timestamp_ns)
+        let is_it = |message: &Arc<Message>| {
+            message.source_timestamp_ns == sample.source_timestamp_ns && message.payload == sample.payload
+        };
+        self.is_on && self.writers.get(&sample.writer).is_some_and(|kept| kept.iter().any(is_it))
+    }
+
+    fn clear(&mut self) {
+        self.writers.clear();
+        self.bytes = 0;
     }
 
     fn retain(&mut self, is_there: impl Fn(&Guid) -> bool) {
@@ -162,7 +172,7 @@ impl Feed {
 
     /// What its reader is to request, as the graph is.
     fn wanted(&self, graph: &Graph) -> EndpointSpec {
-        let FeedKey { topic, type_name, qos } = &self.key;
+        let FeedKey { topic, type_name, qos, .. } = &self.key;
         let info = graph.topics.get(topic);
         let of_type = |info: &&crate::graph::EndpointInfo| info.type_name == *type_name;
         let publishers: Vec<_> = info.iter().flat_map(|info| &info.publishers).filter(of_type).collect();
@@ -197,6 +207,9 @@ impl Feed {
             let latched = &mut outlets.latched;
             latched.retain(|writer| hub.is_there(writer));
             latched.is_on = wanted.qos.durability >= Durability::TransientLocal;
+            if !latched.is_on {
+                latched.clear();
+            }
             latched.depth = match wanted.qos.history {
                 History::KeepLast(depth) => (depth as usize).clamp(1, LATCHED_DEPTH_MAX),
                 History::KeepAll => LATCHED_DEPTH_MAX,
@@ -210,7 +223,11 @@ impl Feed {
         }
         if let Some((old, _)) = reader.take() {
             hub.forget(&[old.guid()]);
+            // Its end waits for its thread, which may wait for a subscriber.
+            let queues: Vec<_> = self.outlets().queues.iter().filter_map(Weak::upgrade).collect();
+            queues.iter().for_each(|queue| queue.let_pass(true));
             drop(old);
+            queues.iter().for_each(|queue| queue.let_pass(false));
         }
         let made = hub.ros.reader(&wanted, Box::new(Intake(Arc::clone(self))))?;
         hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));

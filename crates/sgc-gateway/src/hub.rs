@@ -8,7 +8,7 @@ use std::time::Duration;
 use sgc_ros::{DiscoveredEndpoint, GraphNode, Guid, RosError};
 use sgc_wire::RosNode;
 use tokio::runtime::Handle;
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinHandle;
 
 use crate::error::GatewayError;
@@ -22,6 +22,10 @@ use crate::types::Types;
 const SETTLE: Duration = Duration::from_millis(20);
 /// How long a reader that nobody uses is kept: a page that is loaded again finds it.
 const LINGER: Duration = Duration::from_secs(2);
+/// Threads that wait at a time for local programs, so that others are left for everything else.
+const WAITS_MAX: usize = 64;
+/// Writers at their end that are waited for at a time.
+const FAREWELLS_MAX: usize = 32;
 /// Clients of services that are kept for further calls.
 const CALLERS_MAX: usize = 256;
 
@@ -45,12 +49,32 @@ pub struct Hub {
     keeper: Arc<Keeper>,
 }
 
-struct Keeper(JoinHandle<()>);
+struct Keeper([JoinHandle<()>; 2]);
+
+impl Keeper {
+    fn end(&self) {
+        self.0.iter().for_each(JoinHandle::abort);
+    }
+}
 
 impl Drop for Keeper {
     fn drop(&mut self) {
-        self.0.abort();
+        self.end();
     }
+}
+
+impl Feeds {
+    fn stopped() -> Self {
+        Self { all: Vec::new(), is_stopped: true }
+    }
+}
+
+/// Readers that there are.
+#[derive(Default)]
+struct Feeds {
+    all: Vec<Arc<Feed>>,
+    /// None is made any more.
+    is_stopped: bool,
 }
 
 /// What all clients share.
@@ -62,9 +86,13 @@ pub(crate) struct Shared {
     node_name: String,
     state: Mutex<GraphState>,
     changed: watch::Sender<u64>,
-    feeds: Mutex<Vec<Arc<Feed>>>,
+    feeds: Mutex<Feeds>,
     unused: Notify,
     callers: Mutex<VecDeque<Arc<Caller>>>,
+    /// Calls and writes that may wait, each of which takes a thread.
+    pub(crate) waits: Semaphore,
+    /// Writers that wait for acknowledgements before they end.
+    pub(crate) farewells: Arc<Semaphore>,
 }
 
 impl fmt::Debug for Hub {
@@ -96,6 +124,8 @@ impl Hub {
             feeds: Mutex::default(),
             unused: Notify::new(),
             callers: Mutex::default(),
+            waits: Semaphore::new(WAITS_MAX),
+            farewells: Arc::new(Semaphore::new(FAREWELLS_MAX)),
         });
         let weak = Arc::downgrade(&shared);
         shared
@@ -110,8 +140,9 @@ impl Hub {
                 Ok(())
             })
             .await?;
-        let keeper = tokio::spawn(keep(Arc::downgrade(&shared), shared.changed.subscribe()));
-        Ok(Self { shared, keeper: Arc::new(Keeper(keeper)) })
+        let adapting = tokio::spawn(adapt(Arc::downgrade(&shared), shared.changed.subscribe()));
+        let sweeping = tokio::spawn(sweep(Arc::downgrade(&shared)));
+        Ok(Self { shared, keeper: Arc::new(Keeper([adapting, sweeping])) })
     }
 
     /// What is on the network.
@@ -136,17 +167,17 @@ impl Hub {
 
     /// How many readers there are, shared by all who subscribe.
     pub fn readers(&self) -> usize {
-        lock(&self.shared.feeds).len()
+        lock(&self.shared.feeds).all.len()
     }
 
     /// Leaves the network: subscriptions end, and calls are not answered any more.
     pub async fn stop(&self) {
-        self.keeper.0.abort();
+        self.keeper.end();
         let _ = self
             .shared
             .blocking(|shared| {
-                let feeds = std::mem::take(&mut *lock(&shared.feeds));
-                feeds.iter().for_each(|feed| feed.end());
+                let feeds = std::mem::replace(&mut *lock(&shared.feeds), Feeds::stopped());
+                feeds.all.iter().for_each(|feed| feed.end());
                 let callers = std::mem::take(&mut *lock(&shared.callers));
                 drop(callers);
                 let _ = shared.ros.announce(&[]);
@@ -156,48 +187,46 @@ impl Hub {
     }
 }
 
-/// Adapts readers to the graph, and ends those that nobody uses.
-async fn keep(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
-    loop {
-        let Some(strong) = shared.upgrade() else { return };
-        let unused = strong.unused.notified();
-        tokio::select! {
-            result = changed.changed() => {
-                if result.is_err() {
-                    return;
+/// Adapts readers to the graph.
+async fn adapt(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
+    while changed.changed().await.is_ok() {
+        let Some(shared) = shared.upgrade() else { return };
+        tokio::time::sleep(SETTLE).await;
+        // What changes from here on is looked at again, what is made here among it: there is nothing to do then.
+        changed.mark_unchanged();
+        let done = shared.blocking(|shared| {
+            let feeds = lock(&shared.feeds).all.clone();
+            for feed in feeds {
+                if let Err(error) = feed.adapt() {
+                    tracing::warn!(%error, "a reader could not be made anew");
                 }
-                tokio::time::sleep(SETTLE).await;
-                changed.mark_unchanged();
-                let done = strong.blocking(|shared| {
-                    let feeds = lock(&shared.feeds).clone();
-                    for feed in feeds.iter().filter(|feed| feed.key.qos.is_none()) {
-                        if let Err(error) = feed.adapt() {
-                            tracing::warn!(%error, "a reader could not be made anew");
-                        }
-                    }
-                    shared.announce();
-                    Ok(())
-                });
-                let _ = done.await;
-                changed.mark_unchanged();
             }
-            () = unused => {
-                tokio::time::sleep(LINGER).await;
-                let done = strong.blocking(|shared| {
-                    let mut gone = Vec::new();
-                    lock(&shared.feeds).retain(|feed| {
-                        let is_used = !feed.is_unused();
-                        if !is_used {
-                            gone.push(Arc::clone(feed));
-                        }
-                        is_used
-                    });
-                    gone.iter().for_each(|feed| feed.end());
-                    Ok(())
-                });
-                let _ = done.await;
-            }
-        }
+            shared.announce();
+            Ok(())
+        });
+        let _ = done.await;
+    }
+}
+
+/// Ends readers that nobody uses.
+async fn sweep(shared: Weak<Shared>) {
+    loop {
+        let Some(shared) = shared.upgrade() else { return };
+        shared.unused.notified().await;
+        tokio::time::sleep(LINGER).await;
+        let done = shared.blocking(|shared| {
+            let mut gone = Vec::new();
+            lock(&shared.feeds).all.retain(|feed| {
+                let is_used = !feed.is_unused();
+                if !is_used {
+                    gone.push(Arc::clone(feed));
+                }
+                is_used
+            });
+            gone.iter().for_each(|feed| feed.end());
+            Ok(())
+        });
+        let _ = done.await;
     }
 }
 
@@ -270,24 +299,22 @@ impl Shared {
     ) -> Result<Subscription, GatewayError> {
         self.run(move |shared| {
             let layout = shared.layout_of(&key)?;
-            // A subscriber that is waited for has a reader of its own.
-            let may_share = taking.overflow == crate::queue::Overflow::DropOldest;
-            let (feed, is_new) = {
+            let (feed, subscription) = {
                 let mut feeds = lock(&shared.feeds);
-                match feeds.iter().find(|feed| may_share && feed.key == key) {
-                    Some(feed) => (Arc::clone(feed), false),
-                    None => {
-                        let feed = Feed::new(key, shared);
-                        feeds.push(Arc::clone(&feed));
-                        (feed, true)
-                    }
+                if feeds.is_stopped {
+                    return Err(GatewayError::Stopping);
                 }
+                // A subscriber that is waited for has a reader of its own.
+                let known = feeds.all.iter().find(|feed| !key.waits && feed.key == key).map(Arc::clone);
+                let feed = known.unwrap_or_else(|| {
+                    let feed = Feed::new(key, shared);
+                    feeds.all.push(Arc::clone(&feed));
+                    feed
+                });
+                // Before anybody finds it unused, and before a new reader hears what is for who made it.
+                (Arc::clone(&feed), Subscription::new(feed, layout, taking))
             };
-            // What a new reader hears first is for who made it, so it joins before.
-            let subscription = Subscription::new(Arc::clone(&feed), layout, taking);
-            if is_new {
-                feed.adapt()?;
-            }
+            feed.adapt()?;
             Ok(subscription)
         })
         .await
@@ -305,17 +332,27 @@ impl Shared {
         service: &str,
         type_name: &str,
     ) -> Result<Arc<Caller>, GatewayError> {
-        let mut callers = lock(&self.callers);
-        if let Some(at) = callers.iter().position(|caller| caller.is_for(service, type_name))
-            && let Some(caller) = callers.remove(at)
-        {
+        let known = |callers: &mut VecDeque<Arc<Caller>>| {
+            let at = callers.iter().position(|caller| caller.is_for(service, type_name))?;
+            let caller = callers.remove(at)?;
             callers.push_front(Arc::clone(&caller));
+            Some(caller)
+        };
+        if let Some(caller) = known(&mut lock(&self.callers)) {
             return Ok(caller);
         }
-        let caller = Arc::new(Caller::new(self, service, type_name)?);
-        callers.push_front(Arc::clone(&caller));
-        callers.truncate(CALLERS_MAX);
-        Ok(caller)
+        // Others are not kept waiting meanwhile; of two that are made at once the second goes.
+        let made = Arc::new(Caller::new(self, service, type_name)?);
+        let mut callers = lock(&self.callers);
+        if let Some(caller) = known(&mut callers) {
+            return Ok(caller);
+        }
+        callers.push_front(Arc::clone(&made));
+        let before = callers.len().min(CALLERS_MAX);
+        let old = callers.split_off(before);
+        drop(callers);
+        drop(old);
+        Ok(made)
     }
 }
 

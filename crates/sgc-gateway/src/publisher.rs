@@ -98,6 +98,7 @@ impl Publication {
         if !self.may_block {
             return Ok(self.writer.write(SampleKind::Write, stamp, payload)?);
         }
+        let _place = self.shared.waits.acquire().await.map_err(|_| GatewayError::Stopping)?;
         let writer = Arc::clone(&self.writer);
         self.shared.blocking(move |_| writer.write(SampleKind::Write, stamp, payload)).await
     }
@@ -140,8 +141,12 @@ impl fmt::Debug for Publication {
 impl Drop for Publication {
     fn drop(&mut self) {
         let (shared, writer) = (Arc::clone(&self.shared), Arc::clone(&self.writer));
+        let place = Arc::clone(&shared.farewells).try_acquire_owned();
         self.shared.runtime.spawn_blocking(move || {
-            writer.wait_acknowledged(FAREWELL_MAX);
+            // Where many end at once, not all can be waited for.
+            if place.is_ok() {
+                writer.wait_acknowledged(FAREWELL_MAX);
+            }
             shared.forget(&[writer.guid()]);
             drop(writer);
         });

@@ -24,6 +24,8 @@ struct State {
     bytes: usize,
     dropped: u64,
     is_closed: bool,
+    /// Nobody is waited for at the moment.
+    lets_pass: bool,
 }
 
 /// What waits for one subscriber.
@@ -73,7 +75,13 @@ impl Queue {
             return false;
         }
         let state = self.lock();
-        !state.is_closed && !self.has_room(&state, bytes)
+        !state.is_closed && !state.lets_pass && !self.has_room(&state, bytes)
+    }
+
+    /// Whether what there is no room for comes all the same, rather than waiting.
+    pub(crate) fn let_pass(&self, lets_pass: bool) {
+        self.lock().lets_pass = lets_pass;
+        self.room.notify_all();
     }
 
     /// Puts a message behind the others.
@@ -82,6 +90,7 @@ impl Queue {
         let mut state = self.lock();
         while !state.is_closed && !self.has_room(&state, bytes) {
             match self.overflow {
+                Overflow::Wait if state.lets_pass => break,
                 Overflow::Wait => state = self.room.wait(state).unwrap_or_else(PoisonError::into_inner),
                 Overflow::DropOldest => {
                     if let Some(oldest) = state.messages.pop_front() {

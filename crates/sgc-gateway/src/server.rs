@@ -237,15 +237,13 @@ impl Server {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
-        let access = access.after(&self.shared.door.access());
-        self.shared.door.set_access(access);
+        self.shared.door.change_access(|before| access.after(before));
         Ok(())
     }
 
     /// Other CAs, or other revocation lists of theirs.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
-        let access = self.shared.door.access().with_anchors(anchors);
-        self.shared.door.set_access(access);
+        self.shared.door.change_access(|access| access.clone().with_anchors(anchors));
     }
 
     /// What goes on.

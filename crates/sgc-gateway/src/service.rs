@@ -55,6 +55,9 @@ fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
 #[derive(Default)]
 struct Pending {
     asked: BTreeMap<i64, oneshot::Sender<Bytes>>,
+    /// Requests that are being sent: their numbers are not known yet.
+    sending: usize,
+    /// Replies that may be theirs.
     early: VecDeque<(i64, Bytes)>,
 }
 
@@ -63,18 +66,19 @@ pub(crate) struct Caller {
     service: String,
     type_name: String,
     pub(crate) halves: Halves,
-    client: Box<dyn RosClient>,
+    /// There until the end, which may block.
+    client: Option<Box<dyn RosClient>>,
     pending: Arc<Mutex<Pending>>,
     shared: Weak<Shared>,
 }
 
 /// A call under way: nobody waits for its reply once this is dropped.
-struct Asked<'c> {
-    caller: &'c Caller,
+struct Asked {
+    caller: Arc<Caller>,
     number: i64,
 }
 
-impl Drop for Asked<'_> {
+impl Drop for Asked {
     fn drop(&mut self) {
         lock(&self.caller.pending).asked.remove(&self.number);
     }
@@ -93,6 +97,8 @@ impl Caller {
                 let mut pending = lock(&answered);
                 match pending.asked.remove(&id.number) {
                     Some(waiting) => drop(waiting.send(payload)),
+                    // Nobody waits for it, or will.
+                    None if pending.sending == 0 => {}
                     None => {
                         pending.early.push_back((id.number, payload));
                         if pending.early.len() > EARLY_MAX {
@@ -106,38 +112,52 @@ impl Caller {
         shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.reply));
         shared.know(own_endpoint(EndpointKind::Writer, writer, &spec.request));
         let (service, type_name) = (service.to_owned(), type_name.to_owned());
-        Ok(Self { service, type_name, halves, client, pending, shared: Arc::downgrade(shared) })
+        let shared = Arc::downgrade(shared);
+        Ok(Self { service, type_name, halves, client: Some(client), pending, shared })
     }
 
     pub(crate) fn is_for(&self, service: &str, type_name: &str) -> bool {
         self.service == service && self.type_name == type_name
     }
 
+    /// Sends a request; its reply comes to who holds what this gives. May block.
+    fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(Asked, oneshot::Receiver<Bytes>), RosError> {
+        let client = self.client.as_ref().ok_or(RosError::NoPeer { waited_ms: 0 })?;
+        lock(&self.pending).sending += 1;
+        let sent = client.request(payload);
+        let (send, reply) = oneshot::channel();
+        let mut pending = lock(&self.pending);
+        pending.sending -= 1;
+        let early = sent.as_ref().ok().and_then(|id| {
+            let at = pending.early.iter().position(|(number, _)| *number == id.number)?;
+            pending.early.remove(at)
+        });
+        if pending.sending == 0 {
+            pending.early.clear();
+        }
+        let number = sent?.number;
+        match early {
+            Some((_, payload)) => drop(send.send(payload)),
+            None => drop(pending.asked.insert(number, send)),
+        }
+        drop(pending);
+        Ok((Asked { caller: Arc::clone(self), number }, reply))
+    }
+
     /// Asks, and waits for the reply.
     pub(crate) async fn call(self: &Arc<Self>, payload: Bytes, max: Duration) -> Result<Bytes, GatewayError> {
         let shared = self.shared.upgrade().ok_or(GatewayError::Stopping)?;
         let caller = Arc::clone(self);
-        let asked = shared.blocking(move |_| caller.client.request(payload)).await;
-        let number = match asked {
-            Ok(id) => id.number,
+        let asked = {
+            let _place = shared.waits.acquire().await.map_err(|_| GatewayError::Stopping)?;
+            shared.blocking(move |_| caller.ask(payload)).await
+        };
+        let (_asked, reply) = match asked {
             Err(GatewayError::Ros(RosError::NoPeer { .. })) => {
                 return Err(GatewayError::NoServer { name: self.service.clone() });
             }
-            Err(error) => return Err(error),
+            asked => asked?,
         };
-        let (send, reply) = oneshot::channel();
-        let _asked = Asked { caller: self, number };
-        {
-            let mut pending = lock(&self.pending);
-            match pending.early.iter().position(|(early, _)| *early == number) {
-                Some(at) => {
-                    if let Some((_, payload)) = pending.early.remove(at) {
-                        return Ok(payload);
-                    }
-                }
-                None => drop(pending.asked.insert(number, send)),
-            }
-        }
         match tokio::time::timeout(max, reply).await {
             Ok(Ok(payload)) => Ok(payload),
             Ok(Err(_)) => Err(GatewayError::Stopping),
@@ -151,8 +171,9 @@ impl Caller {
 
 impl Drop for Caller {
     fn drop(&mut self) {
-        if let Some(shared) = self.shared.upgrade() {
-            shared.forget(&self.client.guids());
+        if let Some((shared, client)) = self.shared.upgrade().zip(self.client.take()) {
+            shared.forget(&client.guids());
+            shared.runtime.spawn_blocking(move || drop(client));
         }
     }
 }

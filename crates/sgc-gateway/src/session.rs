@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_ros::is_topic_name;
+use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
 use sgc_wire::Qos;
 
 use crate::access::{Client, Right};
@@ -137,11 +137,17 @@ impl Session {
         if now >= max { Err(GatewayError::TooMany { what, max }) } else { Ok(()) }
     }
 
+    fn check_name(&self, name: &str) -> Result<(), GatewayError> {
+        if is_topic_name(name) {
+            return Ok(());
+        }
+        // What is no name may be of any length.
+        Err(GatewayError::Name { name: name.chars().take(TOPIC_BYTES_MAX).collect() })
+    }
+
     /// Refuses names that are none, and what the scope does not have.
     pub fn check(&self, right: Right, name: &str) -> Result<(), GatewayError> {
-        if !is_topic_name(name) {
-            return Err(GatewayError::Name { name: name.to_owned() });
-        }
+        self.check_name(name)?;
         if !self.client.scope.permits(right, name) {
             let (client, name) = (self.client.name.to_string(), name.to_owned());
             return Err(GatewayError::Denied { client, right, name });
@@ -199,7 +205,7 @@ impl Session {
     /// Subscribes to what belongs to something that the client may use.
     pub(crate) async fn subscribe_checked(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
-        let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos };
+        let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
         let taking = Intaking {
             depth: wanted.depth,
             bytes_max: self.limits.waiting_bytes_max,
@@ -231,6 +237,7 @@ impl Session {
         form: Form,
         max: Duration,
     ) -> Result<Bytes, GatewayError> {
+        self.check_name(service)?;
         self.check(Right::Call, action_of(service))?;
         let type_name = self.service_type(service, type_name)?;
         self.check_count("calls under way", self.calls.load(Ordering::Relaxed), self.limits.calls_max)?;
@@ -245,6 +252,7 @@ impl Session {
 
     /// Serves a service.
     pub async fn serve(&self, service: &str, type_name: Option<&str>) -> Result<Serving, GatewayError> {
+        self.check_name(service)?;
         self.check(Right::Serve, action_of(service))?;
         let type_name = self.service_type(service, type_name)?;
         Serving::new(&self.hub.shared, service.to_owned(), type_name).await

@@ -105,15 +105,23 @@ impl Types {
         })?;
         let found = Library::empty().layout(&name, &mut |file| self.finder.text(file)).map(Arc::new);
         let is_it = |layout: &Arc<Layout>| hash.is_none_or(|hash| layout.type_hash() == hash);
+        let mut is_sure = true;
         let layout = match found {
             Ok(layout) if is_it(&layout) => layout,
             found => match (self.finder.described(&name, hash), found) {
                 (Some(described), _) => described,
-                // A hash that says otherwise may be of another way to compute it; what does not fit is found when decoding.
-                (None, Ok(layout)) => layout,
+                // A hash that says otherwise may be of another way to compute it; what does not fit is found when decoding. Or
+                // the description is on its way.
+                (None, Ok(layout)) => {
+                    is_sure = false;
+                    layout
+                }
                 (None, Err(error)) => return Err(GatewayError::Definition(error)),
             },
         };
+        if !is_sure {
+            return Ok(layout);
+        }
         let mut known = self.lock();
         if known.len() >= TYPES_MAX {
             known.clear();

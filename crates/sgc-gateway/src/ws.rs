@@ -43,8 +43,10 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
             scheme.eq_ignore_ascii_case("bearer").then(|| token.trim().to_owned())
         });
         let token = bearer.or_else(|| request.uri().query().and_then(token_in));
+        // What is no text is no page that is known.
+        let origin = request.headers().get(ORIGIN).map(|value| value.to_str().unwrap_or("?"));
         let client = door
-            .admit(arrival, header(ORIGIN), token.as_deref())
+            .admit(arrival, origin, token.as_deref())
             .map_err(|denied| refusal(StatusCode::UNAUTHORIZED, denied.told()))?;
         let offered: Vec<&str> = request
             .headers()

@@ -132,7 +132,9 @@ impl Reloader {
     /// Carries out `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
         let (identity, state) = (self.identity.clone(), self.state.clone());
-        let (wanted, own, suites) = (config.clone(), self.identity.anchors().clone(), running.suites.clone());
+        let (mut wanted, own, suites) =
+            (config.clone(), self.identity.anchors().clone(), running.suites.clone());
+        let running_gateway = running.config.gateway.clone();
         let trusted = running.rules.partners.certificates.clone();
         let prepare = tokio::task::spawn_blocking(move || -> Result<Prepared, NodeError> {
             let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
@@ -147,6 +149,8 @@ impl Reloader {
                 )),
             };
             let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
+            // One that is no longer wanted runs until a restart, and who was revoked is not to stay there.
+            wanted.gateway = wanted.gateway.or(running_gateway);
             let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
             let gateway = match access.zip(wanted.gateway.as_ref()) {
                 Some((access, gateway)) => Some((access, key_of(gateway, &identity)?)),
@@ -165,18 +169,20 @@ impl Reloader {
         };
         // Before the control task looks at the links that are up.
         self.credentials.set_admitted(rules.partners.admitted.clone());
-        if let Some((access, key)) = gateway {
-            self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())?;
-            if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
-                report.changed.push("who may connect to the gateway changed".to_owned());
-            }
-        }
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let event = CoreEvent::Reload { shares, uses, anchors, message_keys, reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())?;
+        // The control task knows the newest revocation lists.
+        if let Some((access, key)) = gateway {
+            let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
+            self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())?;
+            if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
+                report.changed.push("who may connect to the gateway changed".to_owned());
+            }
+        }
         self.audit.set_names(rules.names.clone());
         // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
         let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = config;

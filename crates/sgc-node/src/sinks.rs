@@ -692,7 +692,9 @@ impl WriterQueue {
     /// was not only news come.
     fn has_written(&self, head: &MessageHead) -> bool {
         let is_known = |recent: &mut Recent| {
-            recent.again = recent.again && recent.heads.contains(head);
+            let is_it =
+                |h: &MessageHead| h.kind == head.kind && h.source_timestamp_ns == head.source_timestamp_ns;
+            recent.again = recent.again && recent.heads.iter().any(is_it);
             recent.again
         };
         self.with_recent(is_known).unwrap_or(false)

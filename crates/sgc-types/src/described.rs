@@ -40,7 +40,8 @@ impl Described {
     /// Reads a description that somebody else made of the type of this name and hash.
     pub fn read(description: Bytes, name: &TypeName, type_hash: &str) -> Result<Self, NotBelieved> {
         let layout = Layout::from_description(&description, type_hash)?;
-        let this = Self::new(layout, description).ok_or_else(nameless)?;
+        // Described anew: what the hash does not vouch for is not passed on.
+        let this = Self::of(layout)?;
         if this.name != *name {
             return Err(NotBelieved::Name { found: this.name.to_string(), expected: name.to_string() });
         }

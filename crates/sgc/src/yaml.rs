@@ -17,7 +17,9 @@ pub(crate) fn json_of(text: &str) -> Result<String, String> {
     if serde_json::from_str::<serde::de::IgnoredAny>(text).is_ok() {
         return Ok(text.split('\n').collect());
     }
-    let node: Node = serde_saphyr::from_str(text).map_err(|error| error.to_string())?;
+    let mut options = serde_saphyr::Options::default();
+    options.non_finite_float_policy = serde_saphyr::options::NonFiniteFloatPolicy::PassThrough;
+    let node: Node = serde_saphyr::from_str_with_options(text, options).map_err(|error| error.to_string())?;
     let mut json = String::new();
     node.write(&mut json, 0)?;
     Ok(json)
