@@ -57,6 +57,8 @@ if [ "$what" = test ]; then
     need 'compiles c++ fastdds/dds/domain/DomainParticipant.hpp' libfastrtps-dev -- "the Fast DDS test peer"
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "the Cyclone DDS test peer runs in a virtual environment"
     need 'command -v node && command -v npm' nodejs npm -- "clients of the gateway in JavaScript"
+    # shellcheck disable=SC2016 # the probe is evaluated later
+    need 'test -x "${SGC_CHROMIUM:-/usr/bin/chromium}"' chromium -- "a page that uses the gateway; SGC_CHROMIUM names another browser of its kind"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
     need 'command -v openssl' openssl -- "a DTLS program that is not ours"
