@@ -229,4 +229,19 @@ mod tests {
         pusher.join().unwrap();
         assert!(!queue.would_wait(1));
     }
+
+    #[test]
+    fn who_waits_for_room_is_let_pass() {
+        let queue = Arc::new(Queue::new(1, 100, Arc::default(), Overflow::Wait));
+        queue.push(&message(1));
+        let pusher = {
+            let queue = queue.clone();
+            std::thread::spawn(move || queue.push(&message(2)))
+        };
+        queue.let_pass(true);
+        pusher.join().unwrap();
+        queue.let_pass(false);
+        assert!(queue.would_wait(1));
+        assert_eq!([queue.pop(), queue.pop()].map(|next| next.unwrap().0.payload.len()), [1, 2]);
+    }
 }

@@ -132,6 +132,34 @@ async fn a_slow_client_loses_the_oldest_and_is_told_how_many() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_is_waited_for_shares_a_reader_with_nobody() {
+    let site = Site::new().await;
+    let _talker = site.writer("/odom", Qos::default());
+    site.knows("/odom").await;
+    let session = site.session("recorder");
+    let _waiting = session.subscribe(Subscribe { waits: true, ..hear("/odom") }).await.unwrap();
+    let _others = [
+        site.session("one").subscribe(hear("/odom")).await.unwrap(),
+        site.session("two").subscribe(hear("/odom")).await.unwrap(),
+    ];
+    assert_eq!(site.hub.readers(), 2);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn latched_messages_survive_a_clock_that_is_set_back() {
+    let site = Site::new().await;
+    let latched =
+        Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
+    let map = site.writer("/map", latched);
+    site.knows("/map").await;
+    let mut heard = site.session("desk").subscribe(hear("/map")).await.unwrap();
+    for (stamp, text) in [(9, "first"), (3, "second"), (3, "third")] {
+        map.write(SampleKind::Write, stamp, string(text)).unwrap();
+        assert_eq!(heard.next().await.unwrap().message.payload, string(text));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_the_scope_does_not_have_is_refused_and_not_seen() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];

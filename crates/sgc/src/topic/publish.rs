@@ -36,7 +36,7 @@ enum DurabilityArg {
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   sgc topic pub /cmd_vel geometry_msgs/msg/Twist '{linear: {x: 0.5}}' --rate 10
-  sgc topic pub --once /chatter std_msgs/String 'data: hello'")]
+  sgc topic pub --once /arm/mode 'data: hello'")]
 pub(crate) struct PubArgs {
     /// The topic
     topic: String,
