@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -13,6 +13,7 @@ help:
 	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 restarts at random; SGC_CHURN_SEED, SGC_CHURN_STEPS), stall (ten minutes of images to who stands still)'
+	@echo '                 gateway-soak (500 clients of the gateway, and 20000 that come and go; SGC_SOAK_CLIENTS, SGC_SOAK_CONNECTS)'
 	@echo '                 bench-graph (200 nodes, 2000 endpoints; SGC_GRAPH_NODES, SGC_GRAPH_SHARED, SGC_GRAPH_SECONDS)'
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
 	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
@@ -101,6 +102,12 @@ churn: peers
 stall: peers
 	SGC_STALL_SECONDS=$${SGC_STALL_SECONDS:-600} \
 		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) stands_still -- --nocapture
+
+# What the gateway holds with 500 clients, one that does not read, and as many that come and go as one every two minutes makes in
+# 26 days. The suite runs a short one.
+gateway-soak: peers
+	SGC_SOAK_CLIENTS=$${SGC_SOAK_CLIENTS:-500} SGC_SOAK_CONNECTS=$${SGC_SOAK_CONNECTS:-20000} \
+		$(CARGO) test -p sgc --locked --test gateway_soak $(ARGS) -- --nocapture
 
 # What a network of 200 nodes and 2000 endpoints costs a node, 50 of them shared.
 bench-graph: peers
