@@ -13,7 +13,7 @@ use super::calls::{Call, answer};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
-use super::op::{Op, OpError, OpId};
+use super::op::{Op, OpError, OpId, told};
 use super::options::{RosbridgeError, RosbridgeOptions};
 use super::outbox::{Gone, Level, Outbox};
 use super::qos::Said;
@@ -163,7 +163,7 @@ impl Connection {
         if !self.patience.count(Instant::now()) {
             return Err(RosbridgeError::TooManyErrors);
         }
-        match self.outbox.status(Level::Error, &error.to_string(), id).await {
+        match self.outbox.status(Level::Error, &told(error), id).await {
             Ok(()) => Ok(()),
             Err(gone) => match gone.into() {
                 Failure::End(error) => Err(error),
@@ -214,16 +214,16 @@ impl Connection {
         };
         match authenticate(&token) {
             Ok(client) => {
-                let told = format!("you are {}", client.name);
+                let who = format!("you are {}", client.name);
                 let limits = *self.session.limits();
                 self.session = Arc::new(Session::new(self.session.hub(), client, limits));
                 self.is_admitted = true;
-                Ok(self.outbox.status(Level::Info, &told, op.id.as_ref()).await?)
+                Ok(self.outbox.status(Level::Info, &who, op.id.as_ref()).await?)
             }
             Err(why) => {
                 // Whoever guesses makes a connection for each guess.
                 let error = op.refused(why.clone());
-                self.outbox.status(Level::Error, &error.to_string(), op.id.as_ref()).await?;
+                self.outbox.status(Level::Error, &told(&error), op.id.as_ref()).await?;
                 Err(Failure::End(RosbridgeError::NotAdmitted(why)))
             }
         }
@@ -266,7 +266,12 @@ impl Connection {
                 let actual = published.publication.type_name().to_owned();
                 return Err(op.gateway(GatewayError::OtherType { name: topic, actual, wanted }).into());
             }
-            published.ids.insert(op.id.clone());
+            if !published.ids.contains(&op.id) {
+                let max = self.session.limits().publications_max;
+                let checked = self.session.check_count("advertisements of a topic", published.ids.len(), max);
+                checked.map_err(|error| op.gateway(error))?;
+                published.ids.insert(op.id.clone());
+            }
             return Ok(());
         }
         let wanted = Advertise { topic, type_name, qos };
@@ -319,7 +324,7 @@ impl Connection {
             Err(error) => Err(error),
         };
         done.map_err(|error| {
-            let (op, why) = (op.name.to_string(), format!("{topic}: {error}"));
+            let (op, why) = (op.shown(), format!("{topic}: {error}"));
             OpError::Refused { op, why }.into()
         })
     }

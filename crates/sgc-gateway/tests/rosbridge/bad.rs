@@ -228,6 +228,10 @@ async fn a_client_has_no_more_than_it_may() {
     browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
     let told = browser.told(json!({"op": "advertise", "topic": "/b", "type": STRING})).await;
     assert_eq!(told, "advertise: 1 topics that are published at most for a client");
+    // As often as it likes by the same id, and by no more ids than it may publish topics.
+    browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
+    let told = browser.told(json!({"op": "advertise", "id": 2, "topic": "/a", "type": STRING})).await;
+    assert_eq!(told, "advertise: 1 advertisements of a topic at most for a client");
     browser.send(json!({"op": "advertise_service", "service": "/a", "type": "std_srvs/Empty"})).await;
     let told =
         browser.told(json!({"op": "advertise_service", "service": "/b", "type": "std_srvs/Empty"})).await;
