@@ -9,6 +9,7 @@ use serde_json::Value as Json;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
+use super::calls::Held;
 use super::envelope::{Compression, Envelope};
 use super::input;
 use super::op::{OpId, told};
@@ -48,7 +49,7 @@ impl Wanted {
     }
 
     /// What is said if there is no outcome.
-    async fn fail(&self, why: &str, outbox: &Outbox) {
+    pub(super) async fn fail(&self, why: &str, outbox: &Outbox) {
         let failed = self.envelope("action_result", why.len()).text("values", why);
         let failed = failed.value("status", &Json::from(GoalStatus::Unknown as i8));
         let _ = outbox.say(failed.value("result", &Json::Bool(false)).finish()).await;
@@ -59,7 +60,7 @@ impl Wanted {
 pub(super) async fn pursue(
     session: Arc<Session>,
     wanted: Wanted,
-    args: String,
+    args: (String, Held),
     cancel: Arc<Notify>,
     outbox: Outbox,
 ) {
@@ -67,12 +68,14 @@ pub(super) async fn pursue(
         let (session, wanted) = (&session, &wanted);
         async move { session.send_goal(&wanted.action, wanted.type_name.as_deref(), &goal).await }
     };
-    match input::tolerate_later(&args, send).await {
+    let sent = input::tolerate_later(&args.0, send).await;
+    drop(args);
+    match sent {
         Ok((goal, feedback)) => match follow(&session, &wanted, &goal, feedback, &cancel, &outbox).await {
             Ok(()) => {}
-            Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+            Err(error) => wanted.fail(&told(&error), &outbox).await,
         },
-        Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+        Err(error) => wanted.fail(&told(&error), &outbox).await,
     }
 }
 
