@@ -9,10 +9,12 @@ use serde_json::Value as Json;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
+use super::calls::Held;
 use super::envelope::{Compression, Envelope};
 use super::input;
-use super::op::OpId;
+use super::op::{OpId, told};
 use super::outbox::{Level, Outbox};
+use super::services::next_number;
 use super::topics::fragment_id;
 use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, GoalId, GoalStatus};
 use crate::content::{Content, Form};
@@ -25,6 +27,8 @@ const OUTCOME_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
 /// How long an action may have no server before its goals are given up: one that starts anew knows them no more, but
 /// discovery may be late.
 const SERVER_GONE_MAX: Duration = Duration::from_secs(5);
+/// Feedback that is told once the outcome is there.
+const FEEDBACK_REST_MAX: usize = 1024;
 /// Goals that a client that serves has not ended; the oldest is forgotten for one more.
 const GOALS_MAX: usize = 1024;
 
@@ -45,7 +49,7 @@ impl Wanted {
     }
 
     /// What is said if there is no outcome.
-    async fn fail(&self, why: &str, outbox: &Outbox) {
+    pub(super) async fn fail(&self, why: &str, outbox: &Outbox) {
         let failed = self.envelope("action_result", why.len()).text("values", why);
         let failed = failed.value("status", &Json::from(GoalStatus::Unknown as i8));
         let _ = outbox.say(failed.value("result", &Json::Bool(false)).finish()).await;
@@ -56,7 +60,7 @@ impl Wanted {
 pub(super) async fn pursue(
     session: Arc<Session>,
     wanted: Wanted,
-    args: String,
+    args: (String, Held),
     cancel: Arc<Notify>,
     outbox: Outbox,
 ) {
@@ -64,12 +68,14 @@ pub(super) async fn pursue(
         let (session, wanted) = (&session, &wanted);
         async move { session.send_goal(&wanted.action, wanted.type_name.as_deref(), &goal).await }
     };
-    match input::tolerate_later(&args, send).await {
+    let sent = input::tolerate_later(&args.0, send).await;
+    drop(args);
+    match sent {
         Ok((goal, feedback)) => match follow(&session, &wanted, &goal, feedback, &cancel, &outbox).await {
             Ok(()) => {}
-            Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+            Err(error) => wanted.fail(&told(&error), &outbox).await,
         },
-        Err(error) => wanted.fail(&error.to_string(), &outbox).await,
+        Err(error) => wanted.fail(&told(&error), &outbox).await,
     }
 }
 
@@ -88,21 +94,28 @@ async fn follow(
     let outcome = loop {
         tokio::select! {
             biased;
+            () = cancel.notified() => give_up(wanted, goal, outbox).await,
+            outcome = &mut outcome => break outcome?,
             Some(said) = feedback.next(form), if wanted.has_feedback => {
-                tell(wanted, said, outbox).await;
-            }
-            () = cancel.notified() => {
-                if let Err(error) = goal.cancel().await {
-                    let told = format!("cancel_action_goal: {error}");
-                    let _ = outbox.status(Level::Error, &told, wanted.id.as_ref()).await;
+                let telling = tell(wanted, said, outbox);
+                tokio::pin!(telling);
+                // A client that does not take what it is told can give it up all the same.
+                loop {
+                    tokio::select! {
+                        biased;
+                        () = cancel.notified() => give_up(wanted, goal, outbox).await,
+                        () = &mut telling => break,
+                    }
                 }
             }
-            outcome = &mut outcome => break outcome?,
             () = &mut gone => return Err(GatewayError::NoServer { name: wanted.action.clone() }),
         }
     };
     // What was said of it before comes first.
-    while let Some(Some(said)) = feedback.next(form).now_or_never().filter(|_| wanted.has_feedback) {
+    for _ in 0..FEEDBACK_REST_MAX {
+        let Some(Some(said)) = feedback.next(form).now_or_never().filter(|_| wanted.has_feedback) else {
+            break;
+        };
         tell(wanted, said, outbox).await;
     }
     let result = wanted
@@ -112,6 +125,13 @@ async fn follow(
         .value("result", &Json::Bool(true));
     let _ = outbox.say(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await;
     Ok(())
+}
+
+async fn give_up(wanted: &Wanted, goal: &Goal, outbox: &Outbox) {
+    if let Err(error) = goal.cancel().await {
+        // Nothing is waited for here: it may be that the client takes nothing.
+        outbox.try_status(Level::Error, &told(&format!("cancel_action_goal: {error}")), wanted.id.as_ref());
+    }
 }
 
 async fn tell(wanted: &Wanted, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
@@ -141,12 +161,8 @@ async fn server_gone(session: &Session, action: &str) {
     }
 }
 
-/// Goals of an action that were passed on to a client.
-#[derive(Debug, Default)]
-struct Goals {
-    next: u64,
-    ids: BTreeMap<u64, GoalId>,
-}
+/// Goals of an action that were passed on to a client, by their number.
+type Goals = BTreeMap<u64, GoalId>;
 
 /// An action that a client serves; ends when dropped.
 #[derive(Debug)]
@@ -184,13 +200,13 @@ impl ServedAction {
 
     /// The goal of an id.
     pub(super) fn goal(&self, id: Option<&OpId>) -> Option<GoalId> {
-        lock(&self.goals).ids.get(&self.number(id)?).copied()
+        lock(&self.goals).get(&self.number(id)?).copied()
     }
 
     /// A goal has ended.
     pub(super) fn forget(&self, id: Option<&OpId>) {
         if let Some(number) = self.number(id) {
-            lock(&self.goals).ids.remove(&number);
+            lock(&self.goals).remove(&number);
         }
     }
 }
@@ -237,16 +253,15 @@ impl Told {
 
     fn remember(&self, id: GoalId) -> u64 {
         let mut goals = lock(&self.goals);
-        let number = goals.next;
-        goals.next += 1;
-        goals.ids.insert(number, id);
-        if goals.ids.len() > GOALS_MAX {
-            goals.ids.pop_first();
+        let number = next_number();
+        goals.insert(number, id);
+        if goals.len() > GOALS_MAX {
+            goals.pop_first();
         }
         number
     }
 
     fn number_of(&self, id: &GoalId) -> Option<u64> {
-        lock(&self.goals).ids.iter().find(|(_, known)| *known == id).map(|(number, _)| *number)
+        lock(&self.goals).iter().find(|(_, known)| *known == id).map(|(number, _)| *number)
     }
 }

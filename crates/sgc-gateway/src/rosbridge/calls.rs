@@ -1,13 +1,14 @@
 //! [`Call`]: a service that a client calls, on the network or of the gateway's own `rosapi`.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use serde_json::Value as Json;
 
 use super::envelope::{Compression, Envelope};
 use super::input;
-use super::op::OpId;
+use super::op::{OpId, told};
 use super::options::RosbridgeOptions;
 use super::outbox::Outbox;
 use super::rosapi::{RosApi, local_name};
@@ -26,6 +27,39 @@ pub(super) struct Call {
     pub(super) max: Duration,
     pub(super) fragment_size: Option<usize>,
     pub(super) compression: Compression,
+}
+
+/// Bytes of arguments that wait, until dropped.
+#[derive(Debug)]
+pub(super) struct Held {
+    waiting: Arc<AtomicUsize>,
+    bytes: usize,
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.waiting.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
+}
+
+impl Held {
+    /// Refuses what is too much beside what waits already; alone, arguments may be of any length.
+    pub(super) fn new(waiting: &Arc<AtomicUsize>, bytes: usize, max: usize) -> Result<Self, GatewayError> {
+        let now = waiting.load(Ordering::Relaxed);
+        if now > 0 && now.saturating_add(bytes) > max {
+            return Err(GatewayError::TooMany { what: "bytes of arguments that wait", max });
+        }
+        // Only the connection adds, and one op after the other.
+        waiting.fetch_add(bytes, Ordering::Relaxed);
+        Ok(Self { waiting: Arc::clone(waiting), bytes })
+    }
+}
+
+/// What is answered to a call that is refused before it begins.
+pub(super) async fn refuse(id: &OpId, service: &str, why: &str, outbox: &Outbox) {
+    let refused = Envelope::json("service_response").id(Some(id)).text("service", service);
+    let refused = refused.text("values", why).value("result", &Json::Bool(false));
+    let _ = outbox.say(refused.finish()).await;
 }
 
 /// Calls it and tells what came of it.
@@ -49,10 +83,10 @@ pub(super) async fn answer(
     };
     let (answered, is_done) = match own {
         Some(Ok(values)) => (envelope(0).value("values", &values), true),
-        Some(Err(why)) => (envelope(0).text("values", &why), false),
+        Some(Err(why)) => (envelope(0).text("values", &told(&why)), false),
         None => match on_network(&session, &call).await {
             Ok(values) => (envelope(values.len()).content("values", &values), true),
-            Err(error) => (envelope(0).text("values", &error.to_string()), false),
+            Err(error) => (envelope(0).text("values", &told(&error)), false),
         },
     };
     let answered = answered.value("result", &Json::Bool(is_done));
@@ -69,4 +103,21 @@ async fn on_network(session: &Session, call: &Call) -> Result<bytes::Bytes, Gate
     let ask =
         |request: Content| async move { session.call(service, type_name, &request, form, call.max).await };
     input::tolerate_later(&args, ask).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arguments_wait_within_a_bound_and_are_given_back() {
+        let waiting: Arc<AtomicUsize> = Arc::default();
+        let first = Held::new(&waiting, 100, 10).unwrap();
+        assert!(matches!(Held::new(&waiting, 1, 10), Err(GatewayError::TooMany { max: 10, .. })));
+        drop(first);
+        let held = [Held::new(&waiting, 4, 10).unwrap(), Held::new(&waiting, 6, 10).unwrap()];
+        assert!(Held::new(&waiting, 1, 10).is_err());
+        drop(held);
+        assert_eq!(waiting.load(Ordering::Relaxed), 0);
+    }
 }

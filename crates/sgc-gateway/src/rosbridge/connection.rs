@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use tokio::sync::Notify;
@@ -9,11 +10,11 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use super::actions::{ServedAction, Wanted, pursue};
-use super::calls::{Call, answer};
+use super::calls::{Call, Held, answer, refuse};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
-use super::op::{Op, OpError, OpId};
+use super::op::{Op, OpError, OpId, told};
 use super::options::{RosbridgeError, RosbridgeOptions};
 use super::outbox::{Gone, Level, Outbox};
 use super::qos::Said;
@@ -24,7 +25,7 @@ use crate::action::GoalStatus;
 use crate::content::Content;
 use crate::error::GatewayError;
 use crate::publisher::Publication;
-use crate::session::{Advertise, Session, Subscribe};
+use crate::session::{Advertise, Session, Subscribe, action_of};
 use crate::types::InterfaceType;
 
 /// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
@@ -78,6 +79,8 @@ pub(super) struct Connection {
     goals: BTreeMap<OpId, Arc<Notify>>,
     /// Calls and goals under way; ended with the connection.
     tasks: JoinSet<Option<OpId>>,
+    /// Bytes of arguments of these, until they are sent.
+    waiting: Arc<AtomicUsize>,
     fragments: Fragments,
     patience: Patience,
 }
@@ -119,6 +122,7 @@ impl Connection {
             actions: BTreeMap::new(),
             goals: BTreeMap::new(),
             tasks: JoinSet::new(),
+            waiting: Arc::default(),
             fragments,
             patience: Patience::new(),
         }
@@ -163,7 +167,7 @@ impl Connection {
         if !self.patience.count(Instant::now()) {
             return Err(RosbridgeError::TooManyErrors);
         }
-        match self.outbox.status(Level::Error, &error.to_string(), id).await {
+        match self.outbox.status(Level::Error, &told(error), id).await {
             Ok(()) => Ok(()),
             Err(gone) => match gone.into() {
                 Failure::End(error) => Err(error),
@@ -214,19 +218,30 @@ impl Connection {
         };
         match authenticate(&token) {
             Ok(client) => {
-                let told = format!("you are {}", client.name);
+                let who = format!("you are {}", client.name);
                 let limits = *self.session.limits();
                 self.session = Arc::new(Session::new(self.session.hub(), client, limits));
                 self.is_admitted = true;
-                Ok(self.outbox.status(Level::Info, &told, op.id.as_ref()).await?)
+                self.end_what_is_not_permitted();
+                Ok(self.outbox.status(Level::Info, &who, op.id.as_ref()).await?)
             }
             Err(why) => {
                 // Whoever guesses makes a connection for each guess.
                 let error = op.refused(why.clone());
-                self.outbox.status(Level::Error, &error.to_string(), op.id.as_ref()).await?;
+                self.outbox.status(Level::Error, &told(&error), op.id.as_ref()).await?;
                 Err(Failure::End(RosbridgeError::NotAdmitted(why)))
             }
         }
+    }
+
+    /// Ends what a client has that it may not have, now that it is another.
+    fn end_what_is_not_permitted(&mut self) {
+        let session = &self.session;
+        let may = |right, name: &str| session.check(right, name).is_ok();
+        self.topics.retain(|name, _| may(Right::Subscribe, name));
+        self.publications.retain(|name, _| may(Right::Publish, name));
+        self.services.retain(|name, _| may(Right::Serve, action_of(name)));
+        self.actions.retain(|name, _| may(Right::Serve, name));
     }
 
     fn set_level(&mut self, op: &Op<'_>) -> Done {
@@ -266,7 +281,12 @@ impl Connection {
                 let actual = published.publication.type_name().to_owned();
                 return Err(op.gateway(GatewayError::OtherType { name: topic, actual, wanted }).into());
             }
-            published.ids.insert(op.id.clone());
+            if !published.ids.contains(&op.id) {
+                let max = self.session.limits().publications_max;
+                let checked = self.session.check_count("advertisements of a topic", published.ids.len(), max);
+                checked.map_err(|error| op.gateway(error))?;
+                published.ids.insert(op.id.clone());
+            }
             return Ok(());
         }
         let wanted = Advertise { topic, type_name, qos };
@@ -319,7 +339,7 @@ impl Connection {
             Err(error) => Err(error),
         };
         done.map_err(|error| {
-            let (op, why) = (op.name.to_string(), format!("{topic}: {error}"));
+            let (op, why) = (op.shown(), format!("{topic}: {error}"));
             OpError::Refused { op, why }.into()
         })
     }
@@ -380,7 +400,19 @@ impl Connection {
         Ok(())
     }
 
+    /// A call that is refused before it begins is answered, too: who has made it waits for that.
     async fn call_service(&mut self, op: &Op<'_>) -> Done {
+        let begun = self.begin_call(op);
+        if let (Err(error), Some(id)) = (&begun, &op.id) {
+            let service = op.name("service").ok().flatten().unwrap_or_default();
+            refuse(id, &service, &told(error), &self.outbox).await;
+        }
+        Ok(begun?)
+    }
+
+    fn begin_call(&mut self, op: &Op<'_>) -> Result<(), OpError> {
+        self.check_tasks(op)?;
+        let held = self.hold(op)?;
         let call = Call {
             id: op.id.clone(),
             service: op.needed_name("service")?,
@@ -394,11 +426,11 @@ impl Connection {
                 Compression::Cbor | Compression::CborRaw => Compression::Cbor,
             },
         };
-        self.check_tasks(op)?;
         let (session, options) = (Arc::clone(&self.session), Arc::clone(&self.options));
         let outbox = self.outbox.clone();
         self.tasks.spawn(async move {
             answer(session, options, call, outbox).await;
+            drop(held);
             None
         });
         Ok(())
@@ -409,6 +441,13 @@ impl Connection {
         let max = self.session.limits().calls_max;
         let checked = self.session.check_count("calls and goals under way", self.tasks.len(), max);
         checked.map_err(|error| op.gateway(error))
+    }
+
+    /// There is a bound on the bytes of their arguments, too.
+    fn hold(&self, op: &Op<'_>) -> Result<Held, OpError> {
+        let bytes = op.raw("args").map_or(0, str::len);
+        let held = Held::new(&self.waiting, bytes, self.session.limits().waiting_bytes_max);
+        held.map_err(|error| op.gateway(error))
     }
 
     async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
@@ -467,7 +506,31 @@ impl Connection {
         Ok(())
     }
 
+    /// A goal that is refused before it is sent has an outcome, too: who has sent it waits for that.
     async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
+        let is_known = op.id.as_ref().is_some_and(|id| self.goals.contains_key(id));
+        if is_known {
+            // An outcome would be taken for that of the other.
+            return Err(op.refused("a goal of that id is under way").into());
+        }
+        let begun = self.begin_goal(op);
+        if let (Err(error), Some(_)) = (&begun, &op.id) {
+            let wanted = Wanted {
+                id: op.id.clone(),
+                action: op.name("action").ok().flatten().unwrap_or_default(),
+                type_name: None,
+                has_feedback: false,
+                fragment_size: None,
+                compression: Compression::None,
+            };
+            wanted.fail(&told(error), &self.outbox).await;
+        }
+        Ok(begun?)
+    }
+
+    fn begin_goal(&mut self, op: &Op<'_>) -> Result<(), OpError> {
+        self.check_tasks(op)?;
+        let held = self.hold(op)?;
         let action = op.needed_name("action")?;
         let type_name = match op.name("action_type")? {
             Some(name) => Some(name),
@@ -484,10 +547,6 @@ impl Connection {
                 Compression::Cbor | Compression::CborRaw => Compression::Cbor,
             },
         };
-        if op.id.as_ref().is_some_and(|id| self.goals.contains_key(id)) {
-            return Err(op.refused("a goal of that id is under way").into());
-        }
-        self.check_tasks(op)?;
         let layout = || {
             let of = self.session.action_type(&wanted.action, wanted.type_name.as_deref())?;
             self.session.hub().types().layout(&format!("{of}_Goal"), None)
@@ -500,7 +559,7 @@ impl Connection {
         }
         let (session, outbox) = (Arc::clone(&self.session), self.outbox.clone());
         self.tasks.spawn(async move {
-            pursue(session, wanted, args, cancel, outbox).await;
+            pursue(session, wanted, (args, held), cancel, outbox).await;
             id
         });
         Ok(())

@@ -14,6 +14,10 @@ use sgc_cdr::{Layout, Value};
 use crate::content::Content;
 use crate::error::GatewayError;
 
+/// Values of a text that is read again, at most, as far as its commas and brackets tell: each takes far more memory than
+/// it has bytes.
+const VALUES_MAX: usize = 1 << 20;
+
 /// A message of a topic. If its type begins with a header whose stamp is left out, that is now.
 pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError> {
     let mut value = tolerate(raw, |raw| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value))?;
@@ -69,8 +73,12 @@ pub(super) fn arguments(
     Ok(format!("{{{}}}", members.collect::<Vec<_>>().join(",")))
 }
 
-/// The same JSON with `secs` and `nsecs` as ROS 2 calls them, and without stamps that are null. None if there are none.
+/// The same JSON with `secs` and `nsecs` as ROS 2 calls them, and without stamps that are null. None if there are none, or
+/// it has more than [`VALUES_MAX`] values.
 fn of_ros_1(raw: &str) -> Option<String> {
+    if raw.bytes().filter(|byte| matches!(byte, b',' | b'[' | b'{')).nth(VALUES_MAX).is_some() {
+        return None;
+    }
     let mut value: Json = serde_json::from_str(raw).ok()?;
     rename(&mut value).then(|| value.to_string())
 }
@@ -154,6 +162,9 @@ mod tests {
         let read = message(&layout, raw).unwrap();
         assert_eq!(read.at("header.stamp.sec"), Some(Value::Int(3)));
         assert_eq!(read.at("header.stamp.nanosec"), Some(Value::Uint(4)));
+        // Not in what has a great many values.
+        let many = format!(r#"{{"secs":3,"a":[0{}]}}"#, ",0".repeat(VALUES_MAX));
+        assert_eq!((of_ros_1(&many), of_ros_1(r#"{"secs":3}"#)), (None, Some(r#"{"sec":3}"#.to_owned())));
         // Members that only look like it stay wrong.
         let wrong = message(&layout, r#"{"point":{"secs":1,"x":2}}"#).unwrap_err();
         assert_eq!(wrong.to_string(), "not a message of that type: point: there is no member \"secs\"");

@@ -6,6 +6,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, Visitor};
 use serde_json::value::RawValue;
 
 use crate::error::GatewayError;
@@ -14,6 +15,12 @@ use crate::error::GatewayError;
 const ID_BYTES_MAX: usize = 1024;
 /// Longest name of a topic, a type or anything else, bytes: names are echoed, too.
 const NAME_BYTES_MAX: usize = 1024;
+/// Members of an op: the most that one has is a dozen.
+const MEMBERS_MAX: usize = 64;
+/// Longest name of an op that is echoed whole, bytes.
+const OP_BYTES_MAX: usize = 64;
+/// Longest text that a client is told of an error, bytes: several names fit in.
+const TOLD_BYTES_MAX: usize = 4096;
 /// Characters of what somebody wrote that are shown.
 const SHOWN_MAX: usize = 80;
 /// Longest time that a client can say, seconds.
@@ -42,6 +49,8 @@ pub(super) enum OpError {
     NotJson(String),
     #[error("not an object with a member \"op\"")]
     NoOp,
+    #[error("an object with more than {MEMBERS_MAX} members")]
+    TooManyMembers,
     #[error("there is no op {0:?}")]
     UnknownOp(String),
     #[error("{op}: {member:?} is missing")]
@@ -64,12 +73,49 @@ pub(super) struct Op<'a> {
     members: BTreeMap<Cow<'a, str>, &'a RawValue>,
 }
 
+/// The members of an object, no more than [`MEMBERS_MAX`].
+struct Members<'a>(BTreeMap<Cow<'a, str>, &'a RawValue>);
+
+impl<'de: 'a, 'a> Deserialize<'de> for Members<'a> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Reader;
+
+        impl<'de> Visitor<'de> for Reader {
+            type Value = BTreeMap<Cow<'de, str>, &'de RawValue>;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("an object")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
+                let mut members = BTreeMap::new();
+                // Members that come twice count, too.
+                let mut count = 0;
+                while let Some((key, value)) = map.next_entry::<Cow<'de, str>, &'de RawValue>()? {
+                    count += 1;
+                    if count > MEMBERS_MAX {
+                        return Err(A::Error::custom(OpError::TooManyMembers));
+                    }
+                    members.insert(key, value);
+                }
+                Ok(members)
+            }
+        }
+
+        deserializer.deserialize_map(Reader).map(Members)
+    }
+}
+
 impl<'a> Op<'a> {
     /// Reads the members, and none of their values but the op and its id.
     pub(super) fn parse(text: &'a str) -> Result<Self, OpError> {
-        let members: BTreeMap<Cow<'a, str>, &'a RawValue> = serde_json::from_str(text).map_err(|error| {
+        let Members(members) = serde_json::from_str(text).map_err(|error| {
             let is_object = text.trim_start().starts_with('{');
-            if error.is_data() && !is_object { OpError::NoOp } else { OpError::NotJson(error.to_string()) }
+            match (error.is_data(), is_object) {
+                (true, true) => OpError::TooManyMembers,
+                (true, false) => OpError::NoOp,
+                (false, _) => OpError::NotJson(error.to_string()),
+            }
         })?;
         let name = members.get("op").and_then(|name| text_of(name)).ok_or(OpError::NoOp)?;
         let mut op = Self { name, id: None, members };
@@ -87,20 +133,25 @@ impl<'a> Op<'a> {
         Ok(Some(OpId::Text(text.into())))
     }
 
+    /// Its name as it is echoed.
+    pub(super) fn shown(&self) -> String {
+        clip(&self.name, OP_BYTES_MAX)
+    }
+
     fn no(&self, member: &'static str, expected: &'static str, found: &str) -> OpError {
-        OpError::Kind { op: self.name.to_string(), member, expected, found: short(found) }
+        OpError::Kind { op: self.shown(), member, expected, found: short(found) }
     }
 
     pub(super) fn refused(&self, why: impl Into<String>) -> OpError {
-        OpError::Refused { op: self.name.to_string(), why: why.into() }
+        OpError::Refused { op: self.shown(), why: why.into() }
     }
 
     pub(super) fn gateway(&self, source: GatewayError) -> OpError {
-        OpError::Gateway { op: self.name.to_string(), source: Box::new(source) }
+        OpError::Gateway { op: self.shown(), source: Box::new(source) }
     }
 
     fn missing(&self, member: &'static str) -> OpError {
-        OpError::Missing { op: self.name.to_string(), member }
+        OpError::Missing { op: self.shown(), member }
     }
 
     /// A member as it was sent; `null` is none.
@@ -117,9 +168,7 @@ impl<'a> Op<'a> {
     /// A text that is no longer than a name can be.
     pub(super) fn name(&self, member: &'static str) -> Result<Option<String>, OpError> {
         match self.text(member)? {
-            Some(name) if name.len() > NAME_BYTES_MAX => {
-                Err(OpError::TooLong { op: self.name.to_string(), member })
-            }
+            Some(name) if name.len() > NAME_BYTES_MAX => Err(OpError::TooLong { op: self.shown(), member }),
             name => Ok(name),
         }
     }
@@ -188,6 +237,20 @@ fn text_of<'a>(raw: &'a RawValue) -> Option<Cow<'a, str>> {
     }
 }
 
+/// What a client is told of an error.
+pub(super) fn told(error: &impl fmt::Display) -> String {
+    clip(&error.to_string(), TOLD_BYTES_MAX)
+}
+
+/// The beginning of a text.
+fn clip(text: &str, bytes_max: usize) -> String {
+    if text.len() <= bytes_max {
+        return text.to_owned();
+    }
+    let end = (0..=bytes_max).rev().find(|end| text.is_char_boundary(*end)).unwrap_or(0);
+    format!("{}…", text.get(..end).unwrap_or_default())
+}
+
 pub(super) fn short(text: &str) -> String {
     let mut shown: String = text.chars().take(SHOWN_MAX).collect();
     if shown.len() < text.len() {
@@ -231,6 +294,18 @@ mod tests {
     }
 
     #[test]
+    fn what_is_echoed_is_short() {
+        let text = format!(r#"{{"op":"{}","n":"{}"}}"#, "ä".repeat(10_000), "x".repeat(10_000));
+        let op = Op::parse(&text).unwrap();
+        let errors =
+            [op.count("n").unwrap_err(), op.needed_name("topic").unwrap_err(), op.name("n").unwrap_err()];
+        for error in errors.into_iter().chain([op.refused("no")]) {
+            assert!(error.to_string().len() < 500, "{error}");
+        }
+        assert!(told(&op.refused("ä".repeat(10_000))).len() <= TOLD_BYTES_MAX + "…".len());
+    }
+
+    #[test]
     fn what_is_no_op_is_told_as_such() {
         for wrong in ["[]", "3", "null", "{}", r#"{"op":3}"#] {
             assert_eq!(Op::parse(wrong).unwrap_err(), OpError::NoOp, "{wrong}");
@@ -241,6 +316,12 @@ mod tests {
         let deep = format!(r#"{{"op":"x","msg":{}{}}}"#, "[".repeat(100_000), "]".repeat(100_000));
         assert!(Op::parse(&deep).is_ok());
         assert!(Op::parse(r#"{"op":"x","id":1.5}"#).is_err());
+        let of_members = |count: usize| {
+            let more: String = (1..count).map(|n| format!(",\"m{}\":0", n % 50)).collect();
+            format!(r#"{{"op":"x"{more}}}"#)
+        };
+        assert!(Op::parse(&of_members(MEMBERS_MAX)).is_ok());
+        assert_eq!(Op::parse(&of_members(MEMBERS_MAX + 1)).unwrap_err(), OpError::TooManyMembers);
         assert_eq!(Op::parse(r#"{"op":"x","id":7}"#).unwrap().id, Some(OpId::Number(7)));
     }
 }

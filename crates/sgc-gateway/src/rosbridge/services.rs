@@ -2,6 +2,7 @@
 //! `service_response`.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use sgc_ros::RequestId;
@@ -18,10 +19,13 @@ use crate::service::{Replier, Serving};
 const PENDING_MAX: usize = 1024;
 
 /// Requests that were passed on, by their number.
-#[derive(Debug, Default)]
-struct Pending {
-    next: u64,
-    asked: BTreeMap<u64, RequestId>,
+type Pending = BTreeMap<u64, RequestId>;
+
+/// A number for what is passed on to a client, which nothing else of the process has: what is answered too late is of
+/// nothing that waits.
+pub(super) fn next_number() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 /// A service that a client serves; ends when dropped.
@@ -59,13 +63,13 @@ impl Served {
 
     /// The request that an answer is for.
     pub(super) fn request(&self, id: Option<&OpId>) -> Option<RequestId> {
-        lock(&self.pending).asked.get(&self.number(id)?).copied()
+        lock(&self.pending).get(&self.number(id)?).copied()
     }
 
     /// A request has its answer.
     pub(super) fn answered(&self, id: Option<&OpId>) {
         if let Some(number) = self.number(id) {
-            lock(&self.pending).asked.remove(&number);
+            lock(&self.pending).remove(&number);
         }
     }
 }
@@ -82,11 +86,10 @@ async fn ask(mut serving: Serving, pending: Arc<Mutex<Pending>>, prefix: Arc<str
         };
         let number = {
             let mut pending = lock(&pending);
-            let number = pending.next;
-            pending.next += 1;
-            pending.asked.insert(number, request.id);
-            if pending.asked.len() > PENDING_MAX {
-                pending.asked.pop_first();
+            let number = next_number();
+            pending.insert(number, request.id);
+            if pending.len() > PENDING_MAX {
+                pending.pop_first();
             }
             number
         };

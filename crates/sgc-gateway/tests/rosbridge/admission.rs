@@ -48,6 +48,32 @@ async fn nothing_is_taken_before_a_token_is_shown() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_becomes_another_keeps_what_that_one_may_have() {
+    let site = Site::new().await;
+    let options = RosbridgeOptions { is_token_needed: false, ..options() };
+    let mut browser = connect(site.session("desk"), options).await;
+    browser.subscribe("/odom").await;
+    browser.subscribe("/secret").await;
+    browser.send(json!({"op": "advertise", "topic": "/odom", "type": STRING})).await;
+    browser.send(json!({"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"})).await;
+    browser.settle().await;
+    browser.send(json!({"op": "auth", "token": "right"})).await;
+    for (op, told) in [
+        (json!({"op": "unsubscribe", "topic": "/secret"}), "/secret is not subscribed to"),
+        (json!({"op": "unadvertise", "topic": "/odom"}), "/odom is not advertised"),
+        (json!({"op": "unadvertise_service", "service": "/s"}), "/s is not served"),
+    ] {
+        let (why, op_name) = (browser.told(op.clone()).await, op["op"].as_str().unwrap().to_owned());
+        assert_eq!(why, format!("{op_name}: {told} by this client"));
+    }
+    let talker = site.writer("/odom", Qos::default());
+    site.knows("/odom").await;
+    talker.write(SampleKind::Write, 1, string("here")).unwrap();
+    browser.send(json!({"op": "unsubscribe", "topic": "/odom"})).await;
+    browser.settle_amid().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_wrong_token_ends_the_connection() {
     let site = Site::new().await;
     let mut browser = connect(site.session("nobody"), options()).await;

@@ -228,6 +228,10 @@ async fn a_client_has_no_more_than_it_may() {
     browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
     let told = browser.told(json!({"op": "advertise", "topic": "/b", "type": STRING})).await;
     assert_eq!(told, "advertise: 1 topics that are published at most for a client");
+    // As often as it likes by the same id, and by no more ids than it may publish topics.
+    browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
+    let told = browser.told(json!({"op": "advertise", "id": 2, "topic": "/a", "type": STRING})).await;
+    assert_eq!(told, "advertise: 1 advertisements of a topic at most for a client");
     browser.send(json!({"op": "advertise_service", "service": "/a", "type": "std_srvs/Empty"})).await;
     let told =
         browser.told(json!({"op": "advertise_service", "service": "/b", "type": "std_srvs/Empty"})).await;
@@ -238,4 +242,15 @@ async fn a_client_has_no_more_than_it_may() {
     }
     let told = browser.told(json!({"op": "call_service", "service": "/silent"})).await;
     assert_eq!(told, "call_service: 2 calls and goals under way at most for a client");
+    // Who waits for an answer by its id has one.
+    for (op, member, answer) in
+        [("call_service", "service", "service_response"), ("send_action_goal", "action", "action_result")]
+    {
+        browser.send(json!({"op": op, "id": "c", member: "/silent"})).await;
+        let answered = browser.next().await;
+        let why = format!("{op}: 2 calls and goals under way at most for a client");
+        assert_eq!((&answered["op"], &answered["id"]), (&json!(answer), &json!("c")));
+        assert_eq!((&answered["values"], &answered["result"]), (&json!(why), &json!(false)));
+        assert_eq!(browser.status().await, (why, json!("c")));
+    }
 }
