@@ -1,7 +1,7 @@
 //! [`Door`]: who comes in, whatever protocol it speaks; and whether those who are in may stay.
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,13 +10,19 @@ use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_trust::{TrustAnchors, VerifiedPeer};
 use sgc_wire::UnixMillis;
-use tokio::sync::watch;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use crate::access::{Access, Admission, Client, Denied};
 use crate::hub::lock;
 
 /// How often it is looked whether a client may stay whose time has no end that a timer could wait for: clocks are set.
 const LOOK_AGAIN_MAX: Duration = Duration::from_secs(60);
+/// Connections of other hosts that may be in their handshake at a time.
+const HANDSHAKES_MAX: usize = 128;
+/// The same of one of them.
+const HANDSHAKES_OF_HOST_MAX: usize = 16;
+/// The same of programs of this host: nobody else takes these.
+const HANDSHAKES_LOCAL_MAX: usize = 128;
 /// Longest token that is looked at, bytes.
 const TOKEN_BYTES_MAX: usize = 32 << 10;
 
@@ -170,7 +176,91 @@ impl Door {
     }
 }
 
+/// How many connections have not shown yet who they are: of this host, of others, and of each of those.
+#[derive(Debug)]
+pub(crate) struct Handshakes {
+    local: Arc<Semaphore>,
+    others: Arc<Semaphore>,
+    of_host: Mutex<BTreeMap<IpAddr, usize>>,
+}
+
+/// One connection of these, until dropped.
+#[derive(Debug)]
+pub(crate) struct Handshake {
+    handshakes: Arc<Handshakes>,
+    /// Whose, if not this host's.
+    host: Option<IpAddr>,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl Default for Handshakes {
+    fn default() -> Self {
+        let [local, others] = [HANDSHAKES_LOCAL_MAX, HANDSHAKES_MAX].map(|max| Arc::new(Semaphore::new(max)));
+        Self { local, others, of_host: Mutex::default() }
+    }
+}
+
+impl Handshakes {
+    /// Counts one from there, unless there are too many.
+    pub(crate) fn begin(this: &Arc<Self>, from: IpAddr) -> Option<Handshake> {
+        let from = from.to_canonical();
+        let handshakes = Arc::clone(this);
+        if from.is_loopback() {
+            let _permit = Arc::clone(&this.local).try_acquire_owned().ok()?;
+            return Some(Handshake { handshakes, host: None, _permit });
+        }
+        let mut of_host = lock(&this.of_host);
+        if of_host.get(&from).is_some_and(|count| *count >= HANDSHAKES_OF_HOST_MAX) {
+            return None;
+        }
+        let _permit = Arc::clone(&this.others).try_acquire_owned().ok()?;
+        *of_host.entry(from).or_default() += 1;
+        Some(Handshake { handshakes, host: Some(from), _permit })
+    }
+}
+
+impl Drop for Handshake {
+    fn drop(&mut self) {
+        let Some(host) = self.host else { return };
+        let mut of_host = lock(&self.handshakes.of_host);
+        let left = of_host.get(&host).map_or(0, |count| count.saturating_sub(1));
+        if left == 0 {
+            of_host.remove(&host);
+        } else {
+            of_host.insert(host, left);
+        }
+    }
+}
+
 pub(crate) fn now() -> UnixMillis {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     UnixMillis(since.map_or(0, |since| since.as_millis().try_into().unwrap_or(u64::MAX)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn silent_hosts_lock_out_neither_others_nor_programs_of_this_one() {
+        let handshakes: Arc<Handshakes> = Arc::default();
+        let host = |n: u8| IpAddr::from([192, 0, 2, n]);
+        let begin = |from| Handshakes::begin(&handshakes, from);
+        let mut held: Vec<_> = std::iter::from_fn(|| begin(host(1))).collect();
+        assert_eq!(held.len(), HANDSHAKES_OF_HOST_MAX);
+        held.pop();
+        held.push(begin("::ffff:192.0.2.1".parse().unwrap()).unwrap());
+        assert!(begin(host(1)).is_none());
+        for n in 2.. {
+            let of_host: Vec<_> = std::iter::from_fn(|| begin(host(n))).collect();
+            if of_host.is_empty() {
+                break;
+            }
+            held.extend(of_host);
+        }
+        assert_eq!(held.len(), HANDSHAKES_MAX);
+        assert!(begin([127, 0, 0, 1].into()).is_some() && begin("::1".parse().unwrap()).is_some());
+        held.clear();
+        assert!(begin(host(200)).is_some() && lock(&handshakes.of_host).is_empty());
+    }
 }

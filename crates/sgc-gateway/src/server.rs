@@ -13,13 +13,14 @@ use rustls::sign::CertifiedKey;
 use sgc_trust::TrustAnchors;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
+use tokio::time::{Instant, Sleep};
 use tokio_rustls::TlsAcceptor;
 use tokio_stream::wrappers::ReceiverStream;
 
 use crate::access::Access;
-use crate::door::{Arrival, Door, GatewayStatus, Place, now};
+use crate::door::{Arrival, Door, GatewayStatus, Handshake, Handshakes, Place, now};
 use crate::foxglove;
 use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
@@ -28,10 +29,8 @@ use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
 use crate::ws::upgrade;
 
-/// How long TLS and the upgrade may take together.
+/// How long TLS and the upgrade may take together; of gRPC, TLS and the first call that is admitted.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
-/// Connections that may be in their handshake at a time.
-const HANDSHAKES_MAX: usize = 128;
 /// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 /// Connections that wait to be served by gRPC.
@@ -117,7 +116,7 @@ struct Shared {
     tls: watch::Sender<Option<Tls>>,
     limits: SessionLimits,
     foxglove: foxglove::Options,
-    handshakes: Semaphore,
+    handshakes: Arc<Handshakes>,
     grpc: mpsc::Sender<Accepted<Placed>>,
 }
 
@@ -126,10 +125,65 @@ trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
 
-/// A stream of bytes whose client has a place while it lasts.
+/// A stream of bytes of gRPC: its client has a place from the first call that is admitted, and has to make it in time.
 struct Placed {
     stream: Box<dyn Bytes>,
-    _place: Place,
+    standing: Standing,
+}
+
+/// How far a client of gRPC has come.
+enum Standing {
+    /// It has not shown yet who it is.
+    Unproven(Unproven),
+    /// It was admitted.
+    Proven(#[expect(dead_code, reason = "it is for its end")] Place),
+    /// It has to go; it was counted why.
+    Refused,
+}
+
+struct Unproven {
+    door: Arc<Door>,
+    connection: Connection,
+    deadline: Pin<Box<Sleep>>,
+    _handshake: Handshake,
+}
+
+impl Placed {
+    fn new(
+        stream: Box<dyn Bytes>,
+        door: Arc<Door>,
+        connection: Connection,
+        deadline: Instant,
+        handshake: Handshake,
+    ) -> Self {
+        let deadline = Box::pin(tokio::time::sleep_until(deadline));
+        let unproven = Unproven { door, connection, deadline, _handshake: handshake };
+        Self { stream, standing: Standing::Unproven(unproven) }
+    }
+
+    /// Fails once the client may not stay. To be asked before reading as before writing: who does not read what it is
+    /// sent is not read from either.
+    fn check(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+        let unproven = match &mut self.standing {
+            Standing::Proven(_) => return Ok(()),
+            Standing::Refused => return Err(io::ErrorKind::ConnectionAborted.into()),
+            Standing::Unproven(unproven) => unproven,
+        };
+        let Unproven { door, connection, deadline, .. } = unproven;
+        let (standing, result) = if let Some(name) = connection.admitted_name() {
+            match door.enter(&name, "grpc", connection.peer()) {
+                Some(place) => (Standing::Proven(place), Ok(())),
+                None => (Standing::Refused, Err(io::Error::other("too many clients"))),
+            }
+        } else if deadline.as_mut().poll(cx).is_ready() {
+            door.count("handshake too slow");
+            (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
+        } else {
+            return Ok(());
+        };
+        self.standing = standing;
+        result
+    }
 }
 
 impl AsyncRead for Placed {
@@ -138,20 +192,25 @@ impl AsyncRead for Placed {
         cx: &mut Context<'_>,
         buf: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
+        self.check(cx)?;
         Pin::new(&mut self.stream).poll_read(cx, buf)
     }
 }
 
 impl AsyncWrite for Placed {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        self.check(cx)?;
         Pin::new(&mut self.stream).poll_write(cx, buf)
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.check(cx)?;
         Pin::new(&mut self.stream).poll_flush(cx)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        // One that has to go is not waited for to take its farewell.
+        self.check(cx)?;
         Pin::new(&mut self.stream).poll_shutdown(cx)
     }
 
@@ -160,6 +219,7 @@ impl AsyncWrite for Placed {
         cx: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.check(cx)?;
         Pin::new(&mut self.stream).poll_write_vectored(cx, bufs)
     }
 
@@ -208,7 +268,7 @@ impl Server {
             tls: watch::Sender::new(tls),
             limits: options.limits,
             foxglove: foxglove::Options { name: options.name, ..foxglove::Options::default() },
-            handshakes: Semaphore::new(HANDSHAKES_MAX),
+            handshakes: Arc::default(),
             grpc,
         });
         let mut local = Vec::new();
@@ -289,11 +349,11 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>
 }
 
 async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Shared>) {
-    let Ok(handshake) = shared.handshakes.try_acquire() else {
+    let Some(handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
         shared.door.count("too many handshakes");
         return;
     };
-    let deadline = tokio::time::Instant::now() + HANDSHAKE_MAX;
+    let deadline = Instant::now() + HANDSHAKE_MAX;
     if !at.is_encrypted {
         let arrival = Arrival { peer, is_encrypted: false, certificate: None };
         return speak(stream, arrival, at, &shared, deadline, handshake).await;
@@ -333,16 +393,16 @@ async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
     arrival: Arrival,
     at: ListenAt,
     shared: &Arc<Shared>,
-    deadline: tokio::time::Instant,
-    handshake: tokio::sync::SemaphorePermit<'_>,
+    deadline: Instant,
+    handshake: Handshake,
 ) {
     if at.protocol == Protocol::Grpc {
         // Its clients say who they are with each call.
         let Arrival { peer, is_encrypted, certificate } = arrival;
-        let Some(place) = shared.door.enter(&peer.ip().to_string(), "grpc", peer) else { return };
         let connection =
             if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
-        let placed = Placed { stream: Box::new(stream), _place: place };
+        let door = Arc::clone(&shared.door);
+        let placed = Placed::new(Box::new(stream), door, connection.clone(), deadline, handshake);
         let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
         return;
     }
@@ -393,5 +453,43 @@ async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
             door.count("no longer admitted");
             tracing::info!(client = %client.name, %denied, "a client is disconnected");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, duplex};
+
+    use super::*;
+    use crate::access::Access;
+
+    /// A stream of gRPC from another host, and the other end of it.
+    fn placed(door: &Arc<Door>, handshakes: &Arc<Handshakes>) -> (Placed, tokio::io::DuplexStream) {
+        let peer: SocketAddr = "192.0.2.1:1000".parse().unwrap();
+        let (near, far) = duplex(16);
+        let handshake = Handshakes::begin(handshakes, peer.ip()).unwrap();
+        let (door, deadline) = (Arc::clone(door), Instant::now() + HANDSHAKE_MAX);
+        (Placed::new(Box::new(near), door, Connection::plain(peer), deadline, handshake), far)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_does_not_show_who_it_is_goes_and_has_had_no_place() {
+        let (door, handshakes) = (Door::new(Access::default(), 1), Arc::default());
+        let (mut silent, _far) = placed(&door, &handshakes);
+        let (mut deaf, _other) = placed(&door, &handshakes);
+        let began = Instant::now();
+        let mut buf = [0; 16];
+        let read = silent.read(&mut buf);
+        let written = async {
+            // More than fits.
+            deaf.write_all(&[0; 64]).await
+        };
+        let (read, written) = tokio::join!(read, written);
+        assert_eq!(read.unwrap_err().kind(), io::ErrorKind::TimedOut);
+        assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
+        assert!(began.elapsed() >= HANDSHAKE_MAX && began.elapsed() < 2 * HANDSHAKE_MAX);
+        assert!(silent.read(&mut buf).await.is_err() && silent.shutdown().await.is_err());
+        assert_eq!(door.refused(), [("handshake too slow".to_owned(), 2)].into());
+        assert!(door.clients().is_empty());
     }
 }

@@ -48,6 +48,12 @@ pub(super) struct Known {
     guest: Arc<Guest>,
 }
 
+impl Known {
+    pub(super) fn client(&self) -> &Client {
+        self.guest.session.client()
+    }
+}
+
 impl Clients {
     pub(super) fn new(hub: Hub, access: Gate, options: GrpcOptions, stopping: watch::Receiver<bool>) -> Self {
         Self { hub, access, options, stopping }

@@ -11,6 +11,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
 use super::client::Known;
+use crate::hub::lock;
 
 /// A connection, as whoever accepted it knows it. Clones are the same one.
 #[derive(Clone)]
@@ -47,6 +48,11 @@ impl Connection {
     /// What its certificate proves.
     pub fn certificate(&self) -> Option<&VerifiedPeer> {
         self.0.certificate.as_ref()
+    }
+
+    /// What the client is called that was admitted on it first, once one was.
+    pub(crate) fn admitted_name(&self) -> Option<Arc<str>> {
+        lock(&self.0.known).first().map(|known| known.client().name.clone())
     }
 
     /// Who was admitted on it.

@@ -66,6 +66,10 @@ const HEADER_BYTES_MAX: u32 = 32 << 10;
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
 /// The same of all streams of a connection: so many may stand still before others do.
 const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
+/// Longest request for health, bytes: whoever can connect may send it.
+const HEALTH_BYTES_MAX: usize = 4 << 10;
+/// The same of reflection.
+const REFLECTION_BYTES_MAX: usize = 64 << 10;
 /// After so long without a sign of life a client is asked for one.
 const PING_INTERVAL: Duration = Duration::from_secs(20);
 /// So long it may take to give it.
@@ -130,6 +134,8 @@ impl Grpc {
                 .register_encoded_file_descriptor_set(proto::DESCRIPTOR)
         };
         let broken = |error: tonic_reflection::server::Error| Fault::Descriptor(error.to_string());
+        let v1 = described().build_v1().map_err(broken)?;
+        let v1alpha = described().build_v1alpha().map_err(broken)?;
         let (reporter, health) = tonic_health::server::health_reporter();
         let mut stopping = self.stopping.subscribe();
         self.clients.hub().shared.runtime.spawn(async move {
@@ -138,9 +144,9 @@ impl Grpc {
             reporter.set_not_serving::<GatewayServer<Service>>().await;
         });
         Ok(Routes::new(admitted)
-            .add_service(health)
-            .add_service(described().build_v1().map_err(broken)?)
-            .add_service(described().build_v1alpha().map_err(broken)?)
+            .add_service(health.max_decoding_message_size(HEALTH_BYTES_MAX))
+            .add_service(v1.max_decoding_message_size(REFLECTION_BYTES_MAX))
+            .add_service(v1alpha.max_decoding_message_size(REFLECTION_BYTES_MAX))
             .prepare())
     }
 

@@ -15,7 +15,7 @@ use sgc_gateway::grpc::GrpcOptions;
 use sgc_gateway::grpc::proto::publish_request::Publisher;
 use sgc_gateway::grpc::proto::subscribe_response::{Kind as Heard, Message};
 use sgc_gateway::grpc::proto::*;
-use sgc_gateway::{Anonymous, Scope, SessionLimits};
+use sgc_gateway::{Anonymous, ListenAt, Protocol, Scope, Server, ServerOptions, SessionLimits};
 use sgc_ros::{RosWriter, SampleKind};
 use sgc_wire::{History, Qos as RosQos, UnixMillis};
 use tokio::sync::mpsc;
@@ -623,6 +623,36 @@ async fn a_gateway_that_stops_says_so_and_lets_its_connections_end() {
     gateway.grpc.stop();
     assert_eq!(end(&mut heard).await, Some(Code::Unavailable));
     within(gateway.serving).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn connections_without_a_client_take_no_place_of_clients() {
+    let gateway = Gateway::new().await;
+    let at = ListenAt { protocol: Protocol::Grpc, is_encrypted: false, addr: ([127, 0, 0, 1], 0).into() };
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: vec![at],
+        access: gateway.access_of(Anonymous::Local, Vec::new()),
+        key: None,
+        clients_max: 1,
+        limits: SessionLimits::default(),
+    };
+    let server = Server::start(gateway.site.hub.clone(), options).await.unwrap();
+    let addr = server.local()[0].addr;
+    let mut idle = Vec::new();
+    for _ in 0..8 {
+        idle.push(tokio::net::TcpStream::connect(addr).await.unwrap());
+    }
+    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{addr}")).unwrap();
+    let mut first = client(endpoint.connect().await.unwrap(), None);
+    within(first.get_graph(GetGraphRequest::default())).await.unwrap();
+    let status = server.status();
+    assert_eq!((status.clients.len(), status.clients[0].protocol.as_str()), (1, "grpc"));
+    let mut second = client(endpoint.connect().await.unwrap(), None);
+    assert!(within(second.get_graph(GetGraphRequest::default())).await.is_err());
+    assert_eq!(server.status().refused, [("too many clients".to_owned(), 1)].into());
+    // It is served as before.
+    within(first.get_graph(GetGraphRequest::default())).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
