@@ -19,6 +19,9 @@ use crate::queue::Overflow;
 use crate::service::Serving;
 use crate::types::InterfaceType;
 
+/// How small a part of a client's bytes a subscription has that the local network waits for.
+const WAITING_PARTS: usize = 16;
+
 /// What one client may have at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
@@ -208,7 +211,11 @@ impl Session {
         let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
         let taking = Intaking {
             depth: wanted.depth,
-            bytes_max: self.limits.waiting_bytes_max,
+            // Those that are waited for do not share their bound: nobody else makes room for them.
+            bytes_max: match wanted.waits {
+                true => self.limits.waiting_bytes_max / WAITING_PARTS,
+                false => self.limits.waiting_bytes_max,
+            },
             waiting: Arc::clone(&self.waiting),
             interval_min: wanted.interval_min,
             overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
