@@ -25,7 +25,7 @@ use super::listing::Listing;
 use super::outbox::{LANE_MESSAGES_MAX, Outbox};
 use super::parameters::{self, ASKED_MAX, Answer, Parameters, Watched};
 use super::protocol::{self, ClientChannel, Command, Metadata, Parameter, Sent, Told, Wanted};
-use super::refusal::Refusal;
+use super::refusal::{Refusal, Refusals};
 use super::{FoxgloveError, Options};
 
 /// How messages are encoded: as ROS 2 has them, or as `docs/spec/json.md` has them; topics are always the former.
@@ -47,8 +47,8 @@ const MATCH_MAX: Duration = Duration::from_millis(200);
 const JOBS_MAX: usize = 512;
 /// Questions for parameters under way.
 const PARAMETER_JOBS_MAX: usize = 8;
-/// Things of one command that are said to be refused, each for itself.
-const REFUSALS_MAX: usize = 16;
+/// Nodes of one question that are said to have failed, each for itself.
+const FAILURES_MAX: usize = 16;
 /// Statuses that are remembered, so that none is said twice.
 const STATUSES_MAX: usize = 1024;
 /// Messages of a topic of events that may wait.
@@ -298,9 +298,9 @@ impl<'o> Connection<'o> {
     async fn command(&mut self, command: Command) {
         match command {
             Command::Subscribe { subscriptions } => {
-                let mut refused = Vec::new();
+                let mut refused = Refusals::default();
                 for wanted in subscriptions {
-                    refused.extend(self.subscribe(wanted).await.err());
+                    refused.note(self.subscribe(wanted).await);
                 }
                 self.refused(&refused);
             }
@@ -309,16 +309,18 @@ impl<'o> Connection<'o> {
                 subscription_ids.into_iter().for_each(|id| self.unsubscribe(id));
             }
             Command::Advertise { channels } => {
-                let mut refused = Vec::new();
+                let mut refused = Refusals::default();
                 for channel in channels {
-                    refused.extend(self.advertise(channel).await.err());
+                    refused.note(self.advertise(channel).await);
                 }
                 self.refused(&refused);
             }
             Command::Unadvertise { channel_ids } => {
-                let mut was = |id: &u32| self.published.remove(id).is_some();
-                let unknown = channel_ids.into_iter().filter(|id| !was(id));
-                let refused: Vec<_> = unknown.map(Refusal::NotAdvertised).collect();
+                let mut refused = Refusals::default();
+                for id in channel_ids {
+                    let removed = self.published.remove(&id).map(drop);
+                    refused.note(removed.ok_or(Refusal::NotAdvertised(id)));
+                }
                 self.refused(&refused);
             }
             Command::GetParameters { parameter_names, id } => {
@@ -348,13 +350,13 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Says what was refused of a command, which may have asked for any number of things.
-    fn refused(&mut self, refused: &[Refusal]) {
-        for refusal in refused.iter().take(REFUSALS_MAX) {
+    /// Says what was refused of a command.
+    fn refused(&mut self, refused: &Refusals) {
+        for refusal in &refused.shown {
             self.status(Level::Error, &refusal.to_string(), None);
         }
-        if let Some(more @ 1..) = refused.len().checked_sub(REFUSALS_MAX) {
-            self.status(Level::Error, &format!("so were {more} more of the same command"), None);
+        if refused.more > 0 {
+            self.status(Level::Error, &format!("so were {} more of the same command", refused.more), None);
         }
     }
 
@@ -442,7 +444,7 @@ impl<'o> Connection<'o> {
         }
         let publications_max = self.session.limits().publications_max;
         self.session.check_count("publications", self.published.len(), publications_max)?;
-        let form = form(&encoding).ok_or(Refusal::Encoding(encoding))?;
+        let form = form(&encoding).ok_or_else(|| Refusal::encoding(&encoding))?;
         let topic = if topic.starts_with('/') { topic } else { format!("/{topic}") };
         let wanted = Advertise { topic, type_name: Some(schema_name), qos: Qos::default() };
         let publication = self.session.advertise(wanted).await?;
@@ -474,7 +476,7 @@ impl<'o> Connection<'o> {
         let bytes_max = self.session.limits().waiting_bytes_max;
         let wanted = match (self.services.get(service), form(&encoding)) {
             (None, _) => Err(Refusal::Service(service)),
-            (_, None) => Err(Refusal::Encoding(encoding.clone())),
+            (_, None) => Err(Refusal::encoding(&encoding)),
             (_, Some(Form::Cdr)) if bytes < CDR_HEADER_BYTES => Err(Refusal::NotSerialised(bytes)),
             (Some(_), _) if self.call_bytes > 0 && self.call_bytes + bytes > bytes_max => {
                 Err(GatewayError::TooMany { what: "bytes of requests under way", max: bytes_max }.into())
@@ -536,7 +538,7 @@ impl<'o> Connection<'o> {
                 for node in &answer.answered {
                     self.remove_status(&parameters_id(node));
                 }
-                for (what, why) in answer.failed.iter().take(REFUSALS_MAX) {
+                for (what, why) in answer.failed.iter().take(FAILURES_MAX) {
                     let message = format!("parameters of {what}: {why}");
                     self.status(Level::Warning, &message, Some(parameters_id(what)));
                 }

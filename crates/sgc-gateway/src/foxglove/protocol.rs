@@ -5,6 +5,10 @@ use bytes::{BufMut, Bytes, BytesMut};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+/// Longest text that is read, bytes: what is long comes in binary messages.
+const TEXT_BYTES_MAX: usize = 1 << 20;
+/// Longest name of a parameter, bytes.
+const PARAMETER_NAME_BYTES_MAX: usize = 1024;
 /// Opcodes of binary messages of the server.
 const MESSAGE_DATA: u8 = 1;
 const SERVICE_CALL_RESPONSE: u8 = 3;
@@ -21,6 +25,18 @@ pub(super) enum ProtocolError {
     /// A text that is none of its messages.
     #[error("not a message of this protocol: {0}")]
     Json(String),
+    /// A text that is too long.
+    #[error("a text of {bytes} bytes: at most {TEXT_BYTES_MAX}")]
+    TooLong {
+        /// Its length.
+        bytes: usize,
+    },
+    /// The name of a parameter that is too long.
+    #[error("the name of a parameter has {bytes} bytes: at most {PARAMETER_NAME_BYTES_MAX}")]
+    ParameterName {
+        /// Its length.
+        bytes: usize,
+    },
     /// A binary message with another opcode.
     #[error(
         "no binary message has opcode {0}: clients send {CLIENT_MESSAGE_DATA} (a message) and {SERVICE_CALL_REQUEST} (a call)"
@@ -52,6 +68,20 @@ pub(super) enum Command {
     SubscribeConnectionGraph,
     UnsubscribeConnectionGraph,
     FetchAsset { uri: String, request_id: u32 },
+}
+
+impl Command {
+    /// The parameters that it is about.
+    fn parameter_names(&self) -> impl Iterator<Item = &str> {
+        let (names, parameters): (&[String], &[Parameter]) = match self {
+            Self::GetParameters { parameter_names, .. }
+            | Self::SubscribeParameterUpdates { parameter_names }
+            | Self::UnsubscribeParameterUpdates { parameter_names } => (parameter_names, &[]),
+            Self::SetParameters { parameters, .. } => (&[], parameters),
+            _ => (&[], &[]),
+        };
+        names.iter().map(String::as_str).chain(parameters.iter().map(|parameter| parameter.name.as_str()))
+    }
 }
 
 /// A subscription that is asked for.
@@ -223,7 +253,16 @@ pub(super) struct Providers {
 
 /// Reads a text.
 pub(super) fn read_text(text: &str) -> Result<Command, ProtocolError> {
-    serde_json::from_str(text).map_err(|error| ProtocolError::Json(error.to_string()))
+    if text.len() > TEXT_BYTES_MAX {
+        return Err(ProtocolError::TooLong { bytes: text.len() });
+    }
+    let command: Command =
+        serde_json::from_str(text).map_err(|error| ProtocolError::Json(error.to_string()))?;
+    let too_long = command.parameter_names().map(str::len).find(|bytes| *bytes > PARAMETER_NAME_BYTES_MAX);
+    match too_long {
+        Some(bytes) => Err(ProtocolError::ParameterName { bytes }),
+        None => Ok(command),
+    }
 }
 
 /// Reads a binary message, whose payload is not copied.
@@ -311,6 +350,22 @@ mod tests {
         {
             assert!(matches!(read_text(wrong), Err(ProtocolError::Json(_))), "{wrong}");
         }
+    }
+
+    #[test]
+    fn texts_and_names_are_no_longer_than_they_may_be() {
+        let set = |name: &str| format!(r#"{{"op":"setParameters","parameters":[{{"name":"{name}"}}]}}"#);
+        let get = |name: &str| format!(r#"{{"op":"getParameters","parameterNames":["/n.a","{name}"]}}"#);
+        let (fits, long) = ("a".repeat(PARAMETER_NAME_BYTES_MAX), "a".repeat(PARAMETER_NAME_BYTES_MAX + 1));
+        for (fits, long) in [(set(&fits), set(&long)), (get(&fits), get(&long))] {
+            assert!(read_text(&fits).is_ok());
+            assert_eq!(read_text(&long), Err(ProtocolError::ParameterName { bytes: 1025 }));
+        }
+        let mut fits = set("/n.a");
+        fits.push_str(&" ".repeat(TEXT_BYTES_MAX - fits.len()));
+        assert!(read_text(&fits).is_ok());
+        let long = ProtocolError::TooLong { bytes: TEXT_BYTES_MAX + 1 };
+        assert_eq!(read_text(&format!("{fits} ")), Err(long));
     }
 
     #[test]
