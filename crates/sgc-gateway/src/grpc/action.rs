@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use futures_util::FutureExt as _;
 use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming};
+use tonic::{Response, Status, Streaming};
 
+use super::budget::{self, respond};
 use super::client::{Guest, Place, Taken};
 use super::fault::Fault;
 use super::proto::send_goal_request::{Goal as GoalSaid, Kind as Asked};
@@ -33,13 +33,13 @@ const LAST_FEEDBACK_MAX: usize = 64;
 const ORDER_GOAL: Fault = Fault::Order { what: "the goal" };
 const ORDER_ACTION: Fault = Fault::Order { what: "the action" };
 
-type Told<T> = mpsc::Sender<Result<T, Status>>;
+type Told<T> = mpsc::Sender<budget::Told<T>>;
 
 /// Sends a goal, and tells of it until it has ended.
 pub(super) async fn send_goal(
     guest: Arc<Guest>,
     mut requests: Streaming<SendGoalRequest>,
-) -> Result<Responses<SendGoalResponse>, Status> {
+) -> Result<Response<Responses<SendGoalResponse>>, Status> {
     let place = guest.take(Taken::Goal)?;
     let first = async { Ok(requests.message().await) };
     let Some(SendGoalRequest { kind: Some(Asked::Goal(said)) }) = guest.admitted(first).await?? else {
@@ -56,9 +56,9 @@ pub(super) async fn send_goal(
     let (type_name, (goal, feedback)) = guest.admitted(sent).await?;
     let (told, responses) = mpsc::channel(RESPONSES_MAX);
     let taken = sent::Taken { goal_id: goal.id().to_vec().into(), r#type: type_name };
-    let _ = told.try_send(Ok(SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) }));
+    let _ = told.try_send((Ok(SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) }), None));
     tokio::spawn(Sent { place, goal, feedback, form }.run(requests, told));
-    Ok(Box::pin(ReceiverStream::new(responses)))
+    Ok(respond(responses))
 }
 
 /// A goal that a server has taken.
@@ -81,7 +81,7 @@ impl Sent {
         };
         drop(self);
         if let Err(why) = why {
-            let _ = told.send(Err(why)).await;
+            let _ = told.send((Err(why), None)).await;
         }
     }
 
@@ -90,9 +90,15 @@ impl Sent {
         mut requests: Streaming<SendGoalRequest>,
         told: &Told<SendGoalResponse>,
     ) -> Result<(), Status> {
-        let Self { goal, feedback, form, .. } = self;
+        let Self { place, goal, feedback, form } = self;
         let tell = async |kind: sent::Kind| {
-            let _ = told.send(Ok(SendGoalResponse { kind: Some(kind) })).await;
+            let bytes = match &kind {
+                sent::Kind::Feedback(feedback) => feedback.payload.len(),
+                sent::Kind::Result(result) => result.payload.len(),
+                sent::Kind::Taken(_) | sent::Kind::CancelAnswer(_) => 0,
+            };
+            let room = place.guest.unread.take(bytes).await;
+            let _ = told.send((Ok(SendGoalResponse { kind: Some(kind) }), room)).await;
         };
         let ended = goal.outcome(*form, OUTCOME_WAIT_MAX);
         tokio::pin!(ended);
@@ -143,7 +149,7 @@ fn to_proto(status: GoalStatus) -> proto::GoalStatus {
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeActionRequest>,
-) -> Result<Responses<ServeActionResponse>, Status> {
+) -> Result<Response<Responses<ServeActionResponse>>, Status> {
     let place = guest.take(Taken::Serving)?;
     let first = async { Ok(requests.message().await) };
     let Some(ServeActionRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
@@ -160,9 +166,9 @@ pub(super) async fn serve(
     let replier = serving.replier();
     let (told, responses) = mpsc::channel(RESPONSES_MAX);
     let first = served::Kind::Served(served::Served { r#type: type_name });
-    let _ = told.try_send(Ok(ServeActionResponse { kind: Some(first) }));
+    let _ = told.try_send((Ok(ServeActionResponse { kind: Some(first) }), None));
     tokio::spawn(Served { place, serving, replier, form }.run(requests, told));
-    Ok(Box::pin(ReceiverStream::new(responses)))
+    Ok(respond(responses))
 }
 
 /// An action that a client serves.
@@ -185,7 +191,7 @@ impl Served {
         };
         drop(self);
         if let Err(why) = why {
-            let _ = told.send(Err(why)).await;
+            let _ = told.send((Err(why), None)).await;
         }
     }
 
@@ -207,24 +213,26 @@ impl Served {
                     };
                     if let Err(why) = self.hear(kind).await {
                         let refused = served::Kind::Refused(served::Refused { goal_id, reason: why.to_string() });
-                        let _ = told.send(Ok(ServeActionResponse { kind: Some(refused) })).await;
+                        let _ = told.send((Ok(ServeActionResponse { kind: Some(refused) }), None)).await;
                     }
                 }
                 event = async {
-                    let room = told.reserve().await.ok()?;
-                    Some((room, self.serving.next().await))
+                    let permit = told.reserve().await.ok()?;
+                    Some((permit, self.serving.next().await))
                 } => {
-                    let Some((room, event)) = event else { return Ok(()) };
+                    let Some((permit, event)) = event else { return Ok(()) };
+                    let mut room = None;
                     let kind = match event.ok_or(Fault::from(GatewayError::Stopping))? {
                         ActionEvent::Goal { id, goal } => {
                             let payload = self.serving.write(&goal, self.form).map_err(Fault::from)?;
+                            room = self.place.guest.unread.take(payload.len()).await;
                             served::Kind::Goal(served::Goal { goal_id: id.to_vec().into(), payload })
                         }
                         ActionEvent::Cancel { id } => {
                             served::Kind::Cancel(served::Cancel { goal_id: id.to_vec().into() })
                         }
                     };
-                    room.send(Ok(ServeActionResponse { kind: Some(kind) }));
+                    permit.send((Ok(ServeActionResponse { kind: Some(kind) }), room));
                 }
             }
         }

@@ -2,18 +2,22 @@
 
 use std::convert::Infallible;
 use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tonic::Status;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio_stream::StreamExt as _;
+use tokio_stream::wrappers::ReceiverStream;
 use tonic::body::Body;
 use tonic::codegen::BoxFuture;
 use tonic::server::NamedService;
+use tonic::{Response, Status};
 
 use super::proto::gateway_server::GatewayServer;
-use super::service::Service;
+use super::service::{Responses, Service};
+use crate::error::GatewayError;
 use crate::hub::lock;
 
 /// Messages up to that length need no room, since streams are counted; that of longer ones is in multiples of it.
@@ -23,6 +27,17 @@ const UNIT_BYTES: usize = 64 << 10;
 pub(super) struct Budget {
     room: Arc<Semaphore>,
     units: usize,
+    /// Of replies that are there, and wait for room.
+    waiting_units: AtomicUsize,
+}
+
+/// A reply that waits for room.
+struct Waits<'a>(&'a AtomicUsize, usize);
+
+impl Drop for Waits<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(self.1, Ordering::Relaxed);
+    }
 }
 
 /// What a message takes of it, until it is dropped.
@@ -32,7 +47,7 @@ pub(super) struct Room(#[expect(dead_code, reason = "it is for its end")] OwnedS
 impl Budget {
     pub(super) fn new(bytes_max: usize) -> Self {
         let units = (bytes_max / UNIT_BYTES).clamp(1, Semaphore::MAX_PERMITS);
-        Self { room: Arc::new(Semaphore::new(units)), units }
+        Self { room: Arc::new(Semaphore::new(units)), units, waiting_units: AtomicUsize::new(0) }
     }
 
     /// Waits for room for a message; one that is longer than all there is waits for all. Short ones need none.
@@ -40,8 +55,27 @@ impl Budget {
         if bytes <= UNIT_BYTES {
             return None;
         }
-        let units = u32::try_from(bytes.div_ceil(UNIT_BYTES).min(self.units)).unwrap_or(u32::MAX);
+        let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
         Arc::clone(&self.room).acquire_many_owned(units).await.ok().map(Room)
+    }
+
+    /// The same for a reply, which nobody holds back while it waits: of those no more wait than there is room in all.
+    pub(super) async fn take_for_reply(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
+        if bytes <= UNIT_BYTES {
+            return Ok(None);
+        }
+        let units = self.units_of(bytes);
+        let before = self.waiting_units.fetch_add(units, Ordering::Relaxed);
+        let _waits = Waits(&self.waiting_units, units);
+        if before + units > self.units {
+            let max = self.units * UNIT_BYTES;
+            return Err(GatewayError::TooMany { what: "bytes of replies that it does not read", max });
+        }
+        Ok(self.take(bytes).await)
+    }
+
+    fn units_of(&self, bytes: usize) -> usize {
+        bytes.div_ceil(UNIT_BYTES).min(self.units)
     }
 }
 
@@ -53,6 +87,29 @@ impl Slot {
     pub(super) fn put(&self, room: Option<Room>) {
         *lock(&self.0) = room;
     }
+}
+
+/// A response of a stream, and the room that it takes.
+pub(super) type Told<T> = (Result<T, Status>, Option<Room>);
+
+/// A stream of what is told, each with its room.
+pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Response<Responses<T>> {
+    let slot = Slot::default();
+    let next = slot.clone();
+    let responses: Responses<T> = Box::pin(ReceiverStream::new(told).map(move |(response, room)| {
+        if room.is_some() {
+            next.put(room);
+        }
+        response
+    }));
+    with_slot(responses, slot)
+}
+
+/// A response whose messages have their room from there.
+pub(super) fn with_slot<T>(message: T, slot: Slot) -> Response<T> {
+    let mut response = Response::new(message);
+    response.extensions_mut().insert(slot);
+    response
 }
 
 /// Has messages hold their room until they have left: the connection drops what it has written.
@@ -148,6 +205,15 @@ mod tests {
         let waits = tokio::time::timeout(Duration::from_millis(20), budget.take(200 << 10)).await;
         assert!(waits.is_err());
         drop(first);
+        // Replies wait for it as well, as many as there is room in all.
+        let all = budget.take(1 << 20).await;
+        let waits = budget.take_for_reply(900 << 10);
+        tokio::pin!(waits);
+        assert!(tokio::time::timeout(Duration::from_millis(20), &mut waits).await.is_err());
+        assert!(budget.take_for_reply(200 << 10).await.is_err());
+        assert!(budget.take_for_reply(1000).await.unwrap().is_none());
+        drop(all);
+        assert!(waits.await.unwrap().is_some());
         // What is longer than all takes all.
         assert!(budget.take(50 << 20).await.is_some());
     }

@@ -180,6 +180,7 @@ struct Counts {
     publications: AtomicUsize,
     servings: AtomicUsize,
     goals: AtomicUsize,
+    calls: AtomicUsize,
 }
 
 /// Of which of its bounds a stream takes one.
@@ -189,6 +190,7 @@ pub(super) enum Taken {
     Publication,
     Serving,
     Goal,
+    Call,
 }
 
 /// One credential on one connection.
@@ -225,6 +227,7 @@ impl Guest {
         match taken {
             Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
             Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            Taken::Call => (&self.counts.calls, "calls under way", limits.calls_max),
             Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
             Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
         }

@@ -18,9 +18,13 @@ use crate::graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, Topic
 /// Least time between two changes that are told.
 const CHANGES_INTERVAL_MIN: Duration = Duration::from_millis(100);
 
-/// What a client sees.
+/// What a client sees: of nodes those that have something in its scope, and the gateway's own.
 fn seen(guest: &Guest, with_hidden: bool) -> Graph {
-    let graph = guest.session.graph();
+    let mut graph = guest.session.graph();
+    let own = guest.session.hub().node_name();
+    graph.nodes.retain(|name, NodeInfo { publishes, subscribes, serves, calls }| {
+        name == own || [publishes, subscribes, serves, calls].iter().any(|names| !names.is_empty())
+    });
     if with_hidden {
         return graph;
     }

@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use sgc_ros::RequestId;
 use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Status, Streaming};
+use tonic::{Response, Status, Streaming};
 
+use super::budget::{self, respond};
 use super::client::{Guest, Place, Taken};
 use super::fault::Fault;
 use super::proto::serve_request::{Kind as Said, Reply, Server};
@@ -26,7 +26,7 @@ const RESPONSES_MAX: usize = 16;
 /// What is to come first.
 const ORDER: Fault = Fault::Order { what: "the service" };
 
-type Told = mpsc::Sender<Result<ServeResponse, Status>>;
+type Told = mpsc::Sender<budget::Told<ServeResponse>>;
 
 /// A service that a client serves.
 struct Work {
@@ -42,7 +42,7 @@ struct Work {
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeRequest>,
-) -> Result<Responses<ServeResponse>, Status> {
+) -> Result<Response<Responses<ServeResponse>>, Status> {
     let place = guest.take(Taken::Serving)?;
     let first = async { Ok(requests.message().await) };
     let Some(ServeRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
@@ -57,10 +57,10 @@ pub(super) async fn serve(
     let replier = serving.replier();
     let (told, responses) = mpsc::channel(RESPONSES_MAX);
     let served = Kind::Served(Served { r#type: type_name? });
-    let _ = told.try_send(Ok(ServeResponse { kind: Some(served) }));
+    let _ = told.try_send((Ok(ServeResponse { kind: Some(served) }), None));
     let work = Work { place, serving, replier, form, open: BTreeMap::new(), last: 0 };
     tokio::spawn(work.run(requests, told));
-    Ok(Box::pin(ReceiverStream::new(responses)))
+    Ok(respond(responses))
 }
 
 impl Work {
@@ -76,7 +76,7 @@ impl Work {
         // It ends before its client hears so: who does not read may take as long as it likes.
         drop(self);
         if let Err(why) = why {
-            let _ = told.send(Err(why)).await;
+            let _ = told.send((Err(why), None)).await;
         }
     }
 
@@ -90,14 +90,14 @@ impl Work {
                     let id = reply.id;
                     if let Err(why) = self.answer(reply).await {
                         let refused = Kind::Refused(Refused { id, reason: why.to_string() });
-                        let _ = told.send(Ok(ServeResponse { kind: Some(refused) })).await;
+                        let _ = told.send((Ok(ServeResponse { kind: Some(refused) }), None)).await;
                     }
                 }
                 request = async {
-                    let room = told.reserve().await.ok()?;
-                    Some((room, self.serving.next().await))
+                    let permit = told.reserve().await.ok()?;
+                    Some((permit, self.serving.next().await))
                 } => {
-                    let Some((room, request)) = request else { return Ok(()) };
+                    let Some((permit, request)) = request else { return Ok(()) };
                     let request = request.ok_or(Fault::from(GatewayError::Stopping))?;
                     match self.serving.write(&request, self.form) {
                         Ok(payload) => {
@@ -106,8 +106,9 @@ impl Work {
                             if self.open.len() > OPEN_MAX {
                                 self.open.pop_first();
                             }
+                            let room = self.place.guest.unread.take(payload.len()).await;
                             let kind = Kind::Request(Request { id: self.last, payload });
-                            room.send(Ok(ServeResponse { kind: Some(kind) }));
+                            permit.send((Ok(ServeResponse { kind: Some(kind) }), room));
                         }
                         Err(error) => {
                             let service = self.serving.service();

@@ -7,7 +7,8 @@ use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::client::Guest;
+use super::budget::{Slot, with_slot};
+use super::client::{Guest, Taken};
 use super::fault::Fault;
 use super::proto::gateway_server::Gateway;
 use super::proto::{
@@ -88,8 +89,17 @@ impl Gateway for Service {
         let form = qos::form(encoding)?;
         let content = Content { form, bytes: payload };
         let type_name = Some(&*r#type).filter(|name| !name.is_empty());
-        let called = async { Ok(guest.session.call(&service, type_name, &content, form, max).await?) };
-        Ok(Response::new(CallResponse { payload: guest.admitted(called).await? }))
+        // It counts until there is room for its reply.
+        let _place = guest.take(Taken::Call)?;
+        let called = async {
+            let payload = guest.session.call(&service, type_name, &content, form, max).await?;
+            let room = guest.unread.take_for_reply(payload.len()).await?;
+            Ok((payload, room))
+        };
+        let (payload, room) = guest.admitted(called).await?;
+        let slot = Slot::default();
+        slot.put(room);
+        Ok(with_slot(CallResponse { payload }, slot))
     }
 
     async fn serve(
@@ -97,7 +107,7 @@ impl Gateway for Service {
         request: Request<Streaming<ServeRequest>>,
     ) -> Result<Response<Self::ServeStream>, Status> {
         let guest = Guest::of(&request)?;
-        Ok(Response::new(serve::serve(guest, request.into_inner()).await?))
+        serve::serve(guest, request.into_inner()).await
     }
 
     async fn send_goal(
@@ -105,7 +115,7 @@ impl Gateway for Service {
         request: Request<Streaming<SendGoalRequest>>,
     ) -> Result<Response<Self::SendGoalStream>, Status> {
         let guest = Guest::of(&request)?;
-        Ok(Response::new(action::send_goal(guest, request.into_inner()).await?))
+        action::send_goal(guest, request.into_inner()).await
     }
 
     async fn serve_action(
@@ -113,7 +123,7 @@ impl Gateway for Service {
         request: Request<Streaming<ServeActionRequest>>,
     ) -> Result<Response<Self::ServeActionStream>, Status> {
         let guest = Guest::of(&request)?;
-        Ok(Response::new(action::serve(guest, request.into_inner()).await?))
+        action::serve(guest, request.into_inner()).await
     }
 }
 

@@ -10,7 +10,7 @@ use sgc_ros::Guid;
 use tokio::sync::watch;
 use tonic::{Response, Status};
 
-use super::budget::Slot;
+use super::budget::{Slot, with_slot};
 use super::client::{Guest, Place, Taken};
 use super::fault::Fault;
 use super::proto::subscribe_response::{Kind, Message, Subscribed, Unreadable};
@@ -90,9 +90,7 @@ pub(super) async fn subscribe(
             Err(why) => Some((Err(Status::from(why)), None)),
         }
     }));
-    let mut response = Response::new(responses);
-    response.extensions_mut().insert(slot);
-    Ok(response)
+    Ok(with_slot(responses, slot))
 }
 
 impl Hearing {

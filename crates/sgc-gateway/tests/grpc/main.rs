@@ -16,8 +16,8 @@ use sgc_gateway::grpc::proto::publish_request::Publisher;
 use sgc_gateway::grpc::proto::subscribe_response::{Kind as Heard, Message};
 use sgc_gateway::grpc::proto::*;
 use sgc_gateway::{Anonymous, ListenAt, Protocol, Scope, Server, ServerOptions, SessionLimits};
-use sgc_ros::{RosWriter, SampleKind};
-use sgc_wire::{History, Qos as RosQos, UnixMillis};
+use sgc_ros::{GraphNode, RosNetwork as _, RosWriter, SampleKind};
+use sgc_wire::{History, Qos as RosQos, RosNode, UnixMillis};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Request, Streaming};
@@ -460,14 +460,21 @@ async fn the_graph_is_listed_and_watched() {
 async fn a_token_permits_what_its_scope_has_and_no_more() {
     let gateway = Gateway::new().await;
     gateway.admit(Anonymous::None);
-    let _talkers = ["/odom", "/secret"].map(|topic| gateway.site.writer(topic, RosQos::default()));
+    let talkers = ["/odom", "/secret"].map(|topic| gateway.site.writer(topic, RosQos::default()));
     gateway.site.knows("/secret").await;
+    let nodes = ["driver", "spy"].into_iter().zip(&talkers).map(|(name, talker)| {
+        let node = RosNode::new("/", name, None).unwrap();
+        GraphNode { node, readers: Vec::new(), writers: vec![talker.guid()] }
+    });
+    gateway.site.ros.announce(&nodes.collect::<Vec<_>>()).unwrap();
     let scope = Scope { subscribe: vec!["/odom".into()], ..Scope::default() };
     let token = gateway.token("partner", scope, UnixMillis(now().0 + 3_600_000));
     let mut partner = gateway.client_with(&token).await;
     subscribe(&mut partner, hear("/odom")).await;
     let graph = partner.get_graph(GetGraphRequest::default()).await.unwrap().into_inner().graph.unwrap();
     assert_eq!(graph.topics.iter().map(|topic| topic.name.as_str()).collect::<Vec<_>>(), ["/odom"]);
+    let nodes: Vec<_> = graph.nodes.iter().map(|node| node.name.as_str()).collect();
+    assert_eq!(nodes, ["/driver", "/sgc_gateway"]);
     let denied = partner.subscribe(hear("/secret")).await.unwrap_err();
     assert_eq!(denied.code(), Code::PermissionDenied);
     assert_eq!(denied.message(), "partner may not subscribe to /secret: its scope does not have it");
