@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -21,6 +21,7 @@ help:
 	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, hours; ARGS="--quick" is minutes)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
+	@echo '                 bench-gateway (gRPC and the rosbridge protocol: bench/README.md)'
 	@echo '                 bench-instructions (whether hot functions take more instructions than before: bench/README.md; ARGS=--accept)'
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
@@ -148,6 +149,12 @@ bench-teleop: deps-build
 
 bench-transports: deps-build
 	$(CARGO) run --release --locked --no-default-features --manifest-path bench/Cargo.toml -- transports $(ARGS)
+
+# Needs neither root nor zenoh. ARGS="--quick", ARGS="--ways rosbridge-json,grpc-cdr".
+bench-gateway: build
+	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -p sgc-bench-load
+	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- gateway \
+		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
 # What `compare` runs beside `sgc`: the Zenoh bridge (minutes, the first time), and talkers with DDS Security.
 bench-peers: deps-bench

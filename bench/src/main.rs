@@ -1,13 +1,14 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`compare`], [`forward`], [`rib`], [`first_message`], [`teleop`] and
-//! [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
+//! This file knows the command line. The parts are [`compare`], [`forward`], [`gateway`], [`rib`], [`first_message`], [`teleop`]
+//! and [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
 #![forbid(unsafe_code)]
 
 mod compare;
 mod first_message;
 mod fleet;
 mod forward;
+mod gateway;
 mod node;
 mod process;
 mod report;
@@ -42,6 +43,8 @@ enum Command {
     Teleop(RunArgs),
     /// Links by every transport beside TCP and TLS; needs root for the part with losses
     Transports(RunArgs),
+    /// Programs without ROS: gRPC and the rosbridge protocol
+    Gateway(gateway::GatewayArgs),
     /// The pages and plots of a run of `compare`, once more from its figures
     Report(ReportArgs),
     /// SGC beside what users would pick instead, in one run over emulated paths; needs root
@@ -118,6 +121,7 @@ fn main() -> Result<()> {
         Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
         Command::Teleop(args) => part(&args, "teleop", teleop::run),
         Command::Transports(args) => part(&args, "transports", transports::run),
+        Command::Gateway(args) => gateway::run(&args),
         Command::Report(args) => compare::Run::read(&args.run)?.render(&args.out),
         Command::Compare(args) => compare::run(args),
         Command::MeasureLinks(args) => transports::measure_memory_here(&args),

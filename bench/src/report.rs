@@ -46,18 +46,24 @@ impl Report {
         Ok(Self { machine: Machine::here(), figures: serde_json::to_value(figures)?, tables })
     }
 
-    /// Prints the tables, Markdown.
+    /// Prints the tables.
     pub(crate) fn print(&self) {
-        println!("Machine: {}\n", self.machine.sentence());
+        print!("{}", self.markdown());
+    }
+
+    /// The machine and the tables.
+    pub(crate) fn markdown(&self) -> String {
+        let mut text = format!("Machine: {}\n\n", self.machine.sentence());
         for table in &self.tables {
-            println!("{}\n", table.title);
-            println!("| {} |", table.columns.join(" | "));
-            println!("|{}", "---|".repeat(table.columns.len()));
+            text += &format!("{}\n\n", table.title);
+            text += &format!("| {} |\n", table.columns.join(" | "));
+            text += &format!("|{}\n", "---|".repeat(table.columns.len()));
             for row in &table.rows {
-                println!("| {} |", row.join(" | "));
+                text += &format!("| {} |\n", row.join(" | "));
             }
-            println!();
+            text += "\n";
         }
+        text
     }
 
     /// Writes `NAME.json`.

@@ -39,7 +39,9 @@ use plan::Breadth;
 use system::{Peers, System};
 
 pub(crate) use figures::Figures;
+pub(crate) use program::Program;
 pub(crate) use report::Run;
+pub(crate) use system::Dds;
 
 /// Measures a table.
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
