@@ -26,7 +26,7 @@ help:
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
 demo: build
-	./target/release/sgc demo $(ARGS)
+	"$${CARGO_TARGET_DIR:-target}/release/sgc" demo $(ARGS)
 
 build: deps-build
 	$(CARGO) build --release --locked -p sgc

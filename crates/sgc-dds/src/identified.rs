@@ -22,7 +22,9 @@ use cyclors::{
 use sgc_ros::EndpointSpec;
 
 use crate::entity::{Entity, c_string};
-use crate::identity::{IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity};
+use crate::identity::{
+    CYCLONE, IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity,
+};
 use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 
@@ -62,7 +64,7 @@ impl IdentifiedSample {
         Self(sample)
     }
 
-    /// A sample to write, with the identity of the request that it belongs to, or none.
+    /// A sample to write under that number, with the identity of the request that it belongs to, or none.
     ///
     /// # Safety
     /// `sertype` must be that of a topic that [`topic`] made; Cyclone keeps it while the sample is in use.
@@ -70,6 +72,7 @@ impl IdentifiedSample {
         sertype: *const ddsi_sertype,
         frame: &Frame<'_>,
         related: Option<SampleIdentity>,
+        number: i64,
         source_timestamp_ns: i64,
     ) -> Self {
         let mut payload = Vec::with_capacity(frame.bytes());
@@ -77,9 +80,11 @@ impl IdentifiedSample {
         payload.extend_from_slice(&frame.prefix[..frame.prefix_bytes]);
         payload.extend_from_slice(frame.body);
         payload.resize(frame.bytes(), 0);
+        // What readers of the same participant are given is this very sample.
+        let origin = Some(Origin { vendor: CYCLONE, number, related });
         // SAFETY: valid by contract.
         let sample =
-            unsafe { Identified::allocate(sertype, ddsi_serdata_kind_SDK_DATA, payload, related, None) };
+            unsafe { Identified::allocate(sertype, ddsi_serdata_kind_SDK_DATA, payload, related, origin) };
         // SAFETY: just made, and not shared yet.
         unsafe { (*sample).timestamp.v = source_timestamp_ns };
         Self(sample)
@@ -232,7 +237,9 @@ impl Identified {
 /// # Safety
 /// `view` must be the `refd_payload_iov` of a `struct ddsi_xmsg` of Cyclone DDS 11 as `cyclors` =0.4.0 builds it:
 /// `ddsi_xmsg_serdata` is the only function there that asks for the payload of a sample of this sertype. (Others ask for
-/// keys, or copy samples for local readers of another sertype, which do not exist: endpoints ignore their own participant.)
+/// keys, or copy samples for readers of the same participant with another sertype. Those of a proxy are ignored, and in any other
+/// network all endpoints of a service's topic are of one sertype: those that [`topic`] makes are equal, so that Cyclone keeps one
+/// of them.)
 unsafe fn add_related(view: *mut ddsrt_iovec_t, related: SampleIdentity) -> bool {
     // SAFETY: by contract the view is that field of that struct.
     let message = unsafe { view.cast::<u8>().sub(offset_of!(Xmsg, payload_view)).cast::<Xmsg>() };

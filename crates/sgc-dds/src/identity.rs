@@ -26,7 +26,7 @@ pub const IDENTITY_BYTES: usize = 24;
 pub const NUMBER_UNKNOWN: i64 = -1 << 32;
 
 /// Vendor id of Cyclone DDS.
-const CYCLONE: [u8; 2] = [0x01, 0x10];
+pub(crate) const CYCLONE: [u8; 2] = [0x01, 0x10];
 
 /// Where a program puts the identity of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]

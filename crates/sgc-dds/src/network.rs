@@ -241,7 +241,13 @@ impl Participant {
         }
         let mut data = user_data::build(self.tag.as_deref(), spec.type_hash.as_deref());
         data.extend_from_slice(more.as_bytes());
-        NativeQos::endpoint(kind, &spec.qos, spec.keyless, &data)
+        let qos = NativeQos::endpoint(kind, &spec.qos, spec.keyless, &data)?;
+        if self.tag.is_some() {
+            // What a proxy writes must never come back to it through its own readers. Of any other network the parts belong
+            // to several programs, which hear each other.
+            qos.set_ignores_own();
+        }
+        Ok(qos)
     }
 }
 

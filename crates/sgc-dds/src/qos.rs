@@ -104,8 +104,6 @@ impl NativeQos {
                 dds_qset_lifespan(native.0, duration(qos.lifespan_ns));
                 dds_qset_writer_data_lifecycle(native.0, false);
             }
-            // What we write must never come back to us through our own readers.
-            dds_qset_ignorelocal(native.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT);
         }
         native.set_user_data(user_data);
         native.set_representations(kind, qos.representations);
@@ -120,6 +118,12 @@ impl NativeQos {
         // SAFETY: `pointers` holds as many NUL-terminated strings as it says, and they are copied.
         unsafe { dds_qset_partition(native.0, pointers.len() as u32, pointers.as_mut_ptr()) };
         Ok(native)
+    }
+
+    /// Has an endpoint match none of its own participant.
+    pub(crate) fn set_ignores_own(&self) {
+        // SAFETY: the object is valid; the call takes a number.
+        unsafe { dds_qset_ignorelocal(self.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT) };
     }
 
     /// Lets a writer put samples into one packet until it is flushed.

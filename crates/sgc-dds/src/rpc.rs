@@ -181,7 +181,7 @@ impl RpcWriter {
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_ns = unix.as_nanos().try_into().unwrap_or(0);
         // SAFETY: the sertype of this writer, which `identified::topic` made.
-        let sample = unsafe { IdentifiedSample::build(sertype, &frame, related, now_ns) };
+        let sample = unsafe { IdentifiedSample::build(sertype, &frame, related, number, now_ns) };
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
         match unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) } {

@@ -19,9 +19,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 use cyclors::{
     dds_builtintopic_endpoint_t, dds_builtintopic_free_endpoint, dds_entity_t, dds_get_instance_handle,
     dds_get_matched_publication_data, dds_get_matched_publications, dds_get_matched_subscription_data,
-    dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask,
-    dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID, dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID,
-    dds_take_status,
+    dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask, dds_take_status,
 };
 use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, ServiceSpec};
 
@@ -30,7 +28,7 @@ use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
 use crate::network::Participant;
 use crate::payload::{Frame, HEADER_BYTES, PREFIX_BYTES, is_little_endian};
 use crate::rpc::{Message, RpcReader, RpcWriter};
-use crate::wait::wait_for_status;
+use crate::wait::{READERS_MATCHED, WRITERS_MATCHED, wait_for_status};
 use crate::{qos, user_data};
 
 /// How long a request waits for a server, and a reply for its client, milliseconds.
@@ -276,10 +274,6 @@ impl Ends {
 type ListMatches = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;
 type DescribeMatch =
     unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
-
-/// Cyclone's status bits for what changes with matches.
-const READERS_MATCHED: u32 = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;
-const WRITERS_MATCHED: u32 = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
 
 /// Client, number and payload of a request; `None` if it is too short for its mapping.
 fn request_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {

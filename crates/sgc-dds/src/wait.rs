@@ -8,12 +8,17 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use cyclors::{
-    dds_create_guardcondition, dds_create_waitset, dds_entity_t, dds_set_guardcondition, dds_waitset_attach,
-    dds_waitset_wait,
+    dds_create_guardcondition, dds_create_waitset, dds_entity_t, dds_set_guardcondition,
+    dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID, dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID,
+    dds_waitset_attach, dds_waitset_wait,
 };
 
 use crate::entity::{Entity, INFINITE, check};
 use crate::network::Participant;
+
+/// Cyclone's status bits for what changes with matches.
+pub(crate) const READERS_MATCHED: u32 = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;
+pub(crate) const WRITERS_MATCHED: u32 = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
 
 /// Ends a thread that waits: a flag for when it works, a guard condition for when it sleeps.
 #[derive(Debug)]

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use cyclors::{
     DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_create_writer,
     dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
-    dds_publication_matched_status, dds_wait_for_acks, dds_write_flush,
+    dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleKind};
 
@@ -18,6 +18,7 @@ use crate::entity::{Entity, INFINITE, check, reason};
 use crate::network::Participant;
 use crate::payload::Frame;
 use crate::serdata::Serdata;
+use crate::wait::{READERS_MATCHED, wait_for_status};
 
 /// Latest source time stamp that RTPS can say, nanoseconds since the Unix epoch: seconds are 32 bits
 /// (RTPS 2.5, 9.3.2.1).
@@ -32,7 +33,7 @@ pub struct CycloneWriter {
     writer: Entity,
     _group: Option<Entity>,
     _topic: Entity,
-    _participant: Arc<Participant>,
+    participant: Arc<Participant>,
     guid: Guid,
     keyless: bool,
 }
@@ -48,12 +49,14 @@ impl CycloneWriter {
         let writer = Entity::new(unsafe {
             dds_create_writer(parent, topic.handle(), qos.as_ptr(), std::ptr::null())
         })?;
+        // SAFETY: takes numbers, checked by Cyclone.
+        check(unsafe { dds_set_status_mask(writer.handle(), READERS_MATCHED) })?;
         let guid = writer.guid()?;
         Ok(Self {
             writer,
             _group: group,
             _topic: topic,
-            _participant: Arc::clone(participant),
+            participant: Arc::clone(participant),
             guid,
             keyless: spec.keyless,
         })
@@ -142,5 +145,25 @@ impl RosWriter for CycloneWriter {
         // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
         let ret = unsafe { dds_get_publication_matched_status(self.writer.handle(), &mut status) };
         if ret < 0 { 0 } else { status.current_count }
+    }
+
+    fn wait_matched(&self, readers: u32, max: Duration) -> u32 {
+        let handle = self.writer.handle();
+        let until = Instant::now() + max;
+        loop {
+            let mut status = 0;
+            // What happens from here on wakes the wait below.
+            // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
+            unsafe { dds_take_status(handle, &mut status, READERS_MATCHED) };
+            let matched = self.matched_readers();
+            let left = until.saturating_duration_since(Instant::now());
+            if matched >= readers || left.is_zero() {
+                return matched;
+            }
+            if let Err(reason) = wait_for_status(&self.participant, &[handle], left) {
+                tracing::error!(reason, "waiting for readers failed");
+                return matched;
+            }
+        }
     }
 }

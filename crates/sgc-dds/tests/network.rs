@@ -265,6 +265,34 @@ fn a_network_does_not_hear_itself() {
     assert_eq!(writer.matched_readers(), 1, "its own reader is no match");
 }
 
+/// The programs of a gateway are of one participant.
+#[test]
+fn programs_behind_one_network_without_tag_hear_each_other() {
+    let ros = open(147, None);
+    let (_reader, samples) = read(&ros, &spec("echo"));
+    let writer = writer(&ros, &spec("echo"), 1);
+    for text in ["hello", &"x".repeat(100_000)] {
+        write(&writer, &string_cdr(text));
+        let sample = next(&samples);
+        assert_eq!(sample.payload, padded(&string_cdr(text)));
+        assert_eq!(sample.writer, Some(writer.guid()));
+    }
+    quiet(&samples);
+}
+
+#[test]
+fn readers_are_waited_for_until_they_are_there_or_the_time_is_over() {
+    let (ros, other) = (open(149, None), open(149, None));
+    let writer = ros.create_writer(&spec("wait")).unwrap();
+    assert_eq!(writer.wait_matched(1, QUIET), 0);
+    let waits = std::thread::scope(|scope| {
+        let waits = scope.spawn(|| writer.wait_matched(2, PATIENCE));
+        let _readers = [read(&other, &spec("wait")), read(&other, &spec("wait"))];
+        waits.join().unwrap()
+    });
+    assert_eq!(waits, 2);
+}
+
 /// The proof against loops: DDS matches the two, SGC must not pass on what the other wrote.
 #[test]
 fn what_another_sgc_node_wrote_is_not_read_again() {
@@ -893,9 +921,14 @@ fn ids_are_as_long_as_those_of_the_network() {
     // A plain participant that reads and writes the topic itself, as an older ROS 2 would.
     let old = open(98, None);
     let (_reader, said) = read(&old, &graph_reader());
-    let heard = || decode_nodes(&next(&said).payload).unwrap();
+    let writer = writer(&old, &graph_writer(), 2);
+    let heard = || loop {
+        let sample = next(&said);
+        if sample.writer != Some(writer.guid()) {
+            break decode_nodes(&sample.payload).unwrap();
+        }
+    };
     assert_eq!(heard().gid_bytes, GidBytes::Sixteen);
-    let writer = writer(&old, &graph_writer(), 1);
     write(&writer, &encode_nodes(&old.guid(), &[graph_node("old", &[], &[])], GidBytes::TwentyFour));
     assert_eq!(nodes(&events).0, old.guid());
     let again = heard();

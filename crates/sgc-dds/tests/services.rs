@@ -150,6 +150,24 @@ fn a_request_without_a_server_says_so_and_sgc_does_not_call_itself() {
     quiet(&requests);
 }
 
+/// The programs of a gateway are of one participant.
+#[test]
+fn programs_behind_one_network_without_tag_call_each_other() {
+    let ros = open(148, None);
+    let (server, requests) = server(&ros);
+    let clients = [client(&ros), client(&ros)];
+    for (n, (client, replies)) in clients.iter().enumerate() {
+        let asked = ask(client, &[0, 1, 0, 0, 1, 2, 3, n as u8]);
+        let (id, payload) = next(&requests);
+        assert_eq!((id.client, id.number), (asked.client, asked.number));
+        assert_eq!(payload, [0, 1, 0, 0, 1, 2, 3, n as u8].as_slice());
+        server.reply(&id, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])).unwrap();
+        assert_eq!(next(replies), (asked, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])));
+    }
+    clients.iter().for_each(|(_, replies)| quiet(replies));
+    quiet(&requests);
+}
+
 #[test]
 fn a_server_made_anew_answers_what_the_one_before_was_asked() {
     let (ros, sgc) = (open(123, None), open(123, Some("arm-1")));

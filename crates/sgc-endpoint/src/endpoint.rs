@@ -15,6 +15,7 @@ use sgc_wire::{
     NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
 };
 
+use crate::advert_pace::AdvertPace;
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
 use crate::types::{TypeAsker, types_name};
@@ -263,6 +264,8 @@ pub struct Endpoint {
     /// True once it describes any.
     pub(crate) describes: bool,
     pub(crate) questions: BTreeMap<SinkId, TypeAsker>,
+    /// Shares that were described, of which nobody who asked was told yet.
+    pub(crate) untold: BTreeSet<Name>,
     pub(crate) shares: Shares,
     pub(crate) joins: BTreeMap<Name, Join>,
     /// Catalogue names of followed owners.
@@ -274,6 +277,7 @@ pub struct Endpoint {
     pub(crate) unadvertised: BTreeSet<Blind>,
     pub(crate) withdrawn: BTreeSet<Blind>,
     advert_seq: u64,
+    pub(crate) advert_pace: AdvertPace,
     pub(crate) renew_at: Option<Instant>,
     /// When to look for certificates that have ended.
     pub(crate) enforce_at: Option<Instant>,
@@ -302,6 +306,7 @@ impl Endpoint {
             types_name: types_name(&own),
             describes: false,
             questions: BTreeMap::new(),
+            untold: BTreeSet::new(),
             shares: Shares::default(),
             joins: BTreeMap::new(),
             followed: BTreeMap::new(),
@@ -310,6 +315,7 @@ impl Endpoint {
             catalogue_rests: None,
             withdrawn: BTreeSet::new(),
             advert_seq: 0,
+            advert_pace: AdvertPace::default(),
             renew_at: None,
             enforce_at: None,
             outputs: VecDeque::new(),
@@ -401,7 +407,13 @@ impl Endpoint {
         }
         self.outputs.pop_front().unwrap_or_else(|| {
             let joins = self.joins.values().filter_map(Join::deadline);
-            let own = [self.renew_at, self.enforce_at, self.rotation_deadline(), self.catalogue_deadline()];
+            let own = [
+                self.renew_at,
+                self.enforce_at,
+                self.rotation_deadline(),
+                self.catalogue_deadline(),
+                self.advert_deadline(),
+            ];
             Output::Timeout(joins.chain(own.into_iter().flatten()).min())
         })
     }
@@ -434,8 +446,17 @@ impl Endpoint {
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
     }
 
-    /// Sends what is due of advertisements and withdrawals, as many names in one as fit.
+    /// When what is due of them may be sent, if that is later.
+    fn advert_deadline(&self) -> Option<Instant> {
+        let is_due = !self.withdrawn.is_empty() || !self.unadvertised.is_empty();
+        self.advert_pace.opens_at().filter(|_| is_due)
+    }
+
+    /// Sends what is due of advertisements and withdrawals, as many names in one as fit, unless it is to be gathered.
     fn advertise(&mut self) {
+        if self.advert_deadline().is_some_and(|at| at > self.now.instant) {
+            return;
+        }
         for withdraw in [true, false] {
             let due = std::mem::take(if withdraw { &mut self.withdrawn } else { &mut self.unadvertised });
             let due: Vec<_> = due.into_iter().collect();
@@ -452,6 +473,7 @@ impl Endpoint {
                 };
                 let signed = self.config.identity.sign_advert(&body);
                 self.outputs.push_back(Output::Send(Control::Advert { cost: 0, signed }));
+                self.advert_pace.sent(self.now.instant);
                 if !withdraw {
                     self.renew_at.get_or_insert(self.now.instant + self.config.limits.lease / 3);
                     self.enforce_at.get_or_insert(self.now.instant + ENFORCE_EVERY);

@@ -9,6 +9,7 @@
 //! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
+mod advert_pace;
 mod calls;
 mod compression;
 mod endpoint;
@@ -24,6 +25,7 @@ mod sink;
 mod source;
 mod types;
 
+pub use advert_pace::{ADVERT_INTERVAL, ADVERTS_BURST};
 pub use calls::{
     ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallRefused, CallStats,
     Caller, Outcome,

@@ -13,6 +13,7 @@ use sgc_wire::{
     RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
 };
 
+use crate::advert_pace::AdvertPace;
 use crate::endpoint::{Dropped, Endpoint, Event};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 use crate::{SinkProgress, SourceProgress};
@@ -121,6 +122,7 @@ impl Endpoint {
         }
         self.unadvertised.remove(&share.blind);
         self.withdrawn.insert(share.blind);
+        self.untold.remove(name);
         self.catalogue_dirty = true;
         if self.shares.shares.values().all(|share| share.described.is_none()) {
             self.withdraw_types();
@@ -159,6 +161,8 @@ impl Endpoint {
             self.unshare(now, &name);
         }
         self.unadvertised.clear();
+        // Nothing is gathered any more.
+        self.advert_pace = AdvertPace::default();
         for (name, blind) in std::mem::take(&mut self.catalogue_names) {
             self.end_catalogue(name, blind);
         }

@@ -81,7 +81,8 @@ pub(crate) fn types_name(owner: &NodeId) -> (Name, Blind) {
 
 /// As an owner.
 impl Endpoint {
-    /// What the type of a share looks like. Those who asked are told.
+    /// What the type of a share looks like. Those who asked are told with [`Endpoint::tell_types`], so that what becomes known
+    /// at about one time is told at one time.
     pub fn describe(&mut self, now: Now, name: &Name, described: PackedType) {
         self.now = now;
         let Some(share) = self.shares.shares.get_mut(name) else { return };
@@ -90,7 +91,14 @@ impl Endpoint {
             self.withdrawn.remove(&self.types_name.1);
             self.unadvertised.insert(self.types_name.1);
         }
-        let waiting = self.questions.iter().filter(|(_, asked)| asked.names.contains(name));
+        self.untold.insert(*name);
+    }
+
+    /// Tells those who asked what was described since the last time.
+    pub fn tell_types(&mut self, now: Now) {
+        self.now = now;
+        let untold = std::mem::take(&mut self.untold);
+        let waiting = self.questions.iter().filter(|(_, asked)| !asked.names.is_disjoint(&untold));
         for sink in waiting.map(|(sink, _)| *sink).collect::<Vec<_>>() {
             self.answer_types(sink, false);
         }
@@ -174,25 +182,22 @@ impl Endpoint {
             self.withdrawn.insert(self.types_name.1);
         }
         self.questions.clear();
+        self.untold.clear();
     }
 }
 
 /// As one who asks.
 impl Endpoint {
     /// Asks an owner what the types of these interfaces look like, the first [`TYPES_PER_QUESTION_MAX`] of them, until it is
-    /// asked for others, or for none. An owner that describes none, or is of a version that cannot, does not advertise the
+    /// asked again, or for none. What it told in answer to a question it tells once more in answer to another. An owner that describes none, or is of a version that cannot, does not advertise the
     /// name that it is asked at: then nothing happens.
     pub fn ask_types(&mut self, now: Now, owner: NodeId, mut names: Vec<Name>) {
         self.now = now;
         names.truncate(TYPES_PER_QUESTION_MAX);
         let (name, _) = types_name(&owner);
-        let wish = Wish::Types(names);
-        if self.joins.get(&name).is_some_and(|join| join.wish == wish) {
-            return;
-        }
         self.leave(now, &name);
-        if wish != Wish::Types(Vec::new()) {
-            self.join(now, name, owner, wish);
+        if !names.is_empty() {
+            self.join(now, name, owner, Wish::Types(names));
         }
     }
 }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason, Output, ShareError, ShareSpec,
-    Wish,
+    ADVERT_INTERVAL, ADVERTS_BURST, Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason,
+    Output, ShareError, ShareSpec, Wish,
 };
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
@@ -189,6 +189,32 @@ fn a_closed_policy_permits_nobody() {
     let (frame, _) = join(&bench, &identity(&Member::new("desk")), name, 1);
     bench.frame(frame);
     assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotPermitted))]);
+}
+
+#[test]
+fn names_that_come_one_by_one_are_gathered_as_routers_take_no_more() {
+    let mut bench = owner();
+    let mut adverts = Vec::new();
+    let count = 3 * ADVERTS_BURST as usize;
+    for n in 0..count {
+        bench.share_with_fleet(&format!("/{n}"));
+        bench.drain();
+        adverts.extend(bench.adverts());
+    }
+    // The catalogue's was the first.
+    assert_eq!(adverts.len() + 1, ADVERTS_BURST as usize);
+    bench.clock.advance_to(bench.clock.now().instant + ADVERT_INTERVAL);
+    bench.endpoint.handle_timeout(bench.clock.now());
+    bench.drain();
+    adverts.extend(bench.adverts());
+    assert_eq!(adverts.len(), ADVERTS_BURST as usize, "one with all the others");
+    assert_eq!(adverts.iter().map(|advert| advert.2).sum::<usize>(), count);
+    // The end is told at once.
+    bench.endpoint.withdraw_all(bench.clock.now());
+    bench.drain();
+    let withdrawn = bench.adverts();
+    assert!(withdrawn.iter().all(|advert| advert.1));
+    assert_eq!(withdrawn.iter().map(|advert| advert.2).sum::<usize>(), count + 1);
 }
 
 #[test]

@@ -17,6 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use crate::access::Right;
+use crate::aside::aside_if_long;
 use crate::content::{Content, Form, write};
 use crate::error::GatewayError;
 use crate::feed::Subscription;
@@ -217,10 +218,12 @@ impl Goal {
         let request = record([("goal_id", uuid(&self.id))]);
         let payload = write(&self.get_result.halves.request, &request, Form::Cdr)?;
         let reply = self.get_result.call(payload, max).await?;
-        let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
-        let status = GoalStatus::of(integer(&reply, "status"));
-        let result = reply.at("result").unwrap_or(Value::Record(Vec::new()));
-        Ok(Outcome { status, result: write(&self.result, &result, form)? })
+        aside_if_long(reply.len(), || {
+            let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
+            let status = GoalStatus::of(integer(&reply, "status"));
+            let result = reply.at("result").unwrap_or(Value::Record(Vec::new()));
+            Ok(Outcome { status, result: write(&self.result, &result, form)? })
+        })
     }
 
     /// Asks the server to give it up.
@@ -259,16 +262,24 @@ impl Feedback {
             if !is_delimited && payload.get(GOAL_ID_AT) != Some(&self.id) {
                 continue;
             }
-            let said = match self.subscription.layout().decode(payload) {
-                Ok(said) => said,
-                Err(error) => return Some(Err(GatewayError::Decode(error))),
-            };
-            if goal_id(&said, "goal_id") != Some(self.id) {
-                continue;
+            let read = || self.read(payload, form);
+            if let Some(said) = aside_if_long(payload.len(), read) {
+                return Some(said);
             }
-            let feedback = said.at("feedback").unwrap_or(Value::Record(Vec::new()));
-            return Some(write(&self.layout, &feedback, form));
         }
+    }
+
+    /// What a message says of this goal.
+    fn read(&self, payload: &Bytes, form: Form) -> Option<Result<Bytes, GatewayError>> {
+        let said = match self.subscription.layout().decode(payload) {
+            Ok(said) => said,
+            Err(error) => return Some(Err(GatewayError::Decode(error))),
+        };
+        if goal_id(&said, "goal_id") != Some(self.id) {
+            return None;
+        }
+        let feedback = said.at("feedback").unwrap_or(Value::Record(Vec::new()));
+        Some(write(&self.layout, &feedback, form))
     }
 }
 

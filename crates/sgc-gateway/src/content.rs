@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use sgc_cdr::{Encoding, Layout, Value};
 
+use crate::aside::aside_if_long;
 use crate::error::GatewayError;
 
 /// How a message is written.
@@ -44,18 +45,18 @@ impl Content {
 
     /// What it says.
     pub fn value(&self, layout: &Layout) -> Result<Value, GatewayError> {
-        match self.form {
+        aside_if_long(self.bytes.len(), || match self.form {
             Form::Cdr => layout.decode(&self.bytes).map_err(GatewayError::Decode),
             Form::Json => layout.from_json(&self.bytes).map_err(GatewayError::Value),
             Form::Cbor => layout.from_cbor(&self.bytes).map_err(GatewayError::Value),
-        }
+        })
     }
 
     /// The same, serialised: what is serialised already is believed to be of its type, as it is of any ROS 2 publisher.
     pub fn to_cdr(&self, layout: &Layout) -> Result<Bytes, GatewayError> {
         match self.form {
             Form::Cdr => Ok(self.bytes.clone()),
-            _ => serialise(layout, &self.value(layout)?),
+            _ => aside_if_long(self.bytes.len(), || serialise(layout, &self.value(layout)?)),
         }
     }
 }
@@ -79,6 +80,8 @@ pub(crate) fn write(layout: &Layout, value: &Value, form: Form) -> Result<Bytes,
 pub(crate) fn convert(layout: &Layout, payload: &Bytes, form: Form) -> Result<Bytes, GatewayError> {
     match form {
         Form::Cdr => Ok(payload.clone()),
-        _ => write(layout, &layout.decode(payload).map_err(GatewayError::Decode)?, form),
+        _ => aside_if_long(payload.len(), || {
+            write(layout, &layout.decode(payload).map_err(GatewayError::Decode)?, form)
+        }),
     }
 }

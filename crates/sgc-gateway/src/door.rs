@@ -129,7 +129,6 @@ impl Door {
         };
         let access = self.access();
         access.admit(&admission).inspect_err(|denied| {
-            self.count("not admitted");
             tracing::debug!(peer = %arrival.peer, %denied, "a client is not admitted");
         })
     }
@@ -172,7 +171,11 @@ impl Door {
     }
 
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
-        lock(&self.refused).iter().map(|(why, count)| ((*why).to_owned(), *count)).collect()
+        let counted = lock(&self.refused);
+        // Whatever the protocol: of gRPC each call is admitted.
+        let denied = Some(("not admitted", self.access.borrow().denied())).filter(|(_, count)| *count > 0);
+        let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
+        all.map(|(why, count)| (why.to_owned(), count)).collect()
     }
 }
 

@@ -50,6 +50,12 @@ pub enum GatewayError {
         /// With what.
         name: String,
     },
+    /// It was asked for by who the client was then.
+    #[error("you are {client} now, who may other things: ask again")]
+    OtherClient {
+        /// Who the client is now.
+        client: String,
+    },
     /// The definition is not found, or not right.
     #[error("no definition: {0}; name a directory that has it with `definitions` in [ros]")]
     Definition(TypeError),
@@ -150,7 +156,7 @@ impl GatewayError {
                 ErrorKind::Invalid
             }
             Self::TypeUnknown { .. } | Self::Definition(_) | Self::NotThere { .. } => ErrorKind::NotFound,
-            Self::Denied { .. } => ErrorKind::Denied,
+            Self::Denied { .. } | Self::OtherClient { .. } => ErrorKind::Denied,
             Self::TooLong { .. } | Self::TooMany { .. } => ErrorKind::Exhausted,
             Self::Twice { .. } => ErrorKind::Exists,
             Self::NoServer { .. } | Self::Stopping => ErrorKind::Unavailable,

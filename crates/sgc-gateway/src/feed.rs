@@ -20,6 +20,7 @@ use crate::hub::Shared;
 use crate::message::Message;
 use crate::queue::{Overflow, Queue};
 use crate::ros::LocalReader;
+use crate::session::Waits;
 
 /// Messages of one writer that are kept for who subscribes later, of a topic whose writers do so too.
 const LATCHED_DEPTH_MAX: usize = 100;
@@ -172,7 +173,7 @@ impl Feed {
 
     /// What its reader is to request, as the graph is.
     fn wanted(&self, graph: &Graph) -> EndpointSpec {
-        let FeedKey { topic, type_name, qos, .. } = &self.key;
+        let FeedKey { topic, type_name, qos, waits } = &self.key;
         let info = graph.topics.get(topic);
         let of_type = |info: &&crate::graph::EndpointInfo| info.type_name == *type_name;
         let publishers: Vec<_> = info.iter().flat_map(|info| &info.publishers).filter(of_type).collect();
@@ -185,7 +186,13 @@ impl Feed {
                     history: History::KeepLast(10),
                     ..Qos::default()
                 },
-                Some(offer) => reader_for(&offer, publishers.len()),
+                Some(offer) => {
+                    let taken = reader_for(&offer, publishers.len());
+                    // Who waits for its subscriber leaves out nothing that it has room for.
+                    let keeps_all = *waits && taken.is_reliable();
+                    let history = if keeps_all { History::KeepAll } else { taken.history };
+                    Qos { history, ..taken }
+                }
             }
         });
         EndpointSpec {
@@ -281,6 +288,8 @@ pub(crate) struct Intaking {
     pub(crate) waiting: Arc<AtomicUsize>,
     pub(crate) interval_min: Option<Duration>,
     pub(crate) overflow: Overflow,
+    /// Its place among those that are waited for, if it is.
+    pub(crate) waits: Option<Waits>,
 }
 
 /// What one client hears of a topic; ends when dropped.
@@ -290,13 +299,21 @@ pub struct Subscription {
     layout: Arc<Layout>,
     interval_min: Option<Duration>,
     not_before: Option<Instant>,
+    _waits: Option<Waits>,
 }
 
 impl Subscription {
     pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
         let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.waiting, taking.overflow));
         feed.join(&queue);
-        Self { feed, queue, layout, interval_min: taking.interval_min, not_before: None }
+        Self {
+            feed,
+            queue,
+            layout,
+            interval_min: taking.interval_min,
+            not_before: None,
+            _waits: taking.waits,
+        }
     }
 
     /// The topic.

@@ -6,6 +6,7 @@ use bytes::Bytes;
 use sgc_cdr::Layout;
 use sgc_ros::Guid;
 
+use crate::aside::aside_if_long;
 use crate::content::{Form, convert};
 use crate::error::GatewayError;
 
@@ -36,10 +37,16 @@ impl Message {
 
     /// The message in a form; `layout` is of its topic's type.
     pub fn written(&self, form: Form, layout: &Layout) -> Result<Bytes, GatewayError> {
-        match form {
-            Form::Cdr => Ok(self.payload.clone()),
-            Form::Json => self.json.get_or_init(|| convert(layout, &self.payload, form)).clone(),
-            Form::Cbor => self.cbor.get_or_init(|| convert(layout, &self.payload, form)).clone(),
+        let written = match form {
+            Form::Cdr => return Ok(self.payload.clone()),
+            Form::Json => &self.json,
+            Form::Cbor => &self.cbor,
+        };
+        if let Some(written) = written.get() {
+            return written.clone();
         }
+        // Who wants the same meanwhile waits for it, and is to hold up nobody either.
+        let make = || written.get_or_init(|| convert(layout, &self.payload, form));
+        aside_if_long(self.payload.len(), make).clone()
     }
 }

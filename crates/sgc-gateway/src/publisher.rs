@@ -1,36 +1,91 @@
 //! [`Publication`]: what one client publishes on a topic.
 
+use std::collections::VecDeque;
 use std::fmt;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_cdr::{Layout, Value};
-use sgc_ros::{EndpointKind, EndpointSpec, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_wire::{History, Qos};
 use tokio::time::Instant;
 
 use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::Shared;
+use crate::hub::{Shared, lock};
 
 /// How long readers may take to acknowledge what was written last before its writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
-/// How often it is looked whether readers are matched: a writer cannot be asked to tell.
-const MATCH_LOOK: Duration = Duration::from_millis(5);
+/// How long a thread waits for readers before it is looked whether anybody still wants that.
+const MATCH_WAIT_MAX: Duration = Duration::from_secs(1);
 /// Longest payload that the local network takes, bytes (`sgc-dds` refuses more).
-pub(crate) const PAYLOAD_BYTES_MAX: usize = 256 << 20;
+const PAYLOAD_BYTES_MAX: usize = 64 << 20;
+
+/// Messages that are written by one thread in one go, and their bytes: what is more waits until these are written.
+const AHEAD_MAX: usize = 64;
+const AHEAD_BYTES_MAX: usize = 64 << 10;
+/// A reliable writer that keeps its last messages does not wait for readers while these have not more bytes than that: Cyclone
+/// lets 30 kB be unacknowledged when it begins, more later.
+const UNACKNOWLEDGED_BYTES_MIN: usize = 24 << 10;
 
 /// What one client publishes on a topic; ends when dropped, once reliable readers have what was written.
 pub struct Publication {
     shared: Arc<Shared>,
-    writer: Arc<dyn RosWriter>,
+    line: Arc<Line>,
     layout: Arc<Layout>,
     topic: String,
     type_name: String,
-    /// Whether a write may wait for readers.
-    may_block: bool,
+    /// Longest message that is written without ever waiting for readers.
+    bytes_at_once_max: usize,
+    /// Whether a write may wait for readers, since one before it may: they keep their order.
+    may_block: AtomicBool,
+}
+
+/// A writer, and what waits to be written by a thread that may wait.
+struct Line {
+    writer: Arc<dyn RosWriter>,
+    ahead: Mutex<Ahead>,
+    /// Held by who writes what waits, so that it keeps its order.
+    turn: Mutex<()>,
+    published: AtomicU64,
+}
+
+#[derive(Default)]
+struct Ahead {
+    /// Source time stamps, nanoseconds since the Unix epoch, and payloads.
+    messages: VecDeque<(i64, Bytes)>,
+    bytes: usize,
+}
+
+impl Line {
+    /// Writes one message, which leaves with those that follow, or when the writer is flushed.
+    fn write(&self, stamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        self.writer.write_ahead(SampleKind::Write, stamp_ns, payload)?;
+        self.published.fetch_add(1, Ordering::Relaxed);
+        Ok(())
+    }
+
+    /// Writes what waits, up to the first message that cannot be written. May block.
+    fn write_out(&self) -> Result<(), RosError> {
+        let _turn = lock(&self.turn);
+        let next = || {
+            let mut ahead = lock(&self.ahead);
+            let next = ahead.messages.pop_front()?;
+            ahead.bytes -= next.1.len();
+            Some(next)
+        };
+        let mut written = Ok(());
+        while written.is_ok()
+            && let Some((stamp_ns, payload)) = next()
+        {
+            written = self.write(stamp_ns, payload);
+        }
+        self.writer.flush();
+        written
+    }
 }
 
 impl Publication {
@@ -40,7 +95,6 @@ impl Publication {
         type_name: String,
         qos: Qos,
     ) -> Result<Self, GatewayError> {
-        let may_block = qos.history == History::KeepAll && qos.is_reliable();
         shared
             .run(move |shared| {
                 let graph = shared.graph();
@@ -58,7 +112,12 @@ impl Publication {
                 };
                 let writer: Arc<dyn RosWriter> = Arc::from(shared.ros.writer(&spec)?);
                 shared.know(own_endpoint(EndpointKind::Writer, writer.guid(), &spec));
-                Ok(Self { shared: Arc::clone(shared), writer, layout, topic, type_name, may_block })
+                let (ahead, turn, published) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
+                let line = Arc::new(Line { writer, ahead, turn, published });
+                let bytes_at_once_max = bytes_at_once_max(&spec);
+                let may_block = AtomicBool::new(bytes_at_once_max == 0);
+                let shared = Arc::clone(shared);
+                Ok(Self { shared, line, layout, topic, type_name, bytes_at_once_max, may_block })
             })
             .await
     }
@@ -80,32 +139,76 @@ impl Publication {
 
     /// Publishes a message; waits for readers if the quality of service says so.
     pub async fn publish(&self, content: &Content) -> Result<(), GatewayError> {
-        let payload = content.to_cdr(&self.layout)?;
-        if payload.len() > PAYLOAD_BYTES_MAX {
-            return Err(GatewayError::TooLong { bytes: payload.len(), max: PAYLOAD_BYTES_MAX });
-        }
-        self.write(payload).await
+        self.publish_ahead(content).await?;
+        self.flush().await
+    }
+
+    /// The same, but the message need not leave before [`Self::flush`]: those that follow share packets with it, and changes
+    /// of threads. If readers are waited for, what fails may be a message before it.
+    pub async fn publish_ahead(&self, content: &Content) -> Result<(), GatewayError> {
+        self.write_ahead(content.to_cdr(&self.layout)?).await
     }
 
     /// The same with a value.
-    pub(crate) async fn publish_value(&self, value: &Value) -> Result<(), GatewayError> {
-        self.write(serialise(&self.layout, value)?).await
+    pub(crate) async fn publish_value_ahead(&self, value: &Value) -> Result<(), GatewayError> {
+        self.write_ahead(serialise(&self.layout, value)?).await
     }
 
-    async fn write(&self, payload: Bytes) -> Result<(), GatewayError> {
+    /// Publishes a value; waits for readers if the quality of service says so.
+    pub(crate) async fn publish_value(&self, value: &Value) -> Result<(), GatewayError> {
+        self.publish_value_ahead(value).await?;
+        self.flush().await
+    }
+
+    async fn write_ahead(&self, payload: Bytes) -> Result<(), GatewayError> {
+        if payload.len() > PAYLOAD_BYTES_MAX {
+            return Err(GatewayError::TooLong { bytes: payload.len(), max: PAYLOAD_BYTES_MAX });
+        }
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-        let stamp = since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX));
-        if !self.may_block {
-            return Ok(self.writer.write(SampleKind::Write, stamp, payload)?);
+        let stamp_ns = since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX));
+        if payload.len() > self.bytes_at_once_max {
+            self.may_block.store(true, Ordering::Relaxed);
+        }
+        if !self.may_block.load(Ordering::Relaxed) {
+            return Ok(self.line.write(stamp_ns, payload)?);
+        }
+        let is_full = {
+            let mut ahead = lock(&self.line.ahead);
+            ahead.bytes += payload.len();
+            ahead.messages.push_back((stamp_ns, payload));
+            ahead.messages.len() >= AHEAD_MAX || ahead.bytes >= AHEAD_BYTES_MAX
+        };
+        if is_full { self.flush().await } else { Ok(()) }
+    }
+
+    /// Has what was published ahead leave. After an error, which is of one message, that is lost, what is behind it waits for
+    /// the next call.
+    pub async fn flush(&self) -> Result<(), GatewayError> {
+        if !self.may_block.load(Ordering::Relaxed) {
+            self.line.writer.flush();
+            return Ok(());
+        }
+        if !self.has_ahead() {
+            return Ok(());
         }
         let _place = self.shared.waits.acquire().await.map_err(|_| GatewayError::Stopping)?;
-        let writer = Arc::clone(&self.writer);
-        self.shared.blocking(move |_| writer.write(SampleKind::Write, stamp, payload)).await
+        let line = Arc::clone(&self.line);
+        self.shared.blocking(move |_| line.write_out()).await
+    }
+
+    /// Whether messages wait that were published ahead.
+    pub fn has_ahead(&self) -> bool {
+        !lock(&self.line.ahead).messages.is_empty()
+    }
+
+    /// How many messages were published: those that wait are not counted yet.
+    pub fn published(&self) -> u64 {
+        self.line.published.load(Ordering::Relaxed)
     }
 
     /// How many local readers hear it at present.
     pub fn matched_readers(&self) -> u32 {
-        self.writer.matched_readers()
+        self.line.writer.matched_readers()
     }
 
     /// Waits until so many readers hear it, or for so long; says how many do.
@@ -113,10 +216,15 @@ impl Publication {
         let until = Instant::now() + max;
         loop {
             let matched = self.matched_readers();
-            if matched >= readers || Instant::now() >= until {
+            let left = until.saturating_duration_since(Instant::now()).min(MATCH_WAIT_MAX);
+            if matched >= readers || left.is_zero() {
                 return matched;
             }
-            tokio::time::sleep(MATCH_LOOK).await;
+            let line = Arc::clone(&self.line);
+            let waited = self.shared.blocking(move |_| Ok(line.writer.wait_matched(readers, left)));
+            if waited.await.is_err() {
+                return matched;
+            }
         }
     }
 
@@ -140,15 +248,30 @@ impl fmt::Debug for Publication {
 
 impl Drop for Publication {
     fn drop(&mut self) {
-        let (shared, writer) = (Arc::clone(&self.shared), Arc::clone(&self.writer));
+        let (shared, line) = (Arc::clone(&self.shared), Arc::clone(&self.line));
         let place = Arc::clone(&shared.farewells).try_acquire_owned();
         self.shared.runtime.spawn_blocking(move || {
             // Where many end at once, not all can be waited for.
             if place.is_ok() {
-                writer.wait_acknowledged(FAREWELL_MAX);
+                if let Err(error) = line.write_out() {
+                    tracing::debug!(%error, "what was published last is lost");
+                }
+                line.writer.wait_acknowledged(FAREWELL_MAX);
             }
-            shared.forget(&[writer.guid()]);
-            drop(writer);
+            shared.forget(&[line.writer.guid()]);
+            drop(line);
         });
+    }
+}
+
+/// Longest message that a writer never has to wait with; 0 if it may with any.
+fn bytes_at_once_max(spec: &EndpointSpec) -> usize {
+    match (spec.qos.is_reliable(), &spec.qos.history) {
+        (false, _) => usize::MAX,
+        // Of each instance of a topic with keys so many are kept.
+        (true, History::KeepLast(depth)) if spec.keyless => {
+            UNACKNOWLEDGED_BYTES_MIN / (*depth as usize).max(1)
+        }
+        (true, _) => 0,
     }
 }

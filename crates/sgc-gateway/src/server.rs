@@ -27,7 +27,7 @@ use crate::hub::Hub;
 use crate::rosbridge::{self, Authenticate, RosbridgeOptions, StillAdmits};
 use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
-use crate::ws::upgrade;
+use crate::ws::{UpgradeError, upgrade};
 
 /// How long TLS and the upgrade may take together; of gRPC, TLS and the first call that is admitted.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
@@ -410,7 +410,8 @@ async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
     let upgraded = upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS);
     let upgraded = match tokio::time::timeout_at(deadline, upgraded).await {
         Ok(Ok(upgraded)) => upgraded,
-        Ok(Err(error)) => {
+        Ok(Err(UpgradeError::NotAdmitted)) => return,
+        Ok(Err(UpgradeError::Socket(error))) => {
             tracing::debug!(%peer, %error, "no WebSocket");
             return door.count("no WebSocket");
         }

@@ -35,6 +35,8 @@ pub struct SessionLimits {
     pub servings_max: usize,
     /// Calls under way.
     pub calls_max: usize,
+    /// Subscriptions that the local network waits for: each has a reader and a part of the bytes of its own.
+    pub waits_max: usize,
 }
 
 impl Default for SessionLimits {
@@ -45,6 +47,7 @@ impl Default for SessionLimits {
             publications_max: 256,
             servings_max: 256,
             calls_max: 256,
+            waits_max: WAITING_PARTS,
         }
     }
 }
@@ -83,8 +86,22 @@ pub struct Session {
     hub: Hub,
     client: Client,
     limits: SessionLimits,
-    calls: AtomicUsize,
+    calls: Arc<AtomicUsize>,
     waiting: Arc<AtomicUsize>,
+    waits: Arc<AtomicUsize>,
+}
+
+/// A subscription that is waited for, counted while it lasts.
+#[derive(Clone, Debug)]
+pub(crate) struct Waits(#[expect(dead_code, reason = "it is for its end")] Arc<CountedWaits>);
+
+#[derive(Debug)]
+struct CountedWaits(Arc<AtomicUsize>);
+
+impl Drop for CountedWaits {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// A call of a client's, counted while it lasts.
@@ -99,7 +116,21 @@ impl Drop for Counted<'_> {
 impl Session {
     /// A client's.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
-        Self { hub: hub.clone(), client, limits, calls: AtomicUsize::new(0), waiting: Arc::default() }
+        Self {
+            hub: hub.clone(),
+            client,
+            limits,
+            calls: Arc::default(),
+            waiting: Arc::default(),
+            waits: Arc::default(),
+        }
+    }
+
+    /// The same program's, now that it is another client: what it has already counts against its bounds.
+    pub fn again(&self, client: Client) -> Self {
+        let (hub, limits) = (self.hub.clone(), self.limits);
+        let [calls, waiting, waits] = [&self.calls, &self.waiting, &self.waits].map(Arc::clone);
+        Self { hub, client, limits, calls, waiting, waits }
     }
 
     /// Who it is.
@@ -208,6 +239,7 @@ impl Session {
     /// Subscribes to what belongs to something that the client may use.
     pub(crate) async fn subscribe_checked(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
+        let waits = if wanted.waits { Some(self.take_wait()?) } else { None };
         let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
         let taking = Intaking {
             depth: wanted.depth,
@@ -219,8 +251,17 @@ impl Session {
             waiting: Arc::clone(&self.waiting),
             interval_min: wanted.interval_min,
             overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
+            waits,
         };
         self.hub.shared.subscribe(key, taking).await
+    }
+
+    /// A place for one more subscription that is waited for.
+    fn take_wait(&self) -> Result<Waits, GatewayError> {
+        let before = self.waits.fetch_add(1, Ordering::Relaxed);
+        let place = Waits(Arc::new(CountedWaits(Arc::clone(&self.waits))));
+        self.check_count("subscriptions that are waited for", before, self.limits.waits_max)?;
+        Ok(place)
     }
 
     /// Becomes a publisher.

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_cdr::{Layout, Library, TypeError, TypeName};
 
+use crate::aside::aside;
 use crate::error::GatewayError;
 
 /// Types remembered; when there are more, all are looked up anew.
@@ -103,12 +104,13 @@ impl Types {
             what: "message",
             example: "std_msgs/msg/String",
         })?;
-        let found = Library::empty().layout(&name, &mut |file| self.finder.text(file)).map(Arc::new);
+        let find = || Library::empty().layout(&name, &mut |file| self.finder.text(file));
+        let found = aside(find).map(Arc::new);
         let is_it = |layout: &Arc<Layout>| hash.is_none_or(|hash| layout.type_hash() == hash);
         let mut is_sure = true;
         let layout = match found {
             Ok(layout) if is_it(&layout) => layout,
-            found => match (self.finder.described(&name, hash), found) {
+            found => match (aside(|| self.finder.described(&name, hash)), found) {
                 (Some(described), _) => described,
                 // A hash that says otherwise may be of another way to compute it; what does not fit is found when decoding. Or
                 // the description is on its way.
@@ -140,7 +142,7 @@ impl Types {
         })?;
         let file = TypeName::new(name.package(), name.kind(), name.file_stem());
         let file = file.ok_or_else(|| unknown(name.clone()))?;
-        self.finder.text(&file).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
+        aside(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
     }
 
     fn lock(&self) -> MutexGuard<'_, Known> {

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use http::StatusCode;
 use http::header::{AUTHORIZATION, ORIGIN, SEC_WEBSOCKET_PROTOCOL};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::{WebSocketStream, tungstenite};
 
 use crate::access::Client;
 use crate::door::{Arrival, Door};
@@ -26,14 +26,25 @@ pub(crate) struct Upgraded<S> {
     pub(crate) subprotocol: Option<&'static str>,
 }
 
+/// Why a connection is not upgraded.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum UpgradeError {
+    /// Its client is not admitted, which the door has counted.
+    #[error("not admitted")]
+    NotAdmitted,
+    /// What came is no upgrade, or the connection ended.
+    #[error("no WebSocket: {0}")]
+    Socket(Box<tungstenite::Error>),
+}
+
 /// Upgrades a connection, if its client is admitted; `known` are subprotocols, the best first.
 pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     arrival: &Arrival,
     door: &Arc<Door>,
     known: &[&'static str],
-) -> Result<Upgraded<S>, tokio_tungstenite::tungstenite::Error> {
-    let mut found = None;
+) -> Result<Upgraded<S>, UpgradeError> {
+    let (mut found, mut is_refused) = (None, false);
     // The size of what it returns is the library's choice.
     #[allow(clippy::result_large_err)]
     let decide = |request: &Request, mut response: Response| -> Result<Response, ErrorResponse> {
@@ -45,9 +56,10 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
         let token = bearer.or_else(|| request.uri().query().and_then(token_in));
         // What is no text is no page that is known.
         let origin = request.headers().get(ORIGIN).map(|value| value.to_str().unwrap_or("?"));
-        let client = door
-            .admit(arrival, origin, token.as_deref())
-            .map_err(|denied| refusal(StatusCode::UNAUTHORIZED, denied.told()))?;
+        let client = door.admit(arrival, origin, token.as_deref()).map_err(|denied| {
+            is_refused = true;
+            refusal(StatusCode::UNAUTHORIZED, denied.told())
+        })?;
         let offered: Vec<&str> = request
             .headers()
             .get_all(SEC_WEBSOCKET_PROTOCOL)
@@ -66,9 +78,13 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     let mut config = WebSocketConfig::default();
     config.max_message_size = Some(MESSAGE_BYTES_MAX);
     config.max_frame_size = Some(MESSAGE_BYTES_MAX);
-    let socket = tokio_tungstenite::accept_hdr_async_with_config(stream, decide, Some(config)).await?;
+    let accepted = tokio_tungstenite::accept_hdr_async_with_config(stream, decide, Some(config)).await;
+    if is_refused {
+        return Err(UpgradeError::NotAdmitted);
+    }
+    let socket = accepted.map_err(|error| UpgradeError::Socket(Box::new(error)))?;
     let Some((client, subprotocol)) = found else {
-        return Err(tokio_tungstenite::tungstenite::Error::ConnectionClosed);
+        return Err(UpgradeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)));
     };
     Ok(Upgraded { socket, client, subprotocol })
 }
@@ -101,7 +117,33 @@ fn percent_decoded(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, duplex};
+
     use super::*;
+    use crate::access::Access;
+
+    #[tokio::test]
+    async fn who_is_not_admitted_is_told_so_and_counted_once() {
+        let door = Door::new(Access::default(), 1);
+        let peer = "192.0.2.1:1000".parse().unwrap();
+        let arrival = Arrival { peer, is_encrypted: false, certificate: None };
+        let ask = async |text: &str| {
+            let (near, mut far) = duplex(4096);
+            far.write_all(text.as_bytes()).await.unwrap();
+            let refused = upgrade(near, &arrival, &door, &[]).await.unwrap_err();
+            let mut told = String::new();
+            far.read_to_string(&mut told).await.unwrap();
+            (refused, told)
+        };
+        let upgrade = "GET / HTTP/1.1\r\nHost: arm-1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+            Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+        let (refused, told) = ask(upgrade).await;
+        assert!(matches!(refused, UpgradeError::NotAdmitted), "{refused}");
+        assert!(told.starts_with("HTTP/1.1 401") && told.contains("not admitted: "), "{told}");
+        assert_eq!(door.refused(), [("not admitted".to_owned(), 1)].into());
+        let (refused, _) = ask("SSH-2.0-x\r\n\r\n").await;
+        assert!(matches!(refused, UpgradeError::Socket(_)), "{refused}");
+    }
 
     #[test]
     fn a_token_may_stand_in_the_url() {

@@ -272,6 +272,10 @@ async fn parameters_are_those_of_nodes() {
 
     viewer.say(json!({"op": "getParameters", "parameterNames": ["exposure"], "id": "wrong"})).await;
     viewer.status("is no parameter: write one such as").await;
+    let wrong: Vec<_> = (0..100).map(|n| format!("exposure{n}")).collect();
+    viewer.say(json!({"op": "getParameters", "parameterNames": wrong, "id": "wrong"})).await;
+    viewer.status("\"exposure15\" is no parameter").await;
+    viewer.status("84 more of the same question failed").await;
     viewer.say(json!({"op": "unsubscribeParameterUpdates", "parameterNames": []})).await;
     eventually(|| site.hub.readers() == 0).await;
 }

@@ -6,7 +6,7 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
-use sgc_gateway::{Advertise, Content, Form, GatewayError, Scope, Subscribe};
+use sgc_gateway::{Advertise, Client, Content, Form, GatewayError, Scope, Session, SessionLimits, Subscribe};
 use sgc_ros::{RosNetwork, RosWriter, SampleKind};
 use sgc_wire::{Durability, History, Qos, Reliability};
 
@@ -91,6 +91,43 @@ async fn clients_publish_for_programs_and_for_each_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_published_ahead_keeps_its_order_and_each_loss_is_told() {
+    let site = Site::new().await;
+    let (texts, _reader) = site.reader("/log");
+    let session = site.session("logger");
+    let text = |number: u32| Content::cdr(string(&number.to_string()));
+    let keep_all = Qos { history: History::KeepAll, ..Qos::default() };
+    for qos in [keep_all, Qos { history: History::KeepLast(10), ..Qos::default() }] {
+        let may_wait = qos.history == History::KeepAll;
+        let wanted = Advertise { topic: "/log".into(), type_name: Some(STRING.into()), qos };
+        let publication = session.advertise(wanted).await.unwrap();
+        site.domain.refuse_write("rt/log", string("7"));
+        let mut lost = 0;
+        for number in 0..200 {
+            lost += u32::from(publication.publish_ahead(&text(number)).await.is_err());
+        }
+        while let Err(why) = publication.flush().await {
+            assert!(matches!(why, GatewayError::Ros(_)), "{why}");
+            lost += 1;
+        }
+        assert!(!publication.has_ahead());
+        assert_eq!((lost, publication.published()), (1, 199), "{may_wait}");
+        // Longer ones are behind those that they follow.
+        let long = string(&"x".repeat(100 << 10));
+        publication.publish_ahead(&text(200)).await.unwrap();
+        publication.publish_ahead(&Content::cdr(long.clone())).await.unwrap();
+        publication.publish_ahead(&text(201)).await.unwrap();
+        // Its end is one of those that have it leave.
+        drop(publication);
+        let heard = || texts.recv_timeout(Duration::from_secs(5)).unwrap();
+        for number in (0..200).filter(|number| *number != 7) {
+            assert_eq!(heard(), string(&number.to_string()), "{may_wait}");
+        }
+        assert_eq!((heard(), heard(), heard()), (string("200"), long, string("201")), "{may_wait}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn services_are_called_and_served() {
     let site = Site::new().await;
     let (server, caller) = (site.session("server"), site.session("caller"));
@@ -132,9 +169,9 @@ async fn a_slow_client_loses_the_oldest_and_is_told_how_many() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_waited_for_shares_a_reader_with_nobody() {
+async fn who_is_waited_for_shares_a_reader_with_nobody_which_keeps_all() {
     let site = Site::new().await;
-    let _talker = site.writer("/odom", Qos::default());
+    let _talker = site.writer("/odom", Qos { history: History::KeepLast(5), ..Qos::default() });
     site.knows("/odom").await;
     let session = site.session("recorder");
     let _waiting = session.subscribe(Subscribe { waits: true, ..hear("/odom") }).await.unwrap();
@@ -143,6 +180,10 @@ async fn who_is_waited_for_shares_a_reader_with_nobody() {
         site.session("two").subscribe(hear("/odom")).await.unwrap(),
     ];
     assert_eq!(site.hub.readers(), 2);
+    let graph = site.hub.graph();
+    let readers = graph.topics["/odom"].subscribers.iter();
+    let keep_all = readers.filter(|reader| reader.qos.history == History::KeepAll).count();
+    assert_eq!(keep_all, 1);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -198,4 +239,29 @@ async fn a_gateway_that_stops_ends_its_subscriptions_and_leaves_nothing_behind()
     assert!(heard.next().await.is_none());
     assert_eq!(talker.matched_readers(), 0);
     let _ = site.ros.announce(&[]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn subscriptions_that_are_waited_for_are_few_and_what_ends_makes_room() {
+    let site = Site::new().await;
+    let client = site.session("client");
+    let limits = SessionLimits { waits_max: 2, ..SessionLimits::default() };
+    let session = Session::new(&site.hub, client.client().clone(), limits);
+    let wanted = |waits| Subscribe {
+        topic: "/chatter".into(),
+        type_name: Some(STRING.into()),
+        waits,
+        ..Subscribe::default()
+    };
+    let first = session.subscribe(wanted(true)).await.unwrap();
+    let _second = session.subscribe(wanted(true)).await.unwrap();
+    let refused = session.subscribe(wanted(true)).await.err();
+    let told = GatewayError::TooMany { what: "subscriptions that are waited for", max: 2 };
+    assert_eq!(refused, Some(told));
+    let _other = session.subscribe(wanted(false)).await.unwrap();
+    // It is the same program's, whoever it says it is.
+    let again = session.again(Client::own("again"));
+    assert!(again.subscribe(wanted(true)).await.is_err());
+    drop(first);
+    let _third = again.subscribe(wanted(true)).await.unwrap();
 }

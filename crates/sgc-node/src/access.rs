@@ -6,17 +6,21 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use sgc_gateway::{ACCESS_VALID_MS_MAX, Access, AccessGrant, AccessRules, ClientRule, Right, Scope, TokenId};
+use sgc_gateway::{
+    ACCESS_VALID_MS_MAX, Access, AccessGrant, AccessRules, ClientRule, HearRefusals, Right, Scope, TokenId,
+};
 use sgc_trust::{AnchorError, Identity};
 use sgc_wire::{Now, UnixMillis};
 
+use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::config::{Config, Recipient};
 use crate::credentials::with_kept_crls;
 use crate::partners::{PartnerError, Partners};
 use crate::policy;
-use crate::state::{self, StateLock};
+use crate::records::{self, Records};
 
 /// Most tokens of one node that have not ended, revoked ones among them.
 pub const ACCESS_TOKENS_MAX: usize = 1024;
@@ -73,6 +77,14 @@ pub fn access_with(
         revoked: records.revoked()?.collect(),
         names: names.collect(),
     })))
+}
+
+/// Writes down each access token that is refused.
+pub(crate) fn refused_tokens(audit: Audit) -> HearRefusals {
+    Arc::new(move |peer, denied| {
+        let record = AuditRecord::new(AuditEvent::TokenRefused);
+        audit.write(record.remote(peer).reason(denied));
+    })
 }
 
 /// The access tokens that a node made, `access.json` in its state directory. No token is in it.
@@ -153,19 +165,25 @@ impl AccessRecord {
     }
 }
 
+impl Records for AccessRecords {
+    type Error = AccessError;
+    const FILE: &str = RECORDS_FILE;
+    const BYTES_MAX: u64 = RECORDS_BYTES_MAX;
+    const VERSION: u32 = RECORDS_VERSION;
+
+    fn version(&self) -> u32 {
+        self.version
+    }
+
+    fn failed(path: PathBuf, source: io::Error) -> AccessError {
+        AccessError::Records { path, source }
+    }
+}
+
 impl AccessRecords {
     /// Reads them; none if there is no file. One that cannot be read is an error: it may hold what was revoked.
     pub fn load(state: &Path) -> Result<Self, AccessError> {
-        let path = state.join(RECORDS_FILE);
-        let failed = |source| AccessError::Records { path: path.clone(), source };
-        let Some(text) = state::read(&path, RECORDS_BYTES_MAX).map_err(failed)? else {
-            return Ok(Self::default());
-        };
-        let records: Self = serde_json::from_slice(&text).map_err(|e| failed(e.into()))?;
-        if records.version != RECORDS_VERSION {
-            return Err(failed(io::Error::other(format!("version {} is not known here", records.version))));
-        }
-        Ok(records)
+        records::load(state)
     }
 
     /// Changes them on the disk, as nobody else does at the same time.
@@ -173,14 +191,7 @@ impl AccessRecords {
         state: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, AccessError>,
     ) -> Result<T, AccessError> {
-        let path = state.join(RECORDS_FILE);
-        let failed = |source| AccessError::Records { path: path.clone(), source };
-        let _lock = StateLock::take(state).map_err(failed)?;
-        let mut records = Self::load(state)?;
-        let done = change(&mut records)?;
-        let text = serde_json::to_vec_pretty(&records).map_err(|e| failed(e.into()))?;
-        state::replace(&path, &text).map_err(failed)?;
-        Ok(done)
+        records::change(state, change)
     }
 
     /// Adds one; those that ended before `now` leave.
@@ -369,6 +380,24 @@ mod tests {
         assert_eq!(admit(), Err(Denied::TokenRevoked { id: grant.id }));
         std::fs::write(cast.dir.path().join(RECORDS_FILE), "?").unwrap();
         assert!(cast.access("[gateway]").is_err(), "what was revoked is not known, so nobody is admitted");
+    }
+
+    #[test]
+    fn a_token_that_is_refused_stands_in_the_audit_log_without_itself() {
+        let cast = Cast::new();
+        let log = cast.dir.path().join("audit.jsonl");
+        let (audit, writer) = Audit::open(&log, 1 << 20, Default::default()).unwrap();
+        let access = cast.access("[gateway]").unwrap().unwrap().heard_by(refused_tokens(audit));
+        let text = "sgc-access-1:AAAA";
+        assert!(access.admit(&Admission { token: Some(text), ..elsewhere() }).is_err());
+        drop(access);
+        writer.finish();
+        let mut records = Vec::new();
+        crate::audit::read(&log, |record| records.push(record)).unwrap();
+        let [record] = &records[..] else { panic!("{records:?}") };
+        assert_eq!((&*record.event, record.remote.as_deref()), ("token_refused", Some("10.0.0.9:1")));
+        let why = record.reason.as_ref().unwrap();
+        assert!(why.starts_with("a token was shown that does not hold: ") && !why.contains(text), "{why}");
     }
 
     #[test]

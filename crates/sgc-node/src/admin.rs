@@ -402,6 +402,10 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
     let write = async {
         into.write_all(format!("{what}\n").as_bytes()).await?;
         while let Some((message, dropped)) = tap.queue.pop().await {
+            let message = match message.is_raw() {
+                true => tokio::task::spawn_blocking(|| message.read()).await.map_err(io::Error::other)?,
+                false => message,
+            };
             let head = TapHead::of(&message, begun, dropped, most);
             let carried = message.payload.get(..head.carried as usize).unwrap_or_default();
             let write = async {

@@ -161,7 +161,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
     {
         let (mut source, grant) = source(suite);
         let (requests, _requested) = mpsc::channel(1);
-        let sink = Arc::new(LocalSink::new(NAME, false, requests));
+        let sink = Arc::new(LocalSink::new(NAME, false, requests, Arc::default()));
         let data = Arc::<DataPlane>::default();
         sink.grant(SinkId([9; 16]), grant, &data);
         let (alive, _) = mpsc::channel(1);

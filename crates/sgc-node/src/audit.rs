@@ -35,6 +35,8 @@ const FILE_NAME: &str = "audit.jsonl";
 /// Refusals of one kind kept in a minute: whoever is refused for ever must not push out what is older.
 const REFUSALS_PER_MINUTE_MAX: u32 = 120;
 const MINUTE_MS: u64 = 60_000;
+/// The kinds of them.
+const REFUSALS: [AuditEvent; 3] = [AuditEvent::Refused, AuditEvent::LinkRefused, AuditEvent::TokenRefused];
 
 /// What happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,13 +69,19 @@ pub enum AuditEvent {
     Renewed,
     /// The configuration was read again.
     Reload,
+    /// An access token was made for the gateway.
+    TokenMade,
+    /// One was taken back.
+    TokenRevoked,
+    /// One was shown at the gateway that does not hold.
+    TokenRefused,
     /// Records were lost.
     Lost,
 }
 
 impl AuditEvent {
     /// All of them.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 18] = [
         Self::Started,
         Self::Stopped,
         Self::Granted,
@@ -88,6 +96,9 @@ impl AuditEvent {
         Self::Crl,
         Self::Renewed,
         Self::Reload,
+        Self::TokenMade,
+        Self::TokenRevoked,
+        Self::TokenRefused,
         Self::Lost,
     ];
 
@@ -108,6 +119,9 @@ impl AuditEvent {
             Self::Crl => "crl",
             Self::Renewed => "renewed",
             Self::Reload => "reload",
+            Self::TokenMade => "token_made",
+            Self::TokenRevoked => "token_revoked",
+            Self::TokenRefused => "token_refused",
             Self::Lost => "audit_lost",
         }
     }
@@ -228,7 +242,7 @@ struct Shared {
     records: SyncSender<Option<AuditRecord>>,
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
-    refusals: [Mutex<Window>; 2],
+    refusals: [Mutex<Window>; REFUSALS.len()],
     lost_total: AtomicU64,
 }
 
@@ -289,8 +303,7 @@ impl Audit {
     /// Hands a record over; never waits.
     pub fn write(&self, mut record: AuditRecord) {
         let Some(shared) = &self.shared else { return };
-        let refusal =
-            [AuditEvent::Refused, AuditEvent::LinkRefused].iter().position(|e| e.label() == record.event);
+        let refusal = REFUSALS.iter().position(|event| event.label() == record.event);
         if let Some(Ok(mut window)) = refusal.and_then(|at| shared.refusals.get(at)).map(Mutex::lock)
             && !window.takes(record.unix_ms)
         {
@@ -337,6 +350,16 @@ impl AuditWriter {
         let _ = self.shared.records.send(None);
         let _ = self.thread.join();
     }
+}
+
+/// Adds a record to the log at `path` from beside the node that writes it, which may run or not. It is on the disk then.
+pub fn append(path: &Path, record: &AuditRecord) -> io::Result<()> {
+    // How long the log may be is for the node to say, which puts it aside.
+    let mut file = LogFile::open(path, u64::MAX)?;
+    let mut line = String::new();
+    push_line(&mut line, record);
+    file.append(&line)?;
+    file.file.sync_data()
 }
 
 /// Where a node with this state directory keeps its log.

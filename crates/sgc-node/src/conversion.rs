@@ -1,17 +1,13 @@
 //! Messages that travel as JSON: CDR to JSON before they are sealed, and back behind the seal.
 //!
-//! Both need to know what messages of the type look like, which may become known later than the first of them comes. What
-//! JSON of a message is, `sgc-cdr` says (docs/spec/json.md).
+//! Both need to know what messages of the type look like, which may become known later than the first of them comes: those
+//! are held (`hold.rs`) by the ends of the topic. What JSON of a message is, `sgc-cdr` says (docs/spec/json.md).
 
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::Bytes;
 use sgc_cdr::{CdrVersion, DecodeError, Encoding, Layout, ValueError};
 use sgc_wire::Representations;
-
-/// How long what came waits for its type to be known: as long as an owner may take to be asked.
-pub(crate) const TYPE_WAIT_MAX: Duration = Duration::from_secs(5);
 
 /// What is known of a type.
 #[derive(Clone, Debug, Default)]
@@ -19,9 +15,11 @@ pub(crate) enum KnownType {
     /// It is being found out.
     #[default]
     Awaited,
+    /// There is no definition here; its owner is asked, and may not know either.
+    Asked,
     /// What its messages look like.
     Known(Arc<Layout>),
-    /// It is not known: there is no definition here, and nobody told one.
+    /// It is not known: there is no definition here, and nobody is asked for one.
     Lacking,
 }
 
@@ -30,27 +28,29 @@ impl KnownType {
     pub(crate) fn layout(&self) -> Option<&Arc<Layout>> {
         match self {
             Self::Known(layout) => Some(layout),
-            Self::Awaited | Self::Lacking => None,
+            Self::Awaited | Self::Asked | Self::Lacking => None,
         }
+    }
+
+    /// Whether it may become known.
+    pub(crate) fn is_awaited(&self) -> bool {
+        matches!(self, Self::Awaited | Self::Asked)
+    }
+
+    /// Whether there is no definition here, and none may come.
+    pub(crate) fn is_lacking(&self) -> bool {
+        matches!(self, Self::Asked | Self::Lacking)
     }
 }
 
 /// What is known of the type of an interface, for its end at this node.
 #[derive(Debug, Default)]
-pub(crate) struct TypeSlot {
-    known: Mutex<KnownType>,
-    changed: Condvar,
-}
+pub(crate) struct TypeSlot(Mutex<KnownType>);
 
 impl TypeSlot {
-    /// Tells those who wait for it. What is known stays so until it is something else.
+    /// It stays so until it is something else.
     pub(crate) fn set(&self, known: KnownType) {
-        let mut slot = self.lock();
-        // That somebody is asked again makes nobody wait a second time.
-        if !matches!((&*slot, &known), (KnownType::Lacking, KnownType::Awaited)) {
-            *slot = known;
-        }
-        self.changed.notify_all();
+        *self.lock() = known;
     }
 
     /// What is known now.
@@ -58,23 +58,8 @@ impl TypeSlot {
         self.lock().clone()
     }
 
-    /// What messages look like, as soon as it is known. Blocks; whoever waited in vain has nobody wait again.
-    pub(crate) fn wait(&self, max: Duration) -> Option<Arc<Layout>> {
-        let deadline = Instant::now() + max;
-        let mut slot = self.lock();
-        while matches!(*slot, KnownType::Awaited) {
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() {
-                *slot = KnownType::Lacking;
-            } else {
-                slot = self.changed.wait_timeout(slot, left).unwrap_or_else(PoisonError::into_inner).0;
-            }
-        }
-        slot.layout().cloned()
-    }
-
     fn lock(&self) -> MutexGuard<'_, KnownType> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -148,22 +133,5 @@ mod tests {
             let refused = from_json(&layout, json, Representations::XCDR1).unwrap_err();
             assert!(matches!(refused, ConversionError::FromJson(_)), "{refused}");
         }
-    }
-
-    #[test]
-    fn who_waits_for_a_type_gets_it_or_gives_up_once() {
-        let slot = Arc::new(TypeSlot::default());
-        let waits = {
-            let slot = slot.clone();
-            std::thread::spawn(move || slot.wait(Duration::from_secs(60)))
-        };
-        slot.set(KnownType::Known(Arc::new(layout())));
-        assert!(waits.join().unwrap().is_some());
-        let slot = TypeSlot::default();
-        assert!(slot.wait(Duration::from_millis(1)).is_none());
-        slot.set(KnownType::Awaited);
-        assert!(slot.wait(Duration::from_secs(60)).is_none(), "and not at the end of a minute");
-        slot.set(KnownType::Known(Arc::new(layout())));
-        assert!(slot.wait(Duration::ZERO).is_some());
     }
 }

@@ -555,6 +555,7 @@ impl<N: RosNetwork> Core<N> {
             self.endpoint.rotate(now, &name);
         }
         self.calls_due(now.instant);
+        self.types_due(now.instant);
         self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
@@ -596,7 +597,7 @@ impl<N: RosNetwork> Core<N> {
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due];
                 let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
-                let all = all.into_iter().chain(own);
+                let all = all.into_iter().chain(own).chain([self.types.deadline()]);
                 return all.flatten().min();
             }
         }

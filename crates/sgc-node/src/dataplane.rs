@@ -14,6 +14,7 @@ use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
 use crate::heart::Activity;
+use crate::hold::Holds;
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
 use crate::sinks::LocalSink;
@@ -53,6 +54,7 @@ pub(crate) struct DataPlane {
     shards: [ArcSwap<HashMap<Name, Arc<Forward>>>; SHARDS],
     drops: Drops,
     rates: PeerRates,
+    holds: Arc<Holds>,
 }
 
 impl Default for DataPlane {
@@ -64,7 +66,13 @@ impl Default for DataPlane {
 impl DataPlane {
     /// Empty tables.
     pub(crate) fn new(rates: PeerRates) -> Self {
-        Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops: Drops::default(), rates }
+        let (drops, holds) = (Drops::default(), Arc::default());
+        Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops, rates, holds }
+    }
+
+    /// What its topics hold for want of something to be known.
+    pub(crate) fn holds(&self) -> &Arc<Holds> {
+        &self.holds
     }
 
     /// What peers may send into it.

@@ -96,7 +96,9 @@ fn files_of(file: &Path, config: &Config) -> Vec<PathBuf> {
         TokenSource::Text(_) => None,
     });
     let cas = config.partners.iter().map(|partner| &partner.ca).chain(&config.trust).chain(&config.accept);
-    let named: BTreeSet<PathBuf> = tokens.chain(cas).cloned().collect();
+    let shown = config.gateway.iter().filter_map(|gateway| gateway.tls.as_ref());
+    let shown = shown.flat_map(|tls| [&tls.certificate, &tls.key]);
+    let named: BTreeSet<PathBuf> = tokens.chain(cas).chain(shown).cloned().collect();
     std::iter::once(file.to_owned()).chain(named).collect()
 }
 
@@ -168,5 +170,20 @@ impl Bell {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_gateway_shows_is_watched_as_other_files_that_are_named() {
+        let text = "identity = 'x'\n[node]\nrouters = ['quic://r']\n[gateway]\nlisten = ['wss://0.0.0.0']\n\
+                    certificate = 'a.pem'\nkey = 'a.key'\n";
+        let config = crate::config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();
+        let files = files_of(Path::new("/etc/sgc/node.toml"), &config);
+        let wanted = ["/etc/sgc/node.toml", "/etc/sgc/a.key", "/etc/sgc/a.pem"].map(PathBuf::from);
+        assert_eq!(files, wanted);
     }
 }

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, MutexGuard, PoisonError};
 
 use rustls::sign::CertifiedKey;
+use rustls_pki_types::CertificateDer;
 use sgc_cdr::{Layout, TypeName};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
@@ -65,6 +66,8 @@ pub(crate) struct Gateway {
     node: String,
     hub: OnceCell<Hub>,
     server: std::sync::Mutex<Option<Arc<Server>>>,
+    /// The certificates that are shown.
+    shown: std::sync::Mutex<Vec<CertificateDer<'static>>>,
 }
 
 impl Gateway {
@@ -77,7 +80,8 @@ impl Gateway {
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
         let (types, hub, server) =
             (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
-        Arc::new(Self { open, types, name: node_name.to_owned(), node, hub, server })
+        let (name, shown) = (node_name.to_owned(), std::sync::Mutex::default());
+        Arc::new(Self { open, types, name, node, hub, server, shown })
     }
 
     /// The hub, which joins the local network if it has not yet.
@@ -107,18 +111,28 @@ impl Gateway {
             SessionLimits { waiting_bytes_max: sockets.client_bytes_max, ..SessionLimits::default() };
         let Sockets { listen, access, key, clients_max, .. } = sockets;
         let name = format!("sgc {}", self.name);
+        self.show(&key);
         let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
         *self.lock() = Some(Arc::new(server));
         Ok(())
     }
 
-    /// Other rules and another certificate from now on.
-    pub(crate) fn reconfigure(&self, access: Access, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
-        match self.server() {
-            Some(server) => server.reconfigure(access, Some(key)),
-            None => Ok(()),
+    /// Other rules and another certificate from now on; says whether it is another.
+    pub(crate) fn reconfigure(&self, access: Access, key: &Arc<CertifiedKey>) -> Result<bool, ServerError> {
+        let Some(server) = self.server() else { return Ok(false) };
+        server.reconfigure(access, Some(key))?;
+        Ok(self.show(key))
+    }
+
+    /// Keeps which certificates are shown; says whether they are others.
+    fn show(&self, key: &CertifiedKey) -> bool {
+        let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_other = *shown != key.cert;
+        if is_other {
+            shown.clone_from(&key.cert);
         }
+        is_other
     }
 
     /// What goes on, if there are sockets.
@@ -202,4 +216,29 @@ pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
         addr: url.address,
     };
     config.listen.iter().map(at).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_chacha::ChaCha20Rng;
+    use rand_chacha::rand_core::SeedableRng as _;
+    use sgc_gateway::Shipped;
+    use sgc_trust::{EnrollRequest, Fleet};
+    use sgc_wire::UnixMillis;
+
+    use super::*;
+
+    #[test]
+    fn a_reload_says_whether_another_certificate_is_shown() {
+        let (rng, now) = (&mut ChaCha20Rng::seed_from_u64(8), UnixMillis(1_795_000_000_000));
+        let mut fleet = Fleet::create("lab".parse().unwrap(), now, rng).unwrap();
+        let mut key = |name: &str| {
+            let request = EnrollRequest::new(name.parse().unwrap(), now);
+            fleet.enroll(&request, rng).unwrap().certified_key()
+        };
+        let (one, other) = (key("one"), key("other"));
+        let gateway = Gateway::new(None, "arm-1", Shipped);
+        assert!(gateway.show(&one) && !gateway.show(&one));
+        assert!(gateway.show(&other) && gateway.show(&one));
+    }
 }

@@ -24,7 +24,7 @@ use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::access::{AccessError, access_with};
+use crate::access::{AccessError, access_with, refused_tokens};
 use crate::admin;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
@@ -374,7 +374,7 @@ pub async fn run_on<N: RosNetwork>(
         gateway
             .listen(Sockets {
                 listen: listen_at(wanted),
-                access: access.unwrap_or_default(),
+                access: access.unwrap_or_default().heard_by(refused_tokens(audit.clone())),
                 key: key_of(wanted, &identity)?,
                 clients_max: wanted.clients_max,
                 client_bytes_max: wanted.client_bytes_max.try_into().unwrap_or(usize::MAX),

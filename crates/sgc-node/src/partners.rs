@@ -14,7 +14,7 @@ use sgc_trust::{AnchorError, CaFingerprint, FleetName, Identity, TrustAnchors};
 use sgc_wire::{NodeId, UnixMillis};
 
 use crate::config::Config;
-use crate::state::{self, StateLock};
+use crate::records::{self, Records};
 
 /// Largest file of CA certificates, bytes.
 const CA_FILE_BYTES_MAX: u64 = 256 * 1024;
@@ -211,19 +211,25 @@ pub struct TokenRecord {
     pub expires: u64,
 }
 
+impl Records for TokenRecords {
+    type Error = PartnerError;
+    const FILE: &str = RECORDS_FILE;
+    const BYTES_MAX: u64 = RECORDS_BYTES_MAX;
+    const VERSION: u32 = RECORDS_VERSION;
+
+    fn version(&self) -> u32 {
+        self.version
+    }
+
+    fn failed(path: PathBuf, source: io::Error) -> PartnerError {
+        PartnerError::Records { path, source }
+    }
+}
+
 impl TokenRecords {
     /// Reads them; none if there is no file.
     pub fn load(state: &Path) -> Result<Self, PartnerError> {
-        let path = state.join(RECORDS_FILE);
-        let failed = |source| PartnerError::Records { path: path.clone(), source };
-        let Some(text) = state::read(&path, RECORDS_BYTES_MAX).map_err(failed)? else {
-            return Ok(Self::default());
-        };
-        let records: Self = serde_json::from_slice(&text).map_err(|e| failed(e.into()))?;
-        if records.version != RECORDS_VERSION {
-            return Err(failed(io::Error::other(format!("version {} is not known here", records.version))));
-        }
-        Ok(records)
+        records::load(state)
     }
 
     /// Changes them on the disk, as nobody else does at the same time.
@@ -231,14 +237,7 @@ impl TokenRecords {
         state: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, PartnerError>,
     ) -> Result<T, PartnerError> {
-        let path = state.join(RECORDS_FILE);
-        let failed = |source| PartnerError::Records { path: path.clone(), source };
-        let _lock = StateLock::take(state).map_err(failed)?;
-        let mut records = Self::load(state)?;
-        let done = change(&mut records)?;
-        let text = serde_json::to_vec_pretty(&records).map_err(|e| failed(e.into()))?;
-        state::replace(&path, &text).map_err(failed)?;
-        Ok(done)
+        records::change(state, change)
     }
 
     /// Adds one, and gives it its number; those that ended before `now` leave.

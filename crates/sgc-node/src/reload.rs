@@ -178,7 +178,9 @@ impl Reloader {
         // The control task knows the newest revocation lists.
         if let Some((access, key)) = gateway {
             let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
-            self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())?;
+            if self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())? {
+                report.changed.push("who connects to the gateway is shown another certificate".to_owned());
+            }
             if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
                 report.changed.push("who may connect to the gateway changed".to_owned());
             }

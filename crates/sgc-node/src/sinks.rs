@@ -17,12 +17,13 @@ use sgc_ros::{
 };
 use sgc_router::LinkId;
 use sgc_wire::{History, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio::time::{sleep_until, timeout_at};
 use tracing::{debug, warn};
 
-use crate::conversion::{self, KnownType, TYPE_WAIT_MAX, TypeSlot};
+use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
+use crate::hold::{Hold, Holds};
 use crate::queue::Queue;
 use crate::shaper::Shaper;
 use crate::stats::{DataDrop, Drops};
@@ -52,13 +53,14 @@ pub(crate) enum SinkRequest {
     Synced(Name, SourceId),
 }
 
-#[derive(Default)]
 struct State {
     sink: Option<Sink>,
     /// Messages, one or several that waited for a grant, that are not written yet.
     releases: u32,
     /// Sources of which something that can be asked for again was not taken, for want of a writer.
     missed: BTreeSet<SourceId>,
+    /// What came as JSON before its type was known, and what came behind it.
+    held: Hold<Message>,
 }
 
 /// A joined name's end at this node.
@@ -85,11 +87,18 @@ pub(crate) type FramePrefix = Arc<ArcSwapOption<String>>;
 
 impl LocalSink {
     /// A sink without a grant.
-    pub(crate) fn new(name: Name, transient_local: bool, requests: mpsc::Sender<SinkRequest>) -> Self {
+    pub(crate) fn new(
+        name: Name,
+        transient_local: bool,
+        requests: mpsc::Sender<SinkRequest>,
+        holds: Arc<Holds>,
+    ) -> Self {
+        let held = Hold::new(WRITER_MESSAGES_MAX, holds);
+        let state = State { sink: None, releases: 0, missed: BTreeSet::new(), held };
         Self {
             name,
             transient_local,
-            state: Mutex::default(),
+            state: Mutex::new(state),
             releasing: Arc::default(),
             writers: ArcSwap::default(),
             requests,
@@ -128,21 +137,38 @@ impl LocalSink {
             if released.is_empty() {
                 return;
             }
-            state.releases += 1;
-            self.releasing.clone().try_lock_owned().ok()
+            self.begin_release(&mut state)
         };
         let (this, data) = (self.clone(), data.clone());
+        self.release(turn, async move {
+            for result in released {
+                if let Some((reason, _)) = this.finish(result, data.drops()).await {
+                    data.count(LinkId::LOCAL, &this.name, reason);
+                }
+            }
+        });
+    }
+
+    /// Has what comes from here on wait behind what is released; the turn for that, unless another has it.
+    fn begin_release(&self, state: &mut State) -> Option<OwnedMutexGuard<()>> {
+        state.releases += 1;
+        self.releasing.clone().try_lock_owned().ok()
+    }
+
+    /// Writes what is released once it is its turn.
+    fn release(
+        self: &Arc<Self>,
+        turn: Option<OwnedMutexGuard<()>>,
+        writing: impl Future<Output = ()> + Send + 'static,
+    ) {
+        let this = self.clone();
         tokio::spawn(async move {
             let releasing = Releasing(&this);
             let turn = match turn {
                 Some(turn) => turn,
                 None => this.releasing.clone().lock_owned().await,
             };
-            for result in released {
-                if let Some((reason, _)) = this.finish(result, data.drops()).await {
-                    data.count(LinkId::LOCAL, &this.name, reason);
-                }
-            }
+            writing.await;
             drop(releasing);
             drop(turn);
         });
@@ -251,6 +277,37 @@ impl LocalSink {
         self.frames.clone()
     }
 
+    /// What messages look like is known now, or is not; what waited for that is written, or given up.
+    pub(crate) fn set_type(self: &Arc<Self>, known: KnownType, data: &Arc<DataPlane>) {
+        let (held, turn) = {
+            let mut state = self.lock();
+            self.types.set(known);
+            if state.held.is_empty() || self.types.now().is_awaited() {
+                return;
+            }
+            (state.held.take(), self.begin_release(&mut state))
+        };
+        let (this, data) = (self.clone(), data.clone());
+        self.release(turn, async move {
+            let now = Instant::now();
+            for held in held {
+                let is_late = held.is_late(now) && this.is_given_up(&held.item);
+                let dropped = match is_late {
+                    true => Some((DataDrop::NoDefinition, 1)),
+                    false => this.write(held.item).await,
+                };
+                if let Some((reason, several)) = dropped {
+                    data.count_here(&this.name, reason, several);
+                }
+            }
+        });
+    }
+
+    /// Whether nobody is to hear late of a message: nobody keeps it for late joiners.
+    fn is_given_up(&self, message: &Message) -> bool {
+        !self.transient_local && message.head.kind == MessageKind::Write
+    }
+
     /// What is known of the type of what comes.
     pub(crate) fn types(&self) -> &Arc<TypeSlot> {
         &self.types
@@ -258,15 +315,13 @@ impl LocalSink {
 
     /// Whether messages come as JSON that nobody here can read, for want of a definition.
     pub(crate) fn lacks_definition(&self) -> bool {
-        self.takes_json.load(Relaxed) && self.types.now().layout().is_none()
+        self.takes_json.load(Relaxed) && self.types.now().is_lacking()
     }
 
     /// Ends all writers after what is queued.
     pub(crate) fn close(&self) {
         // Nobody tells any more.
-        if self.types.now().layout().is_none() {
-            self.types.set(KnownType::Lacking);
-        }
+        drop(self.lock().held.take());
         self.writers.load().values().for_each(|w| w.close());
         self.taps.close();
     }
@@ -280,7 +335,7 @@ impl LocalSink {
     pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Option<(DataDrop, u64)> {
         let (result, behind, turn) = {
             let mut state = self.lock();
-            let State { sink, releases, missed } = &mut *state;
+            let State { sink, releases, missed, held } = &mut *state;
             let Some(sink) = sink else { return Some((DataDrop::NotGranted, 1)) };
             let source = packet.header.source;
             if !self.has_writer(&source) && sink.recovers(&source) {
@@ -291,7 +346,7 @@ impl LocalSink {
             let behind = *releases > 0;
             match sink.handle_packet(&packet) {
                 // Under the lock, so that what comes over two links at once is written in the order of its numbers.
-                Ok(Delivery::Message(message)) if !behind => match self.write_now(message) {
+                Ok(Delivery::Message(message)) if !behind => match self.write_now(message, held) {
                     Ok(dropped) => return dropped,
                     Err(message) => {
                         *releases += 1;
@@ -340,7 +395,8 @@ impl LocalSink {
     }
 
     async fn write(&self, message: Message) -> Option<(DataDrop, u64)> {
-        let message = match self.write_now(message) {
+        let written = self.write_now(message, &mut self.lock().held);
+        let message = match written {
             Ok(dropped) => return dropped,
             Err(message) => message,
         };
@@ -357,15 +413,26 @@ impl LocalSink {
         }
     }
 
-    /// Queues a message for its writer and says what was dropped; gives it back if it has to wait for room.
-    fn write_now(&self, message: Message) -> Result<Option<(DataDrop, u64)>, Message> {
+    /// Queues a message for its writer, or holds it while its type is not known, and says what was dropped; gives it back if
+    /// it has to wait for room.
+    fn write_now(
+        &self,
+        message: Message,
+        held: &mut Hold<Message>,
+    ) -> Result<Option<(DataDrop, u64)>, Message> {
         let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
         let (bytes, head) = (message.payload.len(), message.head);
+        let mut waits = !held.is_empty();
         if head.form == PayloadForm::Json {
             self.takes_json.store(true, Relaxed);
-            if matches!(self.types.now(), KnownType::Lacking) {
-                return Ok(Some((DataDrop::NoDefinition, 1)));
+            match self.types.now() {
+                KnownType::Known(_) => {}
+                KnownType::Awaited | KnownType::Asked => waits = true,
+                KnownType::Lacking => return Ok(Some((DataDrop::NoDefinition, 1))),
             }
+        }
+        if waits {
+            return Ok(self.hold(message, held));
         }
         if writer.has_written(&head) {
             return Ok(Some((DataDrop::Repeated, 1)));
@@ -388,6 +455,14 @@ impl LocalSink {
             self.taps.offer(|| tapped);
         }
         Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
+    }
+
+    /// Holds a message until its type is known, or not to be known. The oldest make room.
+    fn hold(&self, message: Message, held: &mut Hold<Message>) -> Option<(DataDrop, u64)> {
+        let now = Instant::now();
+        let late = held.give_up_late(now, |message| self.is_given_up(message));
+        let given_up = late + held.push(now, message.payload.len(), message);
+        (given_up > 0).then_some((DataDrop::NoDefinition, given_up))
     }
 
     fn tapped(&self, message: &Message) -> Tapped {
@@ -531,11 +606,13 @@ impl WriterQueue {
             let payload = match message.head.form {
                 PayloadForm::Cdr => payload,
                 PayloadForm::Json => {
-                    let Some(layout) = types.wait(TYPE_WAIT_MAX) else {
+                    let known = types.now();
+                    let Some(layout) = known.layout() else {
+                        // It was when the message was queued.
                         counted.count("json_unknown_type");
                         return None;
                     };
-                    match conversion::from_json(&layout, &payload, offered) {
+                    match conversion::from_json(layout, &payload, offered) {
                         Ok(payload) => payload,
                         Err(error) => {
                             if counted.count("json_refused") {
@@ -809,6 +886,7 @@ mod tests {
     use bytes::Bytes;
 
     use super::*;
+    use crate::hold::HOLD_BYTES_MAX;
 
     #[derive(Default)]
     struct Slow {
@@ -827,6 +905,10 @@ mod tests {
         }
 
         fn matched_readers(&self) -> u32 {
+            1
+        }
+
+        fn wait_matched(&self, _: u32, _: Duration) -> u32 {
             1
         }
 
@@ -907,6 +989,80 @@ mod tests {
         match queue.at_once(bytes, 1) {
             Some(mut take) => take(message, Next::Nothing),
             None => queue.queue.try_push(message, bytes, WRITER_BYTES_MAX).unwrap(),
+        }
+    }
+
+    fn sink(transient_local: bool) -> (Arc<LocalSink>, Arc<DataPlane>, Written) {
+        let (requests, _) = mpsc::channel(1);
+        let sink = Arc::new(LocalSink::new(Name([1; 32]), transient_local, requests, Arc::default()));
+        let (queue, taken) = noting(&Arc::default());
+        sink.set_writer(None, Some(queue));
+        (sink, Arc::default(), taken)
+    }
+
+    fn json(seq: u64, bytes: usize) -> Message {
+        let plain = message(seq, bytes);
+        Message { head: MessageHead { form: PayloadForm::Json, ..plain.head }, ..plain }
+    }
+
+    fn any_type() -> KnownType {
+        let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
+        let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text);
+        KnownType::Known(Arc::new(layout.unwrap()))
+    }
+
+    /// Until it is so, which has a bound.
+    async fn wait_until(is_so: impl Fn() -> bool) {
+        let begun = Instant::now();
+        while !is_so() {
+            assert!(begun.elapsed() < Duration::from_secs(20), "it does not come");
+            tokio::task::yield_now().await;
+        }
+    }
+
+    #[tokio::test]
+    async fn what_comes_as_json_is_held_while_the_owner_is_asked_and_written_when_it_told() {
+        let (sink, data, taken) = sink(false);
+        let seqs = || taken.lock().unwrap().iter().map(|(seq, _)| *seq).collect::<Vec<_>>();
+        sink.set_type(KnownType::Asked, &data);
+        for seq in 0..WRITER_MESSAGES_MAX as u64 + 3 {
+            let lost = sink.write(json(seq, 8)).await;
+            assert_eq!(lost, (seq >= WRITER_MESSAGES_MAX as u64).then_some((DataDrop::NoDefinition, 1)));
+        }
+        assert!(sink.lacks_definition());
+        // Large ones are bounded by their bytes; what comes behind them does not overtake them.
+        let lost = sink.write(json(5000, HOLD_BYTES_MAX)).await;
+        assert_eq!(lost, Some((DataDrop::NoDefinition, WRITER_MESSAGES_MAX as u64)));
+        assert_eq!(sink.write(json(5001, 8)).await, Some((DataDrop::NoDefinition, 1)));
+        assert_eq!(sink.write(message(5002, 8)).await, None);
+        assert!(seqs().is_empty());
+        sink.set_type(any_type(), &data);
+        wait_until(|| seqs().len() == 2).await;
+        assert_eq!((seqs(), sink.delivered(), sink.lacks_definition()), (vec![5001, 5002], 2, false));
+        // Where it is not to be known, what can be read without it is written.
+        sink.set_type(KnownType::Asked, &data);
+        assert_eq!(sink.write(json(5003, 8)).await, None);
+        assert_eq!(sink.write(message(5004, 8)).await, None);
+        sink.set_type(KnownType::Lacking, &data);
+        wait_until(|| seqs().len() == 3).await;
+        assert_eq!((seqs()[2], data.drops().snapshot()["no_definition"]), (5004, 1));
+        sink.close();
+    }
+
+    #[tokio::test]
+    async fn what_was_held_for_long_is_written_where_it_is_kept_for_late_joiners() {
+        for transient_local in [true, false] {
+            let (sink, data, taken) = sink(transient_local);
+            sink.set_type(KnownType::Asked, &data);
+            let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
+            sink.lock().held.push(long_ago, 8, json(1, 8));
+            let lost = sink.write(json(2, 8)).await;
+            assert_eq!(lost, (!transient_local).then_some((DataDrop::NoDefinition, 1)));
+            sink.set_type(any_type(), &data);
+            let left = if transient_local { 2 } else { 1 };
+            wait_until(|| taken.lock().unwrap().len() == left).await;
+            assert_eq!(sink.delivered(), left as u64);
+            sink.close();
         }
     }
 

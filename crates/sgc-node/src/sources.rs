@@ -4,7 +4,7 @@
 //! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are
 //! at hand together share a signature; none waits for one that is not.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap};
 use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
@@ -27,6 +27,7 @@ use tracing::{debug, warn};
 
 use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
+use crate::hold::Hold;
 use crate::shaper::Shaper;
 use crate::stats::DataDrop;
 use crate::tap::{Tapped, Taps};
@@ -127,11 +128,10 @@ struct Compression {
 }
 
 /// What is between the local reader and the sources.
-#[derive(Default)]
 struct Inbox {
     /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before
     /// it tells who wrote it. Also those that become JSON, while their type is looked for.
-    early: VecDeque<Sample>,
+    early: Hold<Sample>,
     /// Sources that were told that more follows, and wait for it with what they have.
     open: Vec<SourceSlot>,
 }
@@ -193,13 +193,14 @@ impl LocalShare {
         epoch_messages_max: u64,
         over: Arc<Notify>,
     ) -> Self {
+        let early = Hold::new(EARLY_SAMPLES_MAX, data.holds().clone());
         Self {
             name,
             data,
             runtime: Handle::current(),
             alive,
             map: ArcSwap::default(),
-            inbox: Mutex::default(),
+            inbox: Mutex::new(Inbox { early, open: Vec::new() }),
             is_shaped: AtomicBool::new(false),
             is_altered: AtomicBool::new(false),
             is_json: AtomicBool::new(false),
@@ -227,17 +228,20 @@ impl LocalShare {
     }
 
     /// Sets how much goes out from here on.
-    pub(crate) fn set_shaping(&self, shaping: Shaping) {
+    pub(crate) fn set_shaping(self: &Arc<Self>, shaping: Shaping) {
         lock(&self.held).shaper.set(shaping);
         lock(&self.compression.encoding).0 = shaping.compression;
         self.is_altered.store(shaping != Shaping::default(), SeqCst);
         let (compression, form) = (PayloadEncoding::Plain, PayloadForm::Cdr);
         let limits = Shaping { compression, form, ..shaping };
         self.is_shaped.store(limits != Shaping::default(), SeqCst);
-        self.is_json.store(shaping.form == PayloadForm::Json, SeqCst);
+        if self.is_json.swap(shaping.form == PayloadForm::Json, SeqCst) {
+            // What waits to become JSON need not any more.
+            self.publish_waiting();
+        }
     }
 
-    /// What its messages look like is known now, or is not; what waited for that is published, or dropped.
+    /// What its messages look like is known now, or is not; what waited for that is published, or given up.
     pub(crate) fn set_type(self: &Arc<Self>, known: KnownType) {
         self.types.set(known);
         self.publish_waiting();
@@ -347,13 +351,12 @@ impl LocalShare {
         let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
         self.publish_early(&mut inbox);
         if let Err(sample) = self.try_publish(sample, more, &mut inbox.open) {
-            let early = &mut inbox.early;
-            if early.len() >= EARLY_SAMPLES_MAX {
-                early.pop_front();
-                self.data.count(LinkId::LOCAL, &self.name, DataDrop::Stale);
+            let reason = if self.awaits_type() { DataDrop::NoDefinition } else { DataDrop::Stale };
+            let given_up = inbox.early.push(Instant::now(), sample.payload.len(), sample);
+            if given_up > 0 {
+                self.data.count_here(&self.name, reason, given_up);
             }
-            early.push_back(sample);
-            self.waiting.store(early.len(), SeqCst);
+            self.waiting.store(inbox.early.len(), SeqCst);
             // Its source may have come between the two looks; whoever puts a map in place after this one sees
             // that something waits.
             self.publish_early(&mut inbox);
@@ -391,16 +394,43 @@ impl LocalShare {
             return;
         }
         fence(SeqCst);
-        for sample in std::mem::take(&mut inbox.early) {
-            inbox.early.extend(self.try_publish(sample, true, &mut inbox.open).err());
+        let (now, mut late) = (Instant::now(), 0);
+        if self.awaits_type() {
+            late = inbox.early.give_up_late(now, |sample| self.is_given_up(sample));
+        } else {
+            for mut held in inbox.early.take() {
+                if held.is_late(now) && self.is_given_up(&held.item) {
+                    late += 1;
+                    continue;
+                }
+                if let Err(sample) = self.try_publish(held.item, true, &mut inbox.open) {
+                    held.item = sample;
+                    inbox.early.push_back(held);
+                }
+            }
+        }
+        if late > 0 {
+            self.data.count_here(&self.name, DataDrop::NoDefinition, late);
         }
         self.waiting.store(inbox.early.len(), SeqCst);
+    }
+
+    /// Whether messages are to leave as JSON, and what they look like may become known.
+    fn awaits_type(&self) -> bool {
+        self.is_json.load(Relaxed) && self.types.now().is_awaited()
+    }
+
+    /// Whether nobody is to hear late of a sample that was to become JSON: it is not kept for late joiners.
+    fn is_given_up(&self, sample: &Sample) -> bool {
+        self.is_json.load(Relaxed)
+            && sample.kind == SampleKind::Write
+            && matches!(self.slot_of(sample.writer), Ok(Some(slot)) if !slot.keeps_history)
     }
 
     /// Publishes a sample, or gives it back if its writer's source, or what it is converted by, is not known yet. With
     /// `more` the source may be left with packets that wait for others; then it is in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
-        let awaits_type = self.is_json.load(Relaxed) && matches!(self.types.now(), KnownType::Awaited);
+        let awaits_type = self.awaits_type();
         match self.slot_of(sample.writer) {
             Err(NotListed) => return Err(sample),
             Ok(Some(_)) if awaits_type => return Err(sample),
@@ -681,7 +711,7 @@ impl LocalShare {
 
     /// Whether messages are to leave as JSON and cannot, for want of a definition.
     pub(crate) fn lacks_definition(&self) -> bool {
-        self.is_json.load(Relaxed) && matches!(self.types.now(), KnownType::Lacking)
+        self.is_json.load(Relaxed) && self.types.now().is_lacking()
     }
 
     /// Messages published.
@@ -737,6 +767,7 @@ mod tests {
 
     use super::*;
     use crate::dataplane::{Forward, Out};
+    use crate::hold::HOLD_BYTES_MAX;
     use crate::outflow::OutFlow;
 
     const KNOWN: Guid = Guid([1; 16]);
@@ -851,6 +882,60 @@ mod tests {
         // What came too fast is counted.
         publisher.overrun(7);
         assert_eq!(share.data.drops().snapshot()["overrun"], 7);
+    }
+
+    /// A type of one text, and a message of it.
+    fn text_type() -> (Arc<sgc_cdr::Layout>, Bytes) {
+        let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
+        let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text).unwrap();
+        let message = layout.encode(&layout.from_json(br#"{"a":"text"}"#).unwrap()).unwrap();
+        (Arc::new(layout), message.into())
+    }
+
+    #[test]
+    fn what_becomes_json_is_held_while_the_owner_is_asked_and_leaves_when_it_told() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, mut slot) = share();
+        let (layout, payload) = text_type();
+        let sample = || Sample { payload: payload.clone(), ..sample(KNOWN, false) };
+        share.set_shaping(Shaping { form: PayloadForm::Json, ..Shaping::default() });
+        share.set_type(KnownType::Asked);
+        assert!(share.lacks_definition());
+        (0..EARLY_SAMPLES_MAX + 3).for_each(|_| share.publish(sample()));
+        let lost = |share: &LocalShare| share.data.drops().snapshot().get("no_definition").copied();
+        assert_eq!((share.published(), lost(&share)), (0, Some(3)));
+        // Large ones are bounded by their bytes.
+        let large = Sample { payload: vec![0; HOLD_BYTES_MAX].into(), ..sample() };
+        share.publish(large);
+        assert_eq!(lost(&share), Some(3 + EARLY_SAMPLES_MAX as u64));
+        (0..2).for_each(|_| share.publish(sample()));
+        assert_eq!(lost(&share), Some(4 + EARLY_SAMPLES_MAX as u64));
+        share.set_type(KnownType::Known(layout.clone()));
+        wait_until(|| share.published() == 2);
+        // What nobody keeps for late joiners is of no use after a while; the others are.
+        for keeps_history in [true, false] {
+            slot.keeps_history = keeps_history;
+            let own = HashMap::from([(KNOWN, slot.clone())]);
+            share.set_map(SourceMap { shared: None, per_writer: true, own });
+            share.set_type(KnownType::Asked);
+            let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
+            lock(&share.inbox).early.push(long_ago, 1, sample());
+            let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
+            share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
+            let (before, lost_before) = (share.published(), lost(&share));
+            share.publish(sample());
+            share.set_type(KnownType::Known(layout.clone()));
+            let left = if keeps_history { 2 } else { 1 };
+            wait_until(|| share.published() == before + left);
+            assert_eq!(lost(&share), lost_before.map(|n| n + 2 - left));
+        }
+        // It goes out as it is where that is wanted.
+        share.set_type(KnownType::Asked);
+        share.publish(sample());
+        let before = share.published();
+        share.set_shaping(Shaping::default());
+        wait_until(|| share.published() == before + 1);
     }
 
     #[test]

@@ -31,8 +31,20 @@ pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
 pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
     let failed = |source| StateError::Directory { path: dir.to_owned(), source };
     fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
-    let metadata = fs::metadata(dir).map_err(failed)?;
-    if let Some(mode) = exposed(&metadata) {
+    check_owner(dir, &fs::metadata(dir).map_err(failed)?)
+}
+
+/// Whether the directory is this user's alone, if it is there; makes nothing.
+pub fn check_state_dir(dir: &Path) -> Result<(), StateError> {
+    match fs::metadata(dir) {
+        Ok(metadata) => check_owner(dir, &metadata),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(source) => Err(StateError::Directory { path: dir.to_owned(), source }),
+    }
+}
+
+fn check_owner(dir: &Path, metadata: &fs::Metadata) -> Result<(), StateError> {
+    if let Some(mode) = exposed(metadata) {
         return Err(StateError::Exposed { path: dir.to_owned(), mode });
     }
     if metadata.uid() != rustix::process::geteuid().as_raw() {

@@ -13,7 +13,7 @@ use sgc_cdr::Layout;
 use sgc_endpoint::{Decompressor, Message};
 use sgc_ros::{Sample, SampleKind};
 use sgc_types::Described;
-use sgc_wire::{MessageKind, PayloadForm, Representations};
+use sgc_wire::{MessageKind, PayloadEncoding, PayloadForm, Representations};
 use tokio::sync::Notify;
 
 use crate::conversion;
@@ -37,8 +37,17 @@ pub(crate) struct Tapped {
     pub seen_unix_ns: i64,
     /// When it went by.
     pub seen: Instant,
-    /// Encapsulation header and body.
+    /// Encapsulation header and body; what came over the network, as that has it, until it is [read](Self::read).
     pub payload: Bytes,
+    came: Option<Came>,
+}
+
+/// How a message came over the network.
+#[derive(Clone, Debug)]
+struct Came {
+    encoding: PayloadEncoding,
+    form: PayloadForm,
+    layout: Option<Arc<Layout>>,
 }
 
 impl Tapped {
@@ -46,7 +55,8 @@ impl Tapped {
         Self::now(sample.kind, sample.source_timestamp_ns, sample.payload.clone())
     }
 
-    /// What came as JSON is shown as the local network gets it, if what it looks like is known.
+    /// A message that came over the network; `layout` is what it looks like, if that is known. Who looks reads it, since that
+    /// takes its time.
     pub(crate) fn of_message(message: &Message, layout: Option<&Arc<Layout>>) -> Self {
         let kind = match message.head.kind {
             MessageKind::Dispose => SampleKind::Dispose,
@@ -54,21 +64,39 @@ impl Tapped {
             // What is no sample is not offered.
             _ => SampleKind::Write,
         };
-        // Whoever looks pays for it; what cannot be read is shown as it is.
-        let plain = Decompressor::default().decompress(message.head.encoding, message.payload.clone());
-        let payload = plain.unwrap_or_else(|_| message.payload.clone());
-        let cdr = |layout| conversion::from_json(layout, &payload, Representations::XCDR1).ok();
-        let payload = match (message.head.form, layout) {
-            (PayloadForm::Json, Some(layout)) => cdr(layout).unwrap_or(payload),
-            _ => payload,
-        };
-        Self::now(kind, message.head.source_timestamp_ns, payload)
+        let (encoding, form) = (message.head.encoding, message.head.form);
+        let came = Came { encoding, form, layout: layout.cloned() };
+        let tapped = Self::now(kind, message.head.source_timestamp_ns, message.payload.clone());
+        Self { came: Some(came), ..tapped }
+    }
+
+    /// As the local network gets it, if what it looks like is known. What cannot be read is shown as it is. Takes its time.
+    pub(crate) fn read(mut self) -> Self {
+        let Some(Came { encoding, form, layout }) = self.came.take() else { return self };
+        if let Ok(plain) = Decompressor::default().decompress(encoding, self.payload.clone()) {
+            self.payload = plain;
+        }
+        let cdr =
+            |layout: Arc<Layout>| conversion::from_json(&layout, &self.payload, Representations::XCDR1).ok();
+        if form == PayloadForm::Json
+            && let Some(payload) = layout.and_then(cdr)
+        {
+            self.payload = payload;
+        }
+        self
+    }
+
+    /// Whether reading takes its time.
+    pub(crate) fn is_raw(&self) -> bool {
+        self.came
+            .as_ref()
+            .is_some_and(|came| came.encoding != PayloadEncoding::Plain || came.form != PayloadForm::Cdr)
     }
 
     fn now(kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Self {
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
         let seen_unix_ns = unix.as_nanos().try_into().unwrap_or(i64::MAX);
-        Self { kind, source_timestamp_ns, seen_unix_ns, seen: Instant::now(), payload }
+        Self { kind, source_timestamp_ns, seen_unix_ns, seen: Instant::now(), payload, came: None }
     }
 }
 
@@ -251,6 +279,31 @@ mod tests {
 
     fn message(bytes: usize) -> Tapped {
         Tapped::now(SampleKind::Write, 0, Bytes::from(vec![0; bytes]))
+    }
+
+    #[test]
+    fn what_came_is_read_by_who_looks_and_not_where_it_is_offered() {
+        let text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
+        let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut { text }).unwrap();
+        let json = Bytes::from(format!(r#"{{"a":"{}"}}"#, "long ".repeat(1000)));
+        let packed = sgc_endpoint::Compressor::default().compress(PayloadEncoding::Zstd, &json).unwrap();
+        let head = sgc_wire::MessageHead {
+            form: PayloadForm::Json,
+            encoding: PayloadEncoding::Zstd,
+            ..sgc_wire::MessageHead::new(MessageKind::Write, 1)
+        };
+        let source = sgc_wire::SourceId([1; 16]);
+        let message = Message { source, seq: 1, head, reliable: true, payload: packed.clone() };
+        let layout = Arc::new(layout);
+        let tapped = Tapped::of_message(&message, Some(&layout));
+        assert!(tapped.payload == packed && tapped.is_raw());
+        let read = tapped.read();
+        assert!(!read.is_raw());
+        assert_eq!(layout.decode(&read.payload).unwrap().to_json().as_bytes(), json);
+        // What it looks like is not known, or it is none: it is shown as it is.
+        assert_eq!(Tapped::of_message(&message, None).read().payload, json);
+        let broken = Message { payload: Bytes::from_static(b"abc"), ..message };
+        assert_eq!(Tapped::of_message(&broken, Some(&layout)).read().payload, broken.payload);
     }
 
     #[tokio::test]

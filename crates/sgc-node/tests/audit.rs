@@ -76,6 +76,31 @@ fn each_event_has_a_word_of_its_own_and_no_text_breaks_a_line() {
 }
 
 #[test]
+fn a_record_from_beside_comes_between_those_of_the_node_that_runs() {
+    let place = Place::new();
+    let made = AuditRecord::new(AuditEvent::TokenMade).by("uid 1000");
+    audit::append(&place.path(), &made).unwrap();
+    let (log, writer) = Audit::open(&place.path(), 1 << 20, PeerNames::new()).unwrap();
+    audit::append(&place.path(), &AuditRecord::new(AuditEvent::TokenRevoked)).unwrap();
+    log.write(granted(7));
+    writer.finish();
+    let (records, malformed) = place.read();
+    let events: Vec<_> = records.iter().map(|record| record.event.as_str()).collect();
+    assert_eq!((events, malformed), (vec!["token_made", "token_revoked", "granted"], 0));
+    assert_eq!(fs::metadata(place.path()).unwrap().permissions().mode() & 0o7777, 0o600);
+}
+
+#[test]
+fn tokens_that_are_refused_for_ever_are_counted_and_push_out_nothing() {
+    let place = Place::new();
+    let refused = (0..1000).map(|_| AuditRecord::at(AuditEvent::TokenRefused, UnixMillis(1)));
+    place.write(1 << 20, refused);
+    let (records, _) = place.read();
+    assert_eq!(records.iter().filter(|record| record.event == "token_refused").count(), 120);
+    assert_eq!(records.iter().filter_map(|record| record.lost).sum::<u64>(), 880);
+}
+
+#[test]
 fn a_full_log_is_put_aside_and_one_old_one_kept() {
     const MAX: u64 = 2048;
     let place = Place::new();

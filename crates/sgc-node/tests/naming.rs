@@ -98,6 +98,24 @@ fn two_robots_have_names_of_their_own_and_one_tree_of_frames() {
     }
 }
 
+/// More than a router takes advertisements of one node at a time.
+#[test]
+fn hundreds_of_topics_that_come_one_by_one_are_all_there() {
+    const TOPICS: usize = 400;
+    let trio = Trio::new();
+    let (cloud, _robot, desk) = (trio.cloud(), trio.robot(&["/**"], "desk"), trio.desk(&["/**"]));
+    let net = trio.robot_net.join(false);
+    let talker = |n| net.create_writer(&spec(&format!("/t{n}"), Qos::default())).unwrap();
+    let _talkers: Vec<_> = (0..TOPICS).map(talker).collect();
+    let granted = || {
+        let status = desk.status();
+        let routes = status["routes"].as_array().unwrap();
+        routes.iter().filter(|route| route["state"].as_str().unwrap().starts_with("granted")).count()
+    };
+    wait("all topics", || granted() == TOPICS);
+    assert!(cloud.status()["drops"]["limit"].is_null(), "{}", cloud.status()["drops"]);
+}
+
 #[test]
 fn topics_that_match_come_and_go_and_others_notice_nothing() {
     let trio = Trio::new();

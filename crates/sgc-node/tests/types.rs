@@ -264,3 +264,76 @@ fn who_publishes_on_anothers_topic_converts_by_what_the_owner_told() {
     }
     assert_eq!(robot.drops("no_definition"), 0);
 }
+
+#[test]
+fn what_is_published_while_nobody_knows_the_type_arrives_when_the_owner_does() {
+    let package = Package::new();
+    let trio = Trio::new();
+    let shared = |config: &mut Config| {
+        config.shares[0].publish = vec![Recipient::Node("desk".parse().unwrap())];
+        config.shares[0].type_name = Some(THING.into());
+    };
+    let (_cloud, first) = (trio.cloud(), robot(&trio, None, shared));
+    let desk = desk(&trio, None, |config| {
+        config.uses[0].publish = true;
+        config.uses[0].shaping = json();
+    });
+    let talker = Talker::of(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let listener = Listener::of(&trio.robot_net, &thing_spec(Qos::default(), None));
+    talker.wait_for_readers(1);
+    talker.say(package.thing(TEXT));
+    let lacks = "/thing: its messages travel as JSON, and no definition of mine/msg/Thing";
+    wait("what is wrong", || desk.status()["problems"].to_string().contains(lacks));
+    // It may become known.
+    assert_eq!(desk.drops("no_definition"), 0);
+    first.kill();
+    // Somebody installs the definition.
+    let _robot = robot(&trio, Some(&package), shared);
+    // What was said last, or what is said now.
+    listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
+    assert_eq!(desk.drops("not_converted"), 0);
+    wait("that nothing is wrong", || desk.status()["problems"] == serde_json::json!([]));
+}
+
+#[test]
+fn a_type_that_is_another_after_its_owner_starts_anew_is_asked_for() {
+    let package = Package::new();
+    let trio = Trio::new();
+    let (_cloud, first) = (trio.cloud(), robot(&trio, Some(&package), |_| {}));
+    let desk = desk(&trio, None, |_| {});
+    let old = package.layout(THING).type_hash();
+    let talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), Some(old.clone())));
+    wait("the type", || desk.types.layout(&name(THING), Some(&old)).is_some());
+    first.kill();
+    drop(talker);
+    fs::write(package.0.path().join("mine/msg/Thing.msg"), "int64 other").unwrap();
+    let new = package.layout(THING).type_hash();
+    let _talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), Some(new.clone())));
+    let _robot = robot(&trio, Some(&package), |_| {});
+    wait("the new one", || desk.types.layout(&name(THING), Some(&new)).is_some());
+}
+
+#[test]
+fn types_that_their_owner_does_not_know_keep_those_that_it_does_from_nobody() {
+    let package = Package::new();
+    let trio = Trio::new();
+    let on_all = |config: &mut Config| {
+        config.shares.iter_mut().for_each(|share| share.topic = "/**".into());
+        config.uses.iter_mut().for_each(|used| used.topic = "/**".into());
+    };
+    let known = |n: usize| format!("mine/msg/Known{n}");
+    for n in 0..8 {
+        let path = package.0.path().join(known(n)).with_extension("msg");
+        fs::write(path, format!("int8 a{n}")).unwrap();
+    }
+    let (_cloud, _robot) = (trio.cloud(), robot(&trio, Some(&package), on_all));
+    let types = (0..200).map(|n| format!("mine/msg/Nobody{n}")).chain((0..8).map(known));
+    let net = trio.robot_net.join(false);
+    let talker = |(n, of): (usize, String)| {
+        let type_name = dds_type(&of);
+        net.create_writer(&EndpointSpec { type_name, ..spec(&format!("/t{n}"), Qos::default()) }).unwrap()
+    };
+    let _talkers: Vec<_> = types.enumerate().map(talker).collect();
+    let desk = desk(&trio, None, on_all);
+    wait("all that are known", || (0..8).all(|n| desk.types.layout(&name(&known(n)), None).is_some()));
+}

@@ -339,6 +339,9 @@ pub trait RosWriter: Send + Sync + 'static {
     /// How many local readers are matched at present.
     fn matched_readers(&self) -> u32;
 
+    /// Waits until so many local readers are matched, or for so long; says how many are.
+    fn wait_matched(&self, readers: u32, max: Duration) -> u32;
+
     /// Its GUID.
     fn guid(&self) -> Guid;
 }

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
@@ -35,6 +35,8 @@ struct DomainState {
     /// What each network announces, and whether it is a proxy.
     nodes: BTreeMap<u32, (bool, Vec<GraphNode>)>,
     watchers: Vec<Watcher>,
+    /// Topics and payloads that cannot be written.
+    refused: Vec<(String, Bytes)>,
 }
 
 struct Endpoint {
@@ -121,6 +123,11 @@ impl FakeDomain {
         let state = self.lock();
         let wanted = |e: &&Endpoint| e.discovered.topic == topic && e.discovered.kind == kind;
         state.endpoints.values().filter(wanted).map(|e| e.discovered.guid).collect()
+    }
+
+    /// Has the next write of a payload on a topic fail, as if a reader did not acknowledge what was written before.
+    pub fn refuse_write(&self, topic: &str, payload: Bytes) {
+        self.lock().refused.push((topic.to_owned(), payload));
     }
 
     /// What the writers on a topic offer.
@@ -436,6 +443,16 @@ impl FakeWriter {
 
 impl RosWriter for FakeWriter {
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        {
+            let mut state = self.domain.lock();
+            let topic = state.endpoints.get(&self.guid).map(|writer| writer.discovered.topic.clone());
+            let is_it =
+                |(refused, what): &(String, Bytes)| topic.as_ref() == Some(refused) && *what == payload;
+            if let Some(index) = state.refused.iter().position(is_it) {
+                state.refused.remove(index);
+                return Err(RosError::WriteTimeout { waited_ms: 0 });
+            }
+        }
         self.give(kind, source_timestamp_ns, payload, false);
         Ok(())
     }
@@ -449,6 +466,14 @@ impl RosWriter for FakeWriter {
             .filter(|r| writer.reaches(r.tagged))
             .filter(|r| r.reader.is_some() && matches(&writer.discovered, &r.discovered));
         matched.count() as u32
+    }
+
+    fn wait_matched(&self, readers: u32, max: Duration) -> u32 {
+        let until = Instant::now() + max;
+        while self.matched_readers() < readers && Instant::now() < until {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        self.matched_readers()
     }
 
     fn guid(&self) -> Guid {

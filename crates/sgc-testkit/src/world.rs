@@ -418,11 +418,22 @@ impl World {
 
     /// Tells a node's endpoint what the type of a topic that it shares looks like.
     pub fn describe(&mut self, node: NodeKey, topic: &str, type_hash: &str, description: &Bytes) {
-        self.note(format!("describe {node:?} {topic}"));
-        let (now, name) = (self.now_at(node), self.name(node, topic));
-        let packed = PackedType::new(type_hash, description).expect("within the bounds");
+        self.describe_all(node, &[topic], type_hash, description);
+    }
+
+    /// The same of several, which become known at one time.
+    pub fn describe_all(&mut self, node: NodeKey, topics: &[&str], type_hash: &str, description: &Bytes) {
+        self.note(format!("describe {node:?} {topics:?}"));
+        let now = self.now_at(node);
+        for topic in topics {
+            let name = self.name(node, topic);
+            let packed = PackedType::new(type_hash, description).expect("within the bounds");
+            if let Some(running) = &mut self.nodes[node.0].running {
+                running.endpoint.describe(now, &name, packed);
+            }
+        }
         if let Some(running) = &mut self.nodes[node.0].running {
-            running.endpoint.describe(now, &name, packed);
+            running.endpoint.tell_types(now);
         }
         self.settle(node);
     }

@@ -12,4 +12,6 @@ mod store;
 
 pub use definitions::Definitions;
 pub use described::{Described, NotBelieved};
-pub use store::{StoreFull, TYPES_BYTES_MAX, TYPES_MAX, TypeStore};
+pub use store::{
+    StoreFull, TYPES_BYTES_MAX, TYPES_MAX, TYPES_PER_OWNER_BYTES_MAX, TYPES_PER_OWNER_MAX, TypeStore,
+};

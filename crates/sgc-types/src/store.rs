@@ -15,6 +15,10 @@ use crate::Described;
 pub const TYPES_MAX: usize = 1024;
 /// Bytes of descriptions that are kept. What is made of them takes a few times as much.
 pub const TYPES_BYTES_MAX: usize = 8 << 20;
+/// Types that are kept for the interfaces of one owner: no one of them takes all the room.
+pub const TYPES_PER_OWNER_MAX: usize = TYPES_MAX / 2;
+/// Bytes of their descriptions.
+pub const TYPES_PER_OWNER_BYTES_MAX: usize = TYPES_BYTES_MAX / 2;
 
 /// Types that are known. Shared: all of its calls are short.
 #[derive(Debug)]

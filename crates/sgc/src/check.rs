@@ -140,6 +140,10 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     if let Some(gateway) = &config.gateway {
         rows.extend(gateway_rows(gateway));
     }
+    let state = sgc_node::state_dir(config, identity.node_name().as_str());
+    if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {
+        rows.push(vec!["warning".to_owned(), format!("{error}; the node does not start like that")]);
+    }
     Ok(rows)
 }
 

@@ -372,8 +372,8 @@ impl CliError {
     }
 }
 
-/// Prints what clap has to say, help included, and says how the process ends.
-pub(crate) fn usage(error: &clap::Error) -> ExitCode {
+/// Prints what clap has to say of a call of `called`, help included, and says how the process ends.
+pub(crate) fn usage(error: &clap::Error, called: &str) -> ExitCode {
     match error.kind() {
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => {
             // Nobody is there to be told that the help could not be printed.
@@ -385,14 +385,14 @@ pub(crate) fn usage(error: &clap::Error) -> ExitCode {
             ExitCode::from(EXIT_USAGE)
         }
         _ => {
-            output::diagnostic(&format!("sgc: {}", usage_line(&error.render().to_string())));
+            output::diagnostic(&format!("sgc: {}", usage_line(&error.render().to_string(), called)));
             ExitCode::from(EXIT_USAGE)
         }
     }
 }
 
 /// One line of clap's paragraphs: what is wrong and its tip, then where to read more.
-fn usage_line(text: &str) -> String {
+fn usage_line(text: &str, called: &str) -> String {
     let (about, rest) = text.split_once("Usage:").unwrap_or((text, ""));
     let about = about.split("For more information").next().unwrap_or_default();
     let line = about.split_whitespace().collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
@@ -400,7 +400,8 @@ fn usage_line(text: &str) -> String {
     let is_command = |word: &&str| word.chars().all(|c| c.is_ascii_lowercase() || c == '-');
     let command: Vec<_> =
         rest.split_whitespace().take_while(is_command).take_while(|word| !word.starts_with('-')).collect();
-    let command = if command.is_empty() { "sgc".to_owned() } else { command.join(" ") };
+    // Of a bad value clap says no usage.
+    let command = if command.is_empty() { called.to_owned() } else { command.join(" ") };
     format!("{line}; see `{command} --help`")
 }
 
@@ -438,15 +439,18 @@ mod tests {
         let text = "error: unrecognized subcommand 'flet'\n\n  tip: a similar subcommand exists: 'fleet'\n\n\
                     Usage: sgc <COMMAND>\n\nFor more information, try '--help'.\n";
         assert_eq!(
-            usage_line(text),
+            usage_line(text, "sgc fleet"),
             "unrecognized subcommand 'flet'; a similar subcommand exists: 'fleet'; see `sgc --help`"
         );
         let text = "error: invalid value 'x' for '--days <N>': invalid digit\n\nFor more information, try '--help'.\n";
-        assert_eq!(usage_line(text), "invalid value 'x' for '--days <N>': invalid digit; see `sgc --help`");
+        assert_eq!(
+            usage_line(text, "sgc fleet enroll"),
+            "invalid value 'x' for '--days <N>': invalid digit; see `sgc fleet enroll --help`"
+        );
         let text = "error: the following required arguments were not provided:\n  --owner <NODE>\n\n\
                     Usage: sgc fleet enroll --owner <NODE>\n\nFor more information, try '--help'.\n";
         let said = "the following required arguments were not provided: --owner <NODE>";
-        assert_eq!(usage_line(text), format!("{said}; see `sgc fleet enroll --help`"));
+        assert_eq!(usage_line(text, "sgc"), format!("{said}; see `sgc fleet enroll --help`"));
     }
 
     #[test]

@@ -31,7 +31,7 @@ mod yaml;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
 
 use crate::error::CliError;
 
@@ -75,12 +75,24 @@ enum Command {
 fn main() -> ExitCode {
     let result = match Cli::try_parse() {
         Ok(cli) => run(cli.command),
-        Err(error) => return error::usage(&error),
+        Err(error) => return error::usage(&error, &called(std::env::args())),
     };
     match result {
         Ok(code) => code,
         Err(error) => error.report(),
     }
+}
+
+/// The command that arguments name, as far as there is one of that name: `sgc fleet enroll`, for example.
+fn called(args: impl Iterator<Item = String>) -> String {
+    let mut command = &Cli::command();
+    let mut called = command.get_name().to_owned();
+    for arg in args.skip(1) {
+        let Some(found) = command.find_subcommand(&arg) else { break };
+        command = found;
+        called = format!("{called} {}", found.get_name());
+    }
+    called
 }
 
 fn run(command: Command) -> Result<ExitCode, CliError> {

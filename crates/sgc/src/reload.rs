@@ -60,16 +60,13 @@ pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
     if args.json {
         return output::line(report);
     }
-    for line in lines(report)? {
-        output::line(line)?;
-    }
-    Ok(())
+    lines(report, "nothing changed").into_iter().try_for_each(output::line)
 }
 
 /// Has the node at this socket read its configuration again, if one runs there; says what came of it.
 pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
     match ask(socket) {
-        Ok(report) => lines(report),
+        Ok(report) => Ok(lines(report, "The node that runs knows it.")),
         Err(CliError::NoNode { .. }) => {
             Ok(vec!["The node does not run; it counts from its next start.".to_owned()])
         }
@@ -89,13 +86,14 @@ fn ask(socket: &Path) -> Result<serde_json::Value, CliError> {
     }
 }
 
-fn lines(report: serde_json::Value) -> Result<Vec<String>, CliError> {
+/// What a report says, `unchanged` if nothing of the configuration has changed.
+fn lines(report: serde_json::Value, unchanged: &str) -> Vec<String> {
     let Report { changed, needs_restart, warnings } = serde_json::from_value(report).unwrap_or_default();
     let mut lines = changed;
     if lines.is_empty() && needs_restart.is_empty() {
-        lines.push("nothing changed".to_owned());
+        lines.push(unchanged.to_owned());
     }
     lines.extend(needs_restart);
     lines.extend(warnings);
-    Ok(lines)
+    lines
 }

@@ -77,7 +77,7 @@ struct GatewayClient {
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(crate) struct Link {
-    peer: String,
+    pub(crate) peer: String,
     pub(crate) remote: String,
     url: Option<String>,
     pub(crate) rtt_us: u64,

@@ -9,6 +9,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use rand_core::RngCore as _;
 use sgc_gateway::{ACCESS_VALID_MS_MAX, AccessGrant, Scope, TokenId};
+use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
 use sgc_node::{AccessRecord, AccessRecords};
 use sgc_trust::Identity;
@@ -131,6 +132,8 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
     // On the disk before it is printed: one that is in no list is overlooked.
     AccessRecords::change(&state, |records| records.add(AccessRecord::from(&grant), now))?;
     let short = short(&grant.id.to_string());
+    let (label, expires, scope) = (&grant.label, grant.expires, &grant.scope);
+    note(&config, &state, AuditEvent::TokenMade, &format!("{short} for {label}, until {expires}: {scope}"));
     output::diagnostic(&format!(
         "Token {short} for {}, until {}: {}. Whoever has it may do that at the gateway of {}: keep it secret.\nTo take it \
          back: sgc token revoke {short}",
@@ -181,9 +184,20 @@ fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     sgc_node::create_state_dir(&state)?;
     let record = AccessRecords::change(&state, |records| records.revoke(&args.id, unix_now()))?;
     let whose = if record.label.is_empty() { "which is not listed here" } else { &record.label };
+    note(&config, &state, AuditEvent::TokenRevoked, &format!("{} for {whose}", short(&record.id)));
     output::line(format!("token {} for {whose} is revoked", short(&record.id)))?;
     let socket = sgc_node::admin_socket_path(&config, identity.node_name().as_str());
     reload::after_change(&socket)?.into_iter().try_for_each(output::line)
+}
+
+/// Writes it into the audit log of the node. What was done is done, so a failure is said and no more.
+fn note(config: &Config, state: &Path, event: AuditEvent, what: &str) {
+    let path = audit::audit_path(config.audit.file.as_deref(), Some(state));
+    let Some(path) = path.filter(|_| !config.audit.off) else { return };
+    let by = format!("uid {}", rustix::process::getuid().as_raw());
+    if let Err(error) = audit::append(&path, &AuditRecord::new(event).reason(what).by(by)) {
+        output::diagnostic(&format!("sgc: the audit log {} cannot be written: {error}", path.display()));
+    }
 }
 
 fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {

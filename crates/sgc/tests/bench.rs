@@ -243,6 +243,24 @@ fn another_fleet_is_refused_and_told_so() {
 }
 
 #[test]
+fn a_wrong_name_or_address_of_the_other_side_is_said_to_be_one() {
+    let lab = Lab::new();
+    let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);
+    let url = answer.said("desk waits at ");
+    let output = lab.run("robot.identity", &["--with", "dask", "--to", &url, "--seconds", "1"]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let said = stderr(&output);
+    let address = url.strip_prefix("quic://").unwrap();
+    assert!(said.starts_with(&format!("sgc: bench: the node at {address} is not dask\n")), "{said}");
+    assert!(said.contains("prints the name of its node"), "{said}");
+    let output = lab.run("robot.identity", &["--with", "desk", "--to", address, "--seconds", "1"]);
+    assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
+    let said = stderr(&output);
+    assert!(said.contains("for '--to <URL>'") && !said.contains("`routers`"), "{said}");
+    assert!(said.trim().ends_with("see `sgc bench run --help`"), "{said}");
+}
+
+#[test]
 fn the_end_of_the_other_side_is_told_and_ends_a_run() {
     let lab = Lab::new();
     let answer = lab.answer(&["--listen", "quic://127.0.0.1:0"]);

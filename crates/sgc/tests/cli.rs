@@ -288,6 +288,21 @@ fn a_good_configuration_is_summed_up() {
 }
 
 #[test]
+fn check_warns_of_a_state_directory_that_others_may_enter() {
+    let place = Place::with_fleet();
+    place
+        .write("node.toml", "identity = 'arm-1.identity'\n[node]\nrouters = ['quic://r']\nstate = 'state'\n");
+    let check = ["check", "-c", "node.toml"];
+    assert!(!place.good(&check).contains("warning"), "it is made when the node starts");
+    fs::create_dir(place.path().join("state")).unwrap();
+    for (mode, warns) in [(0o755, true), (0o700, false)] {
+        fs::set_permissions(place.path().join("state"), fs::Permissions::from_mode(mode)).unwrap();
+        let said = place.good(&check);
+        assert_eq!(said.contains("its mode 0755 lets others in; chmod 700 it"), warns, "{said}");
+    }
+}
+
+#[test]
 fn how_routers_are_found_and_who_may_attach_is_summed_up() {
     let place = Place::with_fleet();
     let ca = place.good(&["fleet", "ca"]);
@@ -476,6 +491,8 @@ fn what_no_node_could_share_has_no_name() {
 fn usage_errors_are_one_line_and_code_2() {
     let place = Place::new();
     place.says(2, &["fly"], "unrecognized subcommand 'fly'; see `sgc --help`");
+    let said = place.bad(2, &["token", "create", "--for", "x", "--valid", "soon"]);
+    assert!(said.trim_end().ends_with("see `sgc token create --help`"), "{said}");
     place.says(
         2,
         &["statos"],

@@ -87,6 +87,18 @@ fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
     assert_eq!(wrong.status.code(), Some(1), "{wrong:?}");
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("date"), "{wrong:?}");
 
+    // Programs of one gateway hear and call each other, as ROS 2 nodes do.
+    let args = ["grpc", "grpc://127.0.0.1:50051", "--serve", "/add_here", "--publish", "/between"];
+    let mut one = lab.python(Site::Desk, "gateway.py", &args);
+    one.wait("it serves", |event| event["event"] == "served");
+    let mut other =
+        lab.python(Site::Desk, "gateway.py", &["rosbridge", "ws://127.0.0.1:9090", "--topic", "/between"]);
+    assert!(heard(&mut other).starts_with("without ROS"));
+    let reply = said(&shell(&lab, &["service", "call", "/add_here", "{a: 20, b: 3}"]));
+    assert_eq!(reply, r#"{"sum":23}"#);
+    one.end();
+    other.end();
+
     // Whatever is killed, who hears goes on as soon as it can.
     let mut program = lab.python(Site::Desk, "gateway.py", &["grpc", "grpc://127.0.0.1:50051", "--hear"]);
     heard(&mut program);

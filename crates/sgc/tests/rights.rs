@@ -445,6 +445,18 @@ fn a_program_without_ros_gets_a_token_that_is_taken_back() {
     let revoked: Vec<_> = tokens.iter().filter(|token| !token["revoked"].is_null()).collect();
     assert_eq!((revoked.len(), &revoked[0]["id"]), (1, &id.as_str().into()));
     assert!(tokens.iter().any(|token| token["id"] == second.to_string().as_str()));
+
+    let audit = place.good(&["audit", "-c", "arm-1.toml", "--json"]);
+    let records: Vec<Value> = audit.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let events: Vec<_> = records.iter().map(|record| record["event"].as_str().unwrap()).collect();
+    assert_eq!(events, ["token_made", "token_made", "token_revoked"]);
+    let why = |at: usize| records[at]["reason"].as_str().unwrap().to_owned();
+    assert!(why(0).contains(&format!("{} for dashboard, until ", &id[..12])), "{audit}");
+    assert!(why(0).ends_with("subscribe /odom /camera/**; publish /cmd_vel"), "{audit}");
+    assert_eq!(why(2), format!("{} for dashboard", &id[..12]));
+    assert!(records[2]["by"].as_str().unwrap().starts_with("uid "), "{audit}");
+    assert!(!audit.contains("sgc-access"), "no token is in it");
+    place.good(&["audit", "-c", "arm-1.toml", "--event", "token_refused"]);
 }
 
 #[test]

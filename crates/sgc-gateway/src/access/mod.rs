@@ -12,6 +12,7 @@ mod token;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -69,11 +70,22 @@ pub struct AccessRules {
     pub names: BTreeMap<NodeId, String>,
 }
 
+/// Hears of each token that is refused: where it was shown, and why.
+pub type HearRefusals = Arc<dyn Fn(SocketAddr, &Denied) + Send + Sync>;
+
 /// Who may connect, and what they may do. Cloning shares.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Access {
     rules: Arc<AccessRules>,
     attempts: Arc<Mutex<Attempts>>,
+    hears: Option<HearRefusals>,
+    denied: Arc<AtomicU64>,
+}
+
+impl fmt::Debug for Access {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Access").field("rules", &self.rules).finish_non_exhaustive()
+    }
 }
 
 /// What a front end knows of a connection.
@@ -179,13 +191,23 @@ impl fmt::Debug for Evidence {
 impl Access {
     /// Access by these rules.
     pub fn new(rules: AccessRules) -> Self {
-        Self { rules: Arc::new(rules), attempts: Arc::default() }
+        Self { rules: Arc::new(rules), attempts: Arc::default(), hears: None, denied: Arc::default() }
     }
 
-    /// The same with what is remembered of failed attempts before the rules changed.
+    /// The same with what is remembered of failed attempts before the rules changed, with who hears of them and how many were
+    /// refused.
     #[must_use]
     pub fn after(mut self, before: &Self) -> Self {
         self.attempts = Arc::clone(&before.attempts);
+        self.hears.clone_from(&before.hears);
+        self.denied = Arc::clone(&before.denied);
+        self
+    }
+
+    /// The same, and `hears` is told of tokens that are refused. It must not wait.
+    #[must_use]
+    pub fn heard_by(mut self, hears: HearRefusals) -> Self {
+        self.hears = Some(hears);
         self
     }
 
@@ -206,11 +228,26 @@ impl Access {
         !self.rules.clients.is_empty()
     }
 
+    /// How often somebody was not admitted.
+    pub fn denied(&self) -> u64 {
+        self.denied.load(Ordering::Relaxed)
+    }
+
     /// Who this is, and what it may do. A token decides if there is one: what it does not permit, a certificate beside it
     /// does not either.
     pub fn admit(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
+        self.judge(admission).inspect_err(|_| {
+            self.denied.fetch_add(1, Ordering::Relaxed);
+        })
+    }
+
+    fn judge(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
         if let Some(token) = admission.token {
-            return self.admit_token(token, admission);
+            return self.admit_token(token, admission).inspect_err(|denied| {
+                if let Some(hears) = &self.hears {
+                    hears(admission.peer, denied);
+                }
+            });
         }
         let origin = admission.origin.map(Arc::from);
         if let Some(peer) = admission.certificate {

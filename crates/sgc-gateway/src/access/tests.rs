@@ -319,6 +319,25 @@ fn an_address_whose_tokens_fail_waits_and_a_reload_does_not_forget_it() {
 }
 
 #[test]
+fn who_keeps_the_log_hears_of_tokens_that_are_refused_and_of_nothing_else() {
+    let cast = cast();
+    let heard: Arc<Mutex<Vec<(String, Denied)>>> = Arc::default();
+    let log = Arc::clone(&heard);
+    let hears: HearRefusals =
+        Arc::new(move |peer, denied| log.lock().unwrap().push((peer.to_string(), denied.clone())));
+    let access = Access::new(cast.rules()).heard_by(hears);
+    let revoked = AccessRules { revoked: [cast.grant().id].into(), ..cast.rules() };
+    let revoked = Access::new(revoked).after(&access);
+    let good = cast.token().to_text();
+    let show = |access: &Access, token| access.admit(&Admission { token, ..from(HERE) }).is_ok();
+    assert!(show(&access, Some(&good)) && show(&access, None));
+    assert!(access.admit(&from(ELSEWHERE)).is_err(), "without a token");
+    assert!(!show(&access, Some("x")) && !show(&revoked, Some(&good)));
+    let wanted = [Denied::Token(AccessTokenError::Prefix), Denied::TokenRevoked { id: cast.grant().id }];
+    assert_eq!(*heard.lock().unwrap(), wanted.map(|denied| (HERE.to_owned(), denied)));
+}
+
+#[test]
 fn what_is_no_token_is_not_made() {
     let cast = cast();
     let sign = |grant: AccessGrant| grant.sign(&cast.gateway).unwrap_err();

@@ -47,8 +47,6 @@ const MATCH_MAX: Duration = Duration::from_millis(200);
 const JOBS_MAX: usize = 512;
 /// Questions for parameters under way.
 const PARAMETER_JOBS_MAX: usize = 8;
-/// Nodes of one question that are said to have failed, each for itself.
-const FAILURES_MAX: usize = 16;
 /// Statuses that are remembered, so that none is said twice.
 const STATUSES_MAX: usize = 1024;
 /// Messages of a topic of events that may wait.
@@ -538,9 +536,13 @@ impl<'o> Connection<'o> {
                 for node in &answer.answered {
                     self.remove_status(&parameters_id(node));
                 }
-                for (what, why) in answer.failed.iter().take(FAILURES_MAX) {
+                for (what, why) in &answer.failed.shown {
                     let message = format!("parameters of {what}: {why}");
                     self.status(Level::Warning, &message, Some(parameters_id(what)));
+                }
+                if answer.failed.more > 0 {
+                    let message = format!("{} more of the same question failed", answer.failed.more);
+                    self.status(Level::Warning, &message, None);
                 }
                 if is_asked {
                     self.tell(&Told::ParameterValues { parameters: &answer.parameters, id: id.as_deref() });

@@ -44,6 +44,10 @@ const NODE_PARAMETERS_MAX: usize = 4096;
 pub(super) const ASKED_MAX: usize = 16_384;
 /// Parameters asked for at once: an answer has all of their values.
 const ASKED_AT_ONCE: usize = 128;
+/// Failures of one question that are said, each for itself.
+const FAILURES_MAX: usize = 16;
+/// Longest name and longest reason that are said of one, characters.
+const FAILURE_MAX: usize = 512;
 /// Parameters that a client may hear of; with all, any number.
 pub(super) const WATCHED_MAX: usize = 16_384;
 
@@ -61,8 +65,38 @@ pub(super) struct Answer {
     pub(super) parameters: Vec<Parameter>,
     /// Nodes that answered all they were asked.
     pub(super) answered: Vec<String>,
-    /// Nodes that did not, and why.
-    pub(super) failed: Vec<(String, String)>,
+    /// What did not succeed.
+    pub(super) failed: Failures,
+}
+
+/// Nodes that did not answer, parameters that are none or that a node did not set, and why.
+#[derive(Debug, Default)]
+pub(super) struct Failures {
+    pub(super) shown: Vec<(String, String)>,
+    /// Those that are only counted.
+    pub(super) more: usize,
+}
+
+impl Failures {
+    fn push(&mut self, (what, why): (String, String)) {
+        if self.shown.len() >= FAILURES_MAX {
+            self.more += 1;
+            return;
+        }
+        self.shown.push((clip(&what), clip(&why)));
+    }
+
+    fn extend(&mut self, failed: impl IntoIterator<Item = (String, String)>) {
+        failed.into_iter().for_each(|failed| self.push(failed));
+    }
+}
+
+/// The beginning of a text.
+fn clip(text: &str) -> String {
+    match text.char_indices().nth(FAILURE_MAX) {
+        Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
+        None => text.to_owned(),
+    }
 }
 
 #[derive(Deserialize)]
@@ -220,7 +254,10 @@ impl Parameters {
                         Refusal::Gateway(GatewayError::Timeout { .. } | GatewayError::NoServer { .. })
                     ) {
                         let mut silent = self.silent.lock().unwrap_or_else(PoisonError::into_inner);
-                        silent.insert(node.clone(), Instant::now());
+                        // Of nodes that are only made up there are as many as a client likes.
+                        if silent.len() < NODES_MAX {
+                            silent.insert(node.clone(), Instant::now());
+                        }
                     }
                     answer.failed.push((node, error.to_string()));
                 }
@@ -284,7 +321,10 @@ impl Parameters {
         }
         for (node, parameters) in nodes {
             match self.set_of_node(&node, parameters).await {
-                Ok(refused) => answer.failed.extend(refused),
+                Ok(refused) => {
+                    answer.failed.extend(refused.shown);
+                    answer.failed.more += refused.more;
+                }
                 Err(error) => answer.failed.push((node, error.to_string())),
             }
         }
@@ -299,11 +339,11 @@ impl Parameters {
         &self,
         node: &str,
         parameters: Vec<(String, Parameter)>,
-    ) -> Result<Vec<(String, String)>, Refusal> {
+    ) -> Result<Failures, Refusal> {
         let names: Vec<_> = parameters.iter().map(|(name, _)| name.clone()).collect();
         // What a number is meant to be is known by what is there: JSON has one kind of them.
         let present = self.values(node, &names).await.unwrap_or_default();
-        let (mut refused, mut sent, mut request) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut refused, mut sent, mut request) = (Failures::default(), Vec::new(), Vec::new());
         for (at, (name, parameter)) in parameters.into_iter().enumerate() {
             match to_ros(parameter, present.get(at).map(|value| value.kind)) {
                 Ok(value) => {
@@ -501,6 +541,17 @@ mod tests {
         assert_eq!(of(json!([1, 2.5]), None, NOT_SET), Ok(DOUBLE_ARRAY));
         assert_eq!(of(json!([]), None, INTEGER_ARRAY), Ok(INTEGER_ARRAY));
         assert!(of(json!([1, "a"]), None, NOT_SET).is_err() && of(json!({}), None, NOT_SET).is_err());
+    }
+
+    #[test]
+    fn failures_beyond_those_said_are_counted_and_none_is_long() {
+        let mut failed = Failures::default();
+        let why = "é".repeat(1 << 20);
+        failed.extend((0..20).map(|n| (format!("{n}{why}"), why.clone())));
+        failed.push(("last".into(), "late".into()));
+        assert_eq!((failed.shown.len(), failed.more), (FAILURES_MAX, 5));
+        let longest = failed.shown.iter().map(|(what, why)| what.chars().count().max(why.chars().count()));
+        assert_eq!(longest.max(), Some(FAILURE_MAX + 1));
     }
 
     #[test]

@@ -4,11 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt as _;
-use tokio::sync::mpsc;
 use tonic::{Response, Status, Streaming};
 
-use super::budget::{self, respond};
 use super::client::{Guest, Place, Taken};
+use super::conversation::{Conversation, Told, begin, first};
 use super::fault::Fault;
 use super::proto::send_goal_request::{Goal as GoalSaid, Kind as Asked};
 use super::proto::send_goal_response as sent;
@@ -23,8 +22,6 @@ use crate::action::{
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 
-/// Responses that wait for a client: what comes beyond them waits in the hub.
-const RESPONSES_MAX: usize = 16;
 /// How long the end of a goal is waited for.
 const OUTCOME_WAIT_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
 /// Feedback that was there when a goal ended and is told before that.
@@ -33,16 +30,13 @@ const LAST_FEEDBACK_MAX: usize = 64;
 const ORDER_GOAL: Fault = Fault::Order { what: "the goal" };
 const ORDER_ACTION: Fault = Fault::Order { what: "the action" };
 
-type Told<T> = mpsc::Sender<budget::Told<T>>;
-
 /// Sends a goal, and tells of it until it has ended.
 pub(super) async fn send_goal(
     guest: Arc<Guest>,
     mut requests: Streaming<SendGoalRequest>,
 ) -> Result<Response<Responses<SendGoalResponse>>, Status> {
     let place = guest.take(Taken::Goal)?;
-    let first = async { Ok(requests.message().await) };
-    let Some(SendGoalRequest { kind: Some(Asked::Goal(said)) }) = guest.admitted(first).await?? else {
+    let Some(SendGoalRequest { kind: Some(Asked::Goal(said)) }) = first(&guest, &mut requests).await? else {
         return Err(ORDER_GOAL.into());
     };
     let GoalSaid { action, r#type, encoding, payload } = said;
@@ -54,11 +48,9 @@ pub(super) async fn send_goal(
         Ok((guest.session.action_type(&action, said)?, taken))
     };
     let (type_name, (goal, feedback)) = guest.admitted(sent).await?;
-    let (told, responses) = mpsc::channel(RESPONSES_MAX);
     let taken = sent::Taken { goal_id: goal.id().to_vec().into(), r#type: type_name };
-    let _ = told.try_send((Ok(SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) }), None));
-    tokio::spawn(Sent { place, goal, feedback, form }.run(requests, told));
-    Ok(respond(responses))
+    let taken = SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) };
+    Ok(begin(Sent { place, goal, feedback, form }, requests, taken))
 }
 
 /// A goal that a server has taken.
@@ -69,20 +61,12 @@ struct Sent {
     form: Form,
 }
 
-impl Sent {
-    async fn run(mut self, requests: Streaming<SendGoalRequest>, told: Told<SendGoalResponse>) {
-        let guest = Arc::clone(&self.place.guest);
-        let why = tokio::select! {
-            biased;
-            why = guest.ended() => Err(Status::from(why)),
-            // Its client has gone.
-            () = told.closed() => return,
-            done = self.work(requests, &told) => done,
-        };
-        drop(self);
-        if let Err(why) = why {
-            let _ = told.send((Err(why), None)).await;
-        }
+impl Conversation for Sent {
+    type Request = SendGoalRequest;
+    type Response = SendGoalResponse;
+
+    fn place(&self) -> &Place {
+        &self.place
     }
 
     async fn work(
@@ -151,8 +135,8 @@ pub(super) async fn serve(
     mut requests: Streaming<ServeActionRequest>,
 ) -> Result<Response<Responses<ServeActionResponse>>, Status> {
     let place = guest.take(Taken::Serving)?;
-    let first = async { Ok(requests.message().await) };
-    let Some(ServeActionRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
+    let Some(ServeActionRequest { kind: Some(Said::Server(server)) }) = first(&guest, &mut requests).await?
+    else {
         return Err(ORDER_ACTION.into());
     };
     let Server { action, r#type, encoding } = server;
@@ -164,11 +148,9 @@ pub(super) async fn serve(
     };
     let (type_name, serving) = guest.admitted(serving).await?;
     let replier = serving.replier();
-    let (told, responses) = mpsc::channel(RESPONSES_MAX);
-    let first = served::Kind::Served(served::Served { r#type: type_name });
-    let _ = told.try_send((Ok(ServeActionResponse { kind: Some(first) }), None));
-    tokio::spawn(Served { place, serving, replier, form }.run(requests, told));
-    Ok(respond(responses))
+    let taken = served::Kind::Served(served::Served { r#type: type_name });
+    let taken = ServeActionResponse { kind: Some(taken) };
+    Ok(begin(Served { place, serving, replier, form }, requests, taken))
 }
 
 /// An action that a client serves.
@@ -179,20 +161,12 @@ struct Served {
     form: Form,
 }
 
-impl Served {
-    async fn run(mut self, requests: Streaming<ServeActionRequest>, told: Told<ServeActionResponse>) {
-        let guest = Arc::clone(&self.place.guest);
-        let why = tokio::select! {
-            biased;
-            why = guest.ended() => Err(Status::from(why)),
-            // Its client has gone.
-            () = told.closed() => return,
-            done = self.work(requests, &told) => done,
-        };
-        drop(self);
-        if let Err(why) = why {
-            let _ = told.send((Err(why), None)).await;
-        }
+impl Conversation for Served {
+    type Request = ServeActionRequest;
+    type Response = ServeActionResponse;
+
+    fn place(&self) -> &Place {
+        &self.place
     }
 
     async fn work(
@@ -237,7 +211,9 @@ impl Served {
             }
         }
     }
+}
 
+impl Served {
     async fn hear(&self, said: Said) -> Result<(), Fault> {
         let content = |bytes| Content { form: self.form, bytes };
         match said {

@@ -12,10 +12,10 @@ use tokio::sync::watch;
 use tonic::{Request, Status};
 
 use super::GrpcOptions;
-use super::budget::Budget;
 use super::connection::Connection;
 use super::fault::Fault;
 use crate::access::{Access, Admission, Client, Denied};
+use crate::budget::Budget;
 use crate::error::GatewayError;
 use crate::feed::{Subscription, SubscriptionEnd};
 use crate::hub::{Hub, lock};
@@ -123,6 +123,7 @@ impl Clients {
             ended: watch::Sender::new(None),
             heard: Mutex::default(),
             unread: Budget::new(self.options.unread_bytes_max),
+            incoming: Budget::new(self.options.incoming_bytes_max),
         });
         known.push(Known { shown, guest: Arc::clone(&guest) });
         tokio::spawn(watch_over(
@@ -202,6 +203,8 @@ pub(super) struct Guest {
     heard: Mutex<Vec<SubscriptionEnd>>,
     /// Long messages that are written for it and under way.
     pub(super) unread: Budget,
+    /// Those that it sends.
+    pub(super) incoming: Budget,
 }
 
 /// A stream of a guest's, counted while it lasts.

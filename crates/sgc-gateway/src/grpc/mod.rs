@@ -10,16 +10,18 @@
 //! the business of sessions.
 
 mod action;
-mod budget;
 mod client;
 mod connection;
+mod conversation;
 mod fault;
 mod graph;
+mod incoming;
 mod publish;
 mod qos;
 mod serve;
 mod service;
 mod subscribe;
+mod tracking;
 mod types;
 
 /// What is generated from `proto/sgc/gateway/v1/gateway.proto`, whose words explain it.
@@ -50,10 +52,10 @@ pub use fault::Fault;
 use crate::access::Access;
 use crate::hub::Hub;
 use crate::session::SessionLimits;
-use budget::Tracking;
 use client::Clients;
 use proto::gateway_server::GatewayServer;
 use service::Service;
+use tracking::Tracking;
 
 /// Longest message of gRPC, either way, bytes: images take 13 MB.
 pub const MESSAGE_BYTES_MAX: usize = 64 << 20;
@@ -84,6 +86,9 @@ pub struct GrpcOptions {
     pub session: SessionLimits,
     /// Bytes of long messages that a client has not read yet though they were sent, of all its streams: further ones wait.
     pub unread_bytes_max: usize,
+    /// Bytes of long messages that a client may send at a time, on all its streams: from the head of each until it is worked
+    /// on. Streams that would send more are refused.
+    pub incoming_bytes_max: usize,
     /// How often it is looked whether clients are still admitted.
     pub judge_interval: Duration,
 }
@@ -93,6 +98,7 @@ impl Default for GrpcOptions {
         Self {
             session: SessionLimits::default(),
             unread_bytes_max: 4 * MESSAGE_BYTES_MAX,
+            incoming_bytes_max: 4 * MESSAGE_BYTES_MAX,
             judge_interval: Duration::from_secs(1),
         }
     }

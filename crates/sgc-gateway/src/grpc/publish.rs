@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::FutureExt as _;
 use tonic::{Status, Streaming};
 
 use super::client::{Guest, Taken};
@@ -12,6 +13,7 @@ use super::proto::publish_request::{Kind, Publisher};
 use super::proto::{PublishRequest, PublishResponse};
 use super::qos;
 use crate::content::Content;
+use crate::error::GatewayError;
 use crate::session::Advertise;
 
 /// How long those readers are waited for that are there already: what is published before they are matched is lost to them.
@@ -43,18 +45,36 @@ pub(super) async fn publish(
         Ok(publication)
     };
     let publication = guest.admitted(advertised).await?;
-    let mut published = 0;
-    while let Some(request) = next(&mut requests).await? {
+    // Those that are there already leave together.
+    let mut taken = 0;
+    let failed = |taken: u64, error: GatewayError| {
+        let number = match error {
+            // Which may be one before that which was taken last.
+            GatewayError::Ros(_) => publication.published() + 1,
+            _ => taken,
+        };
+        Fault::Message { number, error: Box::new(error) }
+    };
+    let flush = async |taken: u64| {
+        guest.admitted(async { publication.flush().await.map_err(|error| failed(taken, error)) }).await
+    };
+    loop {
+        let request = match next(&mut requests).now_or_never() {
+            Some(request) => request?,
+            None => {
+                flush(taken).await?;
+                next(&mut requests).await?
+            }
+        };
+        let Some(request) = request else { break };
         let Some(Kind::Payload(bytes)) = request.kind else { return Err(ORDER.into()) };
         let content = Content { form, bytes };
-        let written = async {
-            let result = publication.publish(&content).await;
-            result.map_err(|error| Fault::Message { number: published + 1, error: Box::new(error) })
-        };
-        guest.admitted(written).await?;
-        published += 1;
+        taken += 1;
+        let publishing = publication.publish_ahead(&content);
+        guest.admitted(async { publishing.await.map_err(|error| failed(taken, error)) }).await?;
     }
-    Ok(PublishResponse { published })
+    flush(taken).await?;
+    Ok(PublishResponse { published: publication.published() })
 }
 
 fn wanted(publisher: Publisher) -> Result<Advertise, Fault> {

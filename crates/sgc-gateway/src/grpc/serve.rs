@@ -4,11 +4,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use sgc_ros::RequestId;
-use tokio::sync::mpsc;
 use tonic::{Response, Status, Streaming};
 
-use super::budget::{self, respond};
 use super::client::{Guest, Place, Taken};
+use super::conversation::{Conversation, Told, begin, first};
 use super::fault::Fault;
 use super::proto::serve_request::{Kind as Said, Reply, Server};
 use super::proto::serve_response::{Kind, Refused, Request, Served};
@@ -21,12 +20,8 @@ use crate::service::{Replier, Serving};
 
 /// Calls that were not answered and are remembered: of more the oldest cannot be answered any more.
 const OPEN_MAX: usize = 4096;
-/// Responses that wait for a client: calls beyond them wait in the serving, then at those who call.
-const RESPONSES_MAX: usize = 16;
 /// What is to come first.
 const ORDER: Fault = Fault::Order { what: "the service" };
-
-type Told = mpsc::Sender<budget::Told<ServeResponse>>;
 
 /// A service that a client serves.
 struct Work {
@@ -44,8 +39,7 @@ pub(super) async fn serve(
     mut requests: Streaming<ServeRequest>,
 ) -> Result<Response<Responses<ServeResponse>>, Status> {
     let place = guest.take(Taken::Serving)?;
-    let first = async { Ok(requests.message().await) };
-    let Some(ServeRequest { kind: Some(Said::Server(server)) }) = guest.admitted(first).await?? else {
+    let Some(ServeRequest { kind: Some(Said::Server(server)) }) = first(&guest, &mut requests).await? else {
         return Err(ORDER.into());
     };
     let Server { service, r#type, encoding } = server;
@@ -55,32 +49,24 @@ pub(super) async fn serve(
     let served = async { Ok(guest.session.serve(&service, said).await?) };
     let serving = guest.admitted(served).await?;
     let replier = serving.replier();
-    let (told, responses) = mpsc::channel(RESPONSES_MAX);
-    let served = Kind::Served(Served { r#type: type_name? });
-    let _ = told.try_send((Ok(ServeResponse { kind: Some(served) }), None));
+    let served = ServeResponse { kind: Some(Kind::Served(Served { r#type: type_name? })) };
     let work = Work { place, serving, replier, form, open: BTreeMap::new(), last: 0 };
-    tokio::spawn(work.run(requests, told));
-    Ok(respond(responses))
+    Ok(begin(work, requests, served))
 }
 
-impl Work {
-    async fn run(mut self, requests: Streaming<ServeRequest>, told: Told) {
-        let guest = Arc::clone(&self.place.guest);
-        let why = tokio::select! {
-            biased;
-            why = guest.ended() => Err(Status::from(why)),
-            // Its client has gone.
-            () = told.closed() => return,
-            done = self.work(requests, &told) => done,
-        };
-        // It ends before its client hears so: who does not read may take as long as it likes.
-        drop(self);
-        if let Err(why) = why {
-            let _ = told.send((Err(why), None)).await;
-        }
+impl Conversation for Work {
+    type Request = ServeRequest;
+    type Response = ServeResponse;
+
+    fn place(&self) -> &Place {
+        &self.place
     }
 
-    async fn work(&mut self, mut requests: Streaming<ServeRequest>, told: &Told) -> Result<(), Status> {
+    async fn work(
+        &mut self,
+        mut requests: Streaming<ServeRequest>,
+        told: &Told<ServeResponse>,
+    ) -> Result<(), Status> {
         loop {
             // A place for what may come of it is taken first, so that nothing is lost by being given up.
             tokio::select! {
@@ -119,7 +105,9 @@ impl Work {
             }
         }
     }
+}
 
+impl Work {
     async fn answer(&mut self, Reply { id, payload }: Reply) -> Result<(), Fault> {
         let open = *self.open.get(&id).ok_or(Fault::NotOpen { id })?;
         self.replier.reply(open, &Content { form: self.form, bytes: payload }).await?;

@@ -7,7 +7,6 @@ use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::budget::{Slot, with_slot};
 use super::client::{Guest, Taken};
 use super::fault::Fault;
 use super::proto::gateway_server::Gateway;
@@ -17,6 +16,7 @@ use super::proto::{
     ServeActionResponse, ServeRequest, ServeResponse, SubscribeRequest, SubscribeResponse, WatchGraphRequest,
     WatchGraphResponse,
 };
+use super::tracking::{Slot, with_slot};
 use super::{action, graph, publish, qos, serve, subscribe, types};
 use crate::content::Content;
 

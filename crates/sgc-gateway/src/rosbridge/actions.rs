@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use futures_util::FutureExt as _;
 use serde_json::Value as Json;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 
-use super::calls::Held;
+use super::calls::{Held, ended};
 use super::envelope::{Compression, Envelope};
 use super::input;
 use super::op::{OpId, told};
@@ -56,26 +56,53 @@ impl Wanted {
     }
 }
 
-/// Sends a goal and tells of it until it has ended; `cancel` is told when it is to be given up.
+/// Sends a goal and tells of it until it has ended; `cancel` is told when it is to be given up, `end` when its client may not
+/// have it any more.
 pub(super) async fn pursue(
     session: Arc<Session>,
     wanted: Wanted,
     args: (String, Held),
-    cancel: Arc<Notify>,
+    (cancel, mut end): (Arc<Notify>, oneshot::Receiver<GatewayError>),
     outbox: Outbox,
 ) {
     let send = |goal: Content| {
         let (session, wanted) = (&session, &wanted);
         async move { session.send_goal(&wanted.action, wanted.type_name.as_deref(), &goal).await }
     };
-    let sent = input::tolerate_later(&args.0, send).await;
-    drop(args);
-    match sent {
-        Ok((goal, feedback)) => match follow(&session, &wanted, &goal, feedback, &cancel, &outbox).await {
-            Ok(()) => {}
-            Err(error) => wanted.fail(&told(&error), &outbox).await,
-        },
-        Err(error) => wanted.fail(&told(&error), &outbox).await,
+    let sending = async {
+        // They wait no more once they are sent.
+        let args = args;
+        input::tolerate_later(&args.0, send).await
+    };
+    tokio::pin!(sending);
+    let sent = tokio::select! {
+        biased;
+        why = ended(&mut end) => {
+            let why = told(&why);
+            // What was taken before that is known only now.
+            let (sent, ()) = tokio::join!(sending, wanted.fail(&why, &outbox));
+            if let Ok((goal, _)) = sent {
+                give_up(&wanted, &goal, &outbox).await;
+            }
+            return;
+        }
+        sent = &mut sending => sent,
+    };
+    let (goal, feedback) = match sent {
+        Ok(sent) => sent,
+        Err(error) => return wanted.fail(&told(&error), &outbox).await,
+    };
+    let followed = tokio::select! {
+        biased;
+        why = ended(&mut end) => {
+            let why = told(&why);
+            tokio::join!(give_up(&wanted, &goal, &outbox), wanted.fail(&why, &outbox));
+            return;
+        }
+        followed = follow(&session, &wanted, &goal, feedback, &cancel, &outbox) => followed,
+    };
+    if let Err(error) = followed {
+        wanted.fail(&told(&error), &outbox).await;
     }
 }
 
@@ -123,8 +150,7 @@ async fn follow(
         .content("values", &outcome.result)
         .value("status", &Json::from(outcome.status as i8))
         .value("result", &Json::Bool(true));
-    let _ = outbox.say(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await;
-    Ok(())
+    outbox.say_reply(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await
 }
 
 async fn give_up(wanted: &Wanted, goal: &Goal, outbox: &Outbox) {
@@ -138,7 +164,11 @@ async fn tell(wanted: &Wanted, said: Result<bytes::Bytes, GatewayError>, outbox:
     match said {
         Ok(values) => {
             let said = wanted.envelope("action_feedback", values.len()).content("values", &values);
-            let _ = outbox.say(said.finish_in_pieces(wanted.fragment_size, fragment_id)).await;
+            let said = said.finish_in_pieces(wanted.fragment_size, fragment_id);
+            if let Err(error) = outbox.say_reply(said).await {
+                let why = format!("feedback of {} is left out: {error}", wanted.action);
+                outbox.try_status(Level::Error, &told(&why), wanted.id.as_ref());
+            }
         }
         Err(error) => outbox.try_status(Level::Error, &error.to_string(), wanted.id.as_ref()),
     }
@@ -223,6 +253,7 @@ impl Told {
     async fn pass_on(self, mut serving: ActionServing) {
         let replier = serving.replier();
         while let Some(event) = serving.next().await {
+            let _turn = self.outbox.turn().await;
             let frame = match event {
                 ActionEvent::Goal { id, goal } => {
                     let Ok(args) = serving.write(&goal, Form::Json) else { continue };

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use serde_json::Value as Json;
+use tokio::sync::oneshot;
 
 use super::envelope::{Compression, Envelope};
 use super::input;
@@ -62,13 +63,37 @@ pub(super) async fn refuse(id: &OpId, service: &str, why: &str, outbox: &Outbox)
     let _ = outbox.say(refused.finish()).await;
 }
 
-/// Calls it and tells what came of it.
+/// Ends a call or a goal that its client may not have any more.
+pub(super) type End = oneshot::Sender<GatewayError>;
+
+/// Waits until something is to end, and has why.
+pub(super) async fn ended(end: &mut oneshot::Receiver<GatewayError>) -> GatewayError {
+    match end.await {
+        Ok(why) => why,
+        // Nobody will say so.
+        Err(_) => std::future::pending().await,
+    }
+}
+
+/// Calls it and tells what came of it, or why it has to end.
 pub(super) async fn answer(
     session: Arc<Session>,
     options: Arc<RosbridgeOptions>,
     call: Call,
+    mut end: oneshot::Receiver<GatewayError>,
     outbox: Outbox,
 ) {
+    let why = tokio::select! {
+        biased;
+        why = ended(&mut end) => why,
+        () = ask(&session, &options, &call, &outbox) => return,
+    };
+    let ended = Envelope::new("service_response", call.compression, 0).id(call.id.as_ref());
+    let ended = ended.text("service", &call.service).text("values", &told(&why));
+    let _ = outbox.say(ended.value("result", &Json::Bool(false)).finish()).await;
+}
+
+async fn ask(session: &Session, options: &RosbridgeOptions, call: &Call, outbox: &Outbox) {
     let envelope = |bytes: usize| {
         Envelope::new("service_response", call.compression, bytes)
             .id(call.id.as_ref())
@@ -76,7 +101,7 @@ pub(super) async fn answer(
     };
     let own = match local_name(&call.service) {
         Some(name) => {
-            let api = RosApi { session: &session, options: &options };
+            let api = RosApi { session, options };
             api.answer(name, call.args.as_deref().unwrap_or("{}")).await
         }
         None => None,
@@ -84,13 +109,16 @@ pub(super) async fn answer(
     let (answered, is_done) = match own {
         Some(Ok(values)) => (envelope(0).value("values", &values), true),
         Some(Err(why)) => (envelope(0).text("values", &told(&why)), false),
-        None => match on_network(&session, &call).await {
+        None => match on_network(session, call).await {
             Ok(values) => (envelope(values.len()).content("values", &values), true),
             Err(error) => (envelope(0).text("values", &told(&error)), false),
         },
     };
     let answered = answered.value("result", &Json::Bool(is_done));
-    let _ = outbox.say(answered.finish_in_pieces(call.fragment_size, fragment_id)).await;
+    if let Err(error) = outbox.say_reply(answered.finish_in_pieces(call.fragment_size, fragment_id)).await {
+        let refused = envelope(0).text("values", &told(&error)).value("result", &Json::Bool(false));
+        let _ = outbox.say(refused.finish()).await;
+    }
 }
 
 async fn on_network(session: &Session, call: &Call) -> Result<bytes::Bytes, GatewayError> {

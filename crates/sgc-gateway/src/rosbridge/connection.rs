@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
-use tokio::sync::Notify;
+use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use super::actions::{ServedAction, Wanted, pursue};
-use super::calls::{Call, Held, answer, refuse};
+use super::calls::{Call, End, Held, answer, refuse};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
@@ -18,10 +18,12 @@ use super::op::{Op, OpError, OpId, told};
 use super::options::{RosbridgeError, RosbridgeOptions};
 use super::outbox::{Gone, Level, Outbox};
 use super::qos::Said;
+use super::rosapi::local_name;
 use super::services::Served;
 use super::topics::{Topic, Wish};
 use crate::access::Right;
 use crate::action::GoalStatus;
+use crate::aside::aside_if_long;
 use crate::content::Content;
 use crate::error::GatewayError;
 use crate::publisher::Publication;
@@ -33,11 +35,20 @@ const SETTLE_MAX: Duration = Duration::from_millis(500);
 /// Errors that a client may make at once, and a second: who makes more is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
+/// Things that a client which has become another may not have any more, each said for itself; further ones are counted.
+const ENDED_SHOWN_MAX: usize = 16;
 
 /// What a client publishes on a topic.
 struct Published {
     publication: Publication,
     ids: BTreeSet<Option<OpId>>,
+}
+
+/// A call or a goal under way.
+struct UnderWay {
+    /// What is called.
+    name: String,
+    end: End,
 }
 
 /// Errors that a client may still make.
@@ -74,11 +85,15 @@ pub(super) struct Connection {
     is_admitted: bool,
     topics: BTreeMap<String, Topic>,
     publications: BTreeMap<String, Published>,
+    /// Topics with messages that are still to leave.
+    unflushed: Vec<String>,
     services: BTreeMap<String, Served>,
     actions: BTreeMap<String, ServedAction>,
     goals: BTreeMap<OpId, Arc<Notify>>,
-    /// Calls and goals under way; ended with the connection.
-    tasks: JoinSet<Option<OpId>>,
+    /// Calls and goals under way, by their numbers; ended with the connection.
+    tasks: JoinSet<(u64, Option<OpId>)>,
+    under_way: BTreeMap<u64, UnderWay>,
+    next_number: u64,
     /// Bytes of arguments of these, until they are sent.
     waiting: Arc<AtomicUsize>,
     fragments: Fragments,
@@ -118,10 +133,13 @@ impl Connection {
             outbox,
             topics: BTreeMap::new(),
             publications: BTreeMap::new(),
+            unflushed: Vec::new(),
             services: BTreeMap::new(),
             actions: BTreeMap::new(),
             goals: BTreeMap::new(),
             tasks: JoinSet::new(),
+            under_way: BTreeMap::new(),
+            next_number: 0,
             waiting: Arc::default(),
             fragments,
             patience: Patience::new(),
@@ -139,14 +157,16 @@ impl Connection {
     /// Does what a client asks for; only what ends the connection is an error.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
         while let Some(ended) = self.tasks.try_join_next() {
-            if let Ok(Some(id)) = ended {
+            let Ok((number, goal)) = ended else { continue };
+            self.under_way.remove(&number);
+            if let Some(id) = goal {
                 self.goals.remove(&id);
             }
         }
-        let (done, id) = match Op::parse(text) {
+        let (done, id) = match aside_if_long(text.len(), || Op::parse(text)) {
             Ok(op) if op.name == "fragment" && self.is_admitted => match self.put_together(&op) {
                 Ok(None) => (Ok(()), None),
-                Ok(Some(whole)) => match Op::parse(&whole) {
+                Ok(Some(whole)) => match aside_if_long(whole.len(), || Op::parse(&whole)) {
                     // It is told with the id of the pieces if it has none.
                     Ok(inner) => (self.run(&inner).await, inner.id.or(op.id)),
                     Err(error) => (Err(error.into()), op.id),
@@ -176,10 +196,31 @@ impl Connection {
         }
     }
 
+    /// Lets leave what was published since the last time.
+    pub(super) async fn flush(&mut self) -> Result<(), RosbridgeError> {
+        while let Some(topic) = self.unflushed.pop() {
+            let Some(published) = self.publications.get(&topic) else { continue };
+            let flushed = published.publication.flush().await;
+            // The client is told of each that is lost.
+            if published.publication.has_ahead() {
+                self.unflushed.push(topic.clone());
+            }
+            if let Err(error) = flushed {
+                self.fail(&unpublished("publish", &topic, &error), None).await?;
+            }
+        }
+        Ok(())
+    }
+
     async fn run(&mut self, op: &Op<'_>) -> Done {
         if !self.is_admitted && op.name != "auth" {
             let how = r#"say who you are first: {"op":"auth","token":"…"}"#;
             return Err(op.refused(how).into());
+        }
+        if op.name != "publish"
+            && let Err(error) = self.flush().await
+        {
+            return Err(Failure::End(error));
         }
         match op.name.as_ref() {
             "auth" => self.auth(op).await,
@@ -219,11 +260,11 @@ impl Connection {
         match authenticate(&token) {
             Ok(client) => {
                 let who = format!("you are {}", client.name);
-                let limits = *self.session.limits();
-                self.session = Arc::new(Session::new(self.session.hub(), client, limits));
+                let is_as_before = client.scope == self.session.client().scope;
+                self.session = Arc::new(self.session.again(client));
                 self.is_admitted = true;
-                self.end_what_is_not_permitted();
-                Ok(self.outbox.status(Level::Info, &who, op.id.as_ref()).await?)
+                self.outbox.status(Level::Info, &who, op.id.as_ref()).await?;
+                Ok(self.end_what_is_not_permitted(is_as_before).await?)
             }
             Err(why) => {
                 // Whoever guesses makes a connection for each guess.
@@ -234,14 +275,48 @@ impl Connection {
         }
     }
 
-    /// Ends what a client has that it may not have, now that it is another.
-    fn end_what_is_not_permitted(&mut self) {
-        let session = &self.session;
-        let may = |right, name: &str| session.check(right, name).is_ok();
+    /// Ends what a client has that it may not have, now that it is another, and says so. Calls and goals say it for
+    /// themselves.
+    async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), Gone> {
+        let (session, mut ended) = (&self.session, Vec::new());
+        let mut may = |right, name: &str| {
+            let checked = session.check(right, name);
+            checked.map_err(|error| ended.push(error)).is_ok()
+        };
         self.topics.retain(|name, _| may(Right::Subscribe, name));
         self.publications.retain(|name, _| may(Right::Publish, name));
         self.services.retain(|name, _| may(Right::Serve, action_of(name)));
         self.actions.retain(|name, _| may(Right::Serve, name));
+        let why = |name: &str| match local_name(name) {
+            // It sees what the client saw.
+            Some(_) if is_as_before => None,
+            Some(_) => Some(GatewayError::OtherClient { client: session.client().name.to_string() }),
+            None => session.check(Right::Call, action_of(name)).err(),
+        };
+        let over: Vec<_> =
+            self.under_way.iter().filter_map(|(number, of)| Some((*number, why(&of.name)?))).collect();
+        for (number, why) in over {
+            if let Some(under_way) = self.under_way.remove(&number) {
+                // One that has ended by itself is not there to hear it.
+                let _ = under_way.end.send(why);
+            }
+        }
+        for error in ended.iter().take(ENDED_SHOWN_MAX) {
+            self.outbox.status(Level::Error, &told(&format!("auth: {error}")), None).await?;
+        }
+        if let Some(more) = ended.len().checked_sub(ENDED_SHOWN_MAX).filter(|more| *more > 0) {
+            let told = format!("auth: {more} more that the client had ended in the same way");
+            self.outbox.status(Level::Error, &told, None).await?;
+        }
+        Ok(())
+    }
+
+    /// A number for a call or a goal, and what tells it to end.
+    fn begin(&mut self, name: &str) -> (u64, oneshot::Receiver<GatewayError>) {
+        self.next_number += 1;
+        let (end, ended) = oneshot::channel();
+        self.under_way.insert(self.next_number, UnderWay { name: name.to_owned(), end });
+        (self.next_number, ended)
     }
 
     fn set_level(&mut self, op: &Op<'_>) -> Done {
@@ -335,13 +410,15 @@ impl Connection {
         let Some(published) = self.publications.get(&topic) else { return Ok(()) };
         let publication = &published.publication;
         let done = match input::message(publication.layout(), raw) {
-            Ok(value) => publication.publish_value(&value).await,
+            Ok(value) => publication.publish_value_ahead(&value).await,
             Err(error) => Err(error),
         };
-        done.map_err(|error| {
-            let (op, why) = (op.shown(), format!("{topic}: {error}"));
-            OpError::Refused { op, why }.into()
-        })
+        let failed = |error| unpublished(&op.shown(), &topic, &error);
+        let done = done.map_err(failed);
+        if !self.unflushed.contains(&topic) {
+            self.unflushed.push(topic);
+        }
+        Ok(done?)
     }
 
     async fn subscribe(&mut self, op: &Op<'_>) -> Done {
@@ -428,10 +505,11 @@ impl Connection {
         };
         let (session, options) = (Arc::clone(&self.session), Arc::clone(&self.options));
         let outbox = self.outbox.clone();
+        let (number, end) = self.begin(&call.service);
         self.tasks.spawn(async move {
-            answer(session, options, call, outbox).await;
+            answer(session, options, call, end, outbox).await;
             drop(held);
-            None
+            (number, None)
         });
         Ok(())
     }
@@ -558,9 +636,10 @@ impl Connection {
             self.goals.insert(id.clone(), Arc::clone(&cancel));
         }
         let (session, outbox) = (Arc::clone(&self.session), self.outbox.clone());
+        let (number, end) = self.begin(&wanted.action);
         self.tasks.spawn(async move {
-            pursue(session, wanted, (args, held), cancel, outbox).await;
-            id
+            pursue(session, wanted, (args, held), (cancel, end), outbox).await;
+            (number, id)
         });
         Ok(())
     }
@@ -636,6 +715,10 @@ impl Connection {
         served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
         Ok(())
     }
+}
+
+fn unpublished(op: &str, topic: &str, error: &GatewayError) -> OpError {
+    OpError::Refused { op: op.to_owned(), why: format!("{topic}: {error}") }
 }
 
 fn compression(op: &Op<'_>) -> Result<Compression, OpError> {

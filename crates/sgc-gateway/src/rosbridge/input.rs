@@ -11,6 +11,7 @@ use serde_json::value::RawValue;
 use serde_json::{Map, Value as Json};
 use sgc_cdr::{Layout, Value};
 
+use crate::aside::aside_if_long;
 use crate::content::Content;
 use crate::error::GatewayError;
 
@@ -20,7 +21,8 @@ const VALUES_MAX: usize = 1 << 20;
 
 /// A message of a topic. If its type begins with a header whose stamp is left out, that is now.
 pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError> {
-    let mut value = tolerate(raw, |raw| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value))?;
+    let read = |raw: &str| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value);
+    let mut value = aside_if_long(raw.len(), || tolerate(raw, read))?;
     if layout.begins_with_header() && !has_stamp(raw) {
         stamp(&mut value, now());
     }
@@ -44,7 +46,7 @@ where
     F: Future<Output = Result<T, GatewayError>>,
 {
     match read(Content::json(raw.to_owned())).await {
-        Err(error @ GatewayError::Value(_)) => match of_ros_1(raw) {
+        Err(error @ GatewayError::Value(_)) => match aside_if_long(raw.len(), || of_ros_1(raw)) {
             Some(other) => read(Content::json(other)).await,
             None => Err(error),
         },

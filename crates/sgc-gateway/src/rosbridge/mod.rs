@@ -22,7 +22,7 @@ mod typedefs;
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures_util::{SinkExt as _, StreamExt as _};
+use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
@@ -39,6 +39,8 @@ use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
 
 /// Between two pings at least.
 const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
+/// Messages that are taken before what was published leaves, and whatever else there is is looked after.
+const TOGETHER_MAX: usize = 64;
 /// How long a client may take to hear why its connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
@@ -56,7 +58,7 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let options = Arc::new(options);
-    let (outbox, mut outgoing) = Outbox::new();
+    let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max);
     let pulse = Pulse::default();
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
@@ -107,15 +109,25 @@ where
 {
     let begun = Instant::now();
     let mut looks = tokio::time::interval(ping_interval(options.silence_max));
+    let mut together = 0;
     loop {
-        let message = tokio::select! {
-            message = stream.next() => message,
-            _ = looks.tick() => {
-                look(connection, pulse, options)?;
-                continue;
-            }
-            () = tokio::time::sleep_until(begun + ROSBRIDGE_ADMISSION_MAX), if !connection.is_admitted() => {
-                return Err(RosbridgeError::NotAdmitted("no token was shown in time".to_owned()));
+        // What is there already is published together.
+        let ready = if together < TOGETHER_MAX { stream.next().now_or_never() } else { None };
+        together = if ready.is_some() { together + 1 } else { 0 };
+        let message = match ready {
+            Some(message) => message,
+            None => {
+                connection.flush().await?;
+                tokio::select! {
+                    message = stream.next() => message,
+                    _ = looks.tick() => {
+                        look(connection, pulse, options)?;
+                        continue;
+                    }
+                    () = tokio::time::sleep_until(begun + ROSBRIDGE_ADMISSION_MAX), if !connection.is_admitted() => {
+                        return Err(RosbridgeError::NotAdmitted("no token was shown in time".to_owned()));
+                    }
+                }
             }
         };
         let Some(message) = message else { return Ok(()) };

@@ -1,20 +1,24 @@
 //! [`Outbox`]: what waits to be written to a client, in two lanes, and [`write_all`], which writes it.
 //!
 //! Replies, requests and status go before messages of topics. Both lanes are short: who has something to say waits for a
-//! place, so that of a client that does not read nothing gathers here, and its subscriptions drop what is old.
+//! place, so that of a client that does not read nothing gathers here, and its subscriptions drop what is old. Long replies
+//! and requests wait for room as well, of which a client has so many bytes; replies, which nobody can hold back, are
+//! refused beyond as many more.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use futures_util::{Sink, SinkExt as _};
-use tokio::sync::mpsc;
+use tokio::sync::{Mutex as Turns, MutexGuard as Turn, mpsc};
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::{self, Message};
 
 use super::envelope::{Envelope, Frame};
 use super::op::OpId;
 use super::options::RosbridgeError;
+use crate::budget::{Budget, Room};
+use crate::error::GatewayError;
 
 /// Replies, requests and status that wait.
 const CONTROL_MAX: usize = 64;
@@ -59,15 +63,30 @@ impl Level {
 /// What waits to be written to a client.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
-    control: mpsc::Sender<Frame>,
+    control: mpsc::Sender<Said>,
     batches: mpsc::Sender<Vec<Frame>>,
     level: Arc<AtomicU8>,
+    room: Arc<Budget>,
+    turns: Arc<Turns<()>>,
+}
+
+/// A frame of the first lane, and its room until it is written.
+#[derive(Debug)]
+struct Said {
+    frame: Frame,
+    room: Option<Room>,
+}
+
+impl Said {
+    fn frames(self) -> (Vec<Frame>, Option<Room>) {
+        (vec![self.frame], self.room)
+    }
 }
 
 /// The other end of it.
 #[derive(Debug)]
 pub(super) struct Outgoing {
-    control: mpsc::Receiver<Frame>,
+    control: mpsc::Receiver<Said>,
     batches: mpsc::Receiver<Vec<Frame>>,
 }
 
@@ -76,11 +95,16 @@ pub(super) struct Outgoing {
 pub(super) struct Gone;
 
 impl Outbox {
-    pub(super) fn new() -> (Self, Outgoing) {
+    /// One whose long replies and requests have so many bytes.
+    pub(super) fn new(bytes_max: usize) -> (Self, Outgoing) {
         let (control, control_out) = mpsc::channel(CONTROL_MAX);
         let (batches, batches_out) = mpsc::channel(BATCHES_MAX);
         let level = Arc::new(AtomicU8::new(Level::Error as u8));
-        (Self { control, batches, level }, Outgoing { control: control_out, batches: batches_out })
+        let (room, turns) = (Arc::new(Budget::new(bytes_max)), Arc::default());
+        (
+            Self { control, batches, level, room, turns },
+            Outgoing { control: control_out, batches: batches_out },
+        )
     }
 
     pub(super) fn set_level(&self, level: Level) {
@@ -89,7 +113,23 @@ impl Outbox {
 
     /// Says something once there is room.
     pub(super) async fn say(&self, frame: Frame) -> Result<(), Gone> {
-        self.control.send(frame).await.map_err(|_| Gone)
+        let room = self.room.take(frame.bytes()).await;
+        self.control.send(Said { frame, room }).await.map_err(|_| Gone)
+    }
+
+    /// The same of what came by itself, and waits here until there is room.
+    ///
+    /// # Errors
+    /// If too much waits already. That the connection has ended is none: nobody is there to be told.
+    pub(super) async fn say_reply(&self, frame: Frame) -> Result<(), GatewayError> {
+        let room = self.room.take_for_reply(frame.bytes()).await?;
+        let _ = self.control.send(Said { frame, room }).await;
+        Ok(())
+    }
+
+    /// Waits for the turn to write out a request that is to be said: of a client that does not read, one waits.
+    pub(super) async fn turn(&self) -> Turn<'_, ()> {
+        self.turns.lock().await
     }
 
     fn status_frame(&self, level: Level, told: &str, id: Option<&OpId>) -> Option<Frame> {
@@ -109,7 +149,7 @@ impl Outbox {
     /// The same from where nothing may be waited for: left out if there is no room.
     pub(super) fn try_status(&self, level: Level, told: &str, id: Option<&OpId>) {
         if let Some(frame) = self.status_frame(level, told, id) {
-            let _ = self.control.try_send(frame);
+            let _ = self.control.try_send(Said { frame, room: None });
         }
     }
 
@@ -156,11 +196,11 @@ where
     pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     pings.reset();
     loop {
-        let (frames, is_ping) = tokio::select! {
+        let (said, is_ping) = tokio::select! {
             biased;
-            _ = pings.tick() => (Vec::new(), true),
-            Some(frame) = outgoing.control.recv() => (vec![frame], false),
-            Some(batch) = outgoing.batches.recv() => (batch, false),
+            _ = pings.tick() => ((Vec::new(), None), true),
+            Some(said) = outgoing.control.recv() => (said.frames(), false),
+            Some(batch) = outgoing.batches.recv() => ((batch, None), false),
             else => return RosbridgeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)),
         };
         let written = async {
@@ -169,7 +209,7 @@ where
                 pulse.asked();
             }
             let mut bytes = 0;
-            let mut frames = frames;
+            let (mut frames, mut room) = said;
             loop {
                 for frame in frames {
                     bytes += feed(sink, frame, silence_max).await?;
@@ -177,8 +217,10 @@ where
                 if bytes >= FLUSH_BYTES {
                     break;
                 }
-                let next = outgoing.control.try_recv().map(|frame| vec![frame]);
-                frames = match next.or_else(|_| outgoing.batches.try_recv()) {
+                let next = outgoing.control.try_recv().map(Said::frames);
+                let next = next.or_else(|_| outgoing.batches.try_recv().map(|batch| (batch, None)));
+                drop(room);
+                (frames, room) = match next {
                     Ok(next) => next,
                     Err(_) => break,
                 };
@@ -198,8 +240,8 @@ where
 {
     outgoing.batches.close();
     outgoing.control.close();
-    while let Ok(frame) = outgoing.control.try_recv() {
-        for message in frame.messages() {
+    while let Ok(said) = outgoing.control.try_recv() {
+        for message in said.frame.messages() {
             sink.feed(message).await?;
         }
     }

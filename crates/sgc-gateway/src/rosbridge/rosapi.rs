@@ -11,6 +11,7 @@ use super::input;
 use super::options::RosbridgeOptions;
 use super::params::ParamError;
 use super::{params, typedefs};
+use crate::aside::aside;
 use crate::graph::{Graph, NodeInfo, is_hidden};
 use crate::session::Session;
 use crate::types::InterfaceType;
@@ -111,7 +112,7 @@ impl RosApi<'_> {
 
     fn typedefs(&self, of: InterfaceType, type_name: &str, part: &str) -> Result<Json, String> {
         let full = of.full_name(type_name).map_err(|error| error.to_string())?;
-        let found = typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}"));
+        let found = aside(|| typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}")));
         found.map(|typedefs| json!({ "typedefs": typedefs })).map_err(|error| error.to_string())
     }
 
@@ -143,7 +144,8 @@ impl RosApi<'_> {
             "topics_and_raw_types" => {
                 let (names, types): (Vec<_>, Vec<_>) = topics().unzip();
                 let types_known = self.session.hub().types();
-                let texts: Vec<_> = types.iter().map(|of| typedefs::full_text(types_known, of)).collect();
+                let read = || types.iter().map(|of| typedefs::full_text(types_known, of)).collect::<Vec<_>>();
+                let texts = aside(read);
                 json!({ "topics": names, "types": types, "typedefs_full_text": texts })
             }
             "topics_for_type" => {

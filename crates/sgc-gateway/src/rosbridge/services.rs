@@ -77,6 +77,7 @@ impl Served {
 /// Passes requests on as fast as the client takes them.
 async fn ask(mut serving: Serving, pending: Arc<Mutex<Pending>>, prefix: Arc<str>, outbox: Outbox) {
     while let Some(request) = serving.next().await {
+        let _turn = outbox.turn().await;
         let args = match serving.write(&request, Form::Json) {
             Ok(args) => args,
             Err(error) => {

@@ -15,7 +15,7 @@ use sgc_gateway::grpc::GrpcOptions;
 use sgc_gateway::grpc::proto::publish_request::Publisher;
 use sgc_gateway::grpc::proto::subscribe_response::{Kind as Heard, Message};
 use sgc_gateway::grpc::proto::*;
-use sgc_gateway::{Anonymous, ListenAt, Protocol, Scope, Server, ServerOptions, SessionLimits};
+use sgc_gateway::{Anonymous, Content, ListenAt, Protocol, Scope, Server, ServerOptions, SessionLimits};
 use sgc_ros::{GraphNode, RosNetwork as _, RosWriter, SampleKind};
 use sgc_wire::{History, Qos as RosQos, RosNode, UnixMillis};
 use tokio::sync::mpsc;
@@ -621,6 +621,48 @@ async fn long_messages_that_a_client_does_not_read_are_not_written_for_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn long_requests_that_are_under_way_are_bounded_in_bytes_for_each_client() {
+    let options = GrpcOptions { incoming_bytes_max: 2 << 20, ..GrpcOptions::default() };
+    let gateway = Gateway::with(options).await;
+    let (service, of) = ("/slow", "rcl_interfaces/srv/SetParameters");
+    let mut serving = gateway.site.session("program").serve(service, Some(of)).await.unwrap();
+    let call = |bytes: usize| CallRequest {
+        service: service.into(),
+        r#type: of.into(),
+        payload: string(&"x".repeat(bytes)),
+        ..CallRequest::default()
+    };
+    let mut client = gateway.client().await;
+    let mut first = client.clone();
+    let first = tokio::spawn(async move { first.call(call(1500 << 10)).await });
+    let asked = within(serving.next()).await.unwrap();
+    // It is worked on, so there is no room for another of that length, in no stream.
+    let told = "2097152 bytes of requests that come or are worked on at most for a client";
+    let refused = within(client.call(call(1500 << 10))).await.unwrap_err();
+    assert_eq!((refused.code(), refused.message()), (Code::ResourceExhausted, told));
+    // There is for short ones, and for other clients.
+    let (mut short, mut other) = (client.clone(), gateway.client().await);
+    let all = [
+        tokio::spawn(async move { short.call(call(60 << 10)).await }),
+        tokio::spawn(async move { other.call(call(1500 << 10)).await }),
+    ];
+    let mut reply = vec![0, 1, 0, 0];
+    reply.extend([0; 4]);
+    for asked in [asked, within(serving.next()).await.unwrap(), within(serving.next()).await.unwrap()] {
+        serving.replier().reply(asked.id, &Content::cdr(reply.clone())).await.unwrap();
+    }
+    within(first).await.unwrap().unwrap();
+    for answered in all {
+        within(answered).await.unwrap().unwrap();
+    }
+    // What has its reply makes room.
+    let again = tokio::spawn(async move { client.call(call(1500 << 10)).await });
+    let asked = within(serving.next()).await.unwrap();
+    serving.replier().reply(asked.id, &Content::cdr(reply)).await.unwrap();
+    within(again).await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_gateway_that_stops_says_so_and_lets_its_connections_end() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/chatter", RosQos::default());
@@ -630,6 +672,32 @@ async fn a_gateway_that_stops_says_so_and_lets_its_connections_end() {
     gateway.grpc.stop();
     assert_eq!(end(&mut heard).await, Some(Code::Unavailable));
     within(gateway.serving).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn calls_that_are_not_admitted_are_counted_whatever_the_rules_are_later() {
+    let gateway = Gateway::new().await;
+    let at = ListenAt { protocol: Protocol::Grpc, is_encrypted: false, addr: ([127, 0, 0, 1], 0).into() };
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: vec![at],
+        access: gateway.access_of(Anonymous::None, Vec::new()),
+        key: None,
+        clients_max: 8,
+        limits: SessionLimits::default(),
+    };
+    let server = Server::start(gateway.site.hub.clone(), options).await.unwrap();
+    let addr = server.local()[0].addr;
+    let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{addr}")).unwrap();
+    let channel = endpoint.connect().await.unwrap();
+    for token in [None, Some("sgc-access-1:AAAA")] {
+        let mut client = client(channel.clone(), token);
+        let refused = client.get_graph(GetGraphRequest::default());
+        assert_eq!(within(refused).await.unwrap_err().code(), Code::Unauthenticated);
+    }
+    server.reconfigure(gateway.access_of(Anonymous::Local, Vec::new()), None).unwrap();
+    within(client(channel, None).get_graph(GetGraphRequest::default())).await.unwrap();
+    assert_eq!(server.status().refused, [("not admitted".to_owned(), 2)].into());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use serde_json::json;
+use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{ROSBRIDGE_ADMISSION_MAX, RosbridgeError, RosbridgeOptions};
-use sgc_gateway::{Client as Who, Scope};
+use sgc_gateway::{ActionEvent, Client as Who, Content, Scope, SessionLimits};
 use sgc_ros::{RosWriter as _, SampleKind};
 use sgc_wire::Qos;
 
-use crate::client::{client_with, connect, pipe};
+use crate::client::{PATIENCE, bounded, client_with, connect, pipe};
 use crate::support::{STRING, Site, string};
 
 fn options() -> RosbridgeOptions {
@@ -58,6 +58,10 @@ async fn who_becomes_another_keeps_what_that_one_may_have() {
     browser.send(json!({"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty"})).await;
     browser.settle().await;
     browser.send(json!({"op": "auth", "token": "right"})).await;
+    for ended in ["subscribe to /secret", "publish /odom", "serve /s"] {
+        let told = format!("auth: partner may not {ended}: its scope does not have it");
+        assert_eq!(browser.status().await.0, told);
+    }
     for (op, told) in [
         (json!({"op": "unsubscribe", "topic": "/secret"}), "/secret is not subscribed to"),
         (json!({"op": "unadvertise", "topic": "/odom"}), "/odom is not advertised"),
@@ -71,6 +75,71 @@ async fn who_becomes_another_keeps_what_that_one_may_have() {
     talker.write(SampleKind::Write, 1, string("here")).unwrap();
     browser.send(json!({"op": "unsubscribe", "topic": "/odom"})).await;
     browser.settle_amid().await;
+}
+
+/// Whatever token is shown, it permits to call `/allowed`.
+fn becomes_partner() -> RosbridgeOptions {
+    RosbridgeOptions {
+        authenticate: Some(Arc::new(|_: &str| {
+            let scope = Scope { call: vec!["/allowed".into()], ..Scope::default() };
+            Ok(Who::own("partner").with_scope(scope))
+        })),
+        ..RosbridgeOptions::default()
+    }
+}
+
+fn call(id: &str, service: &str) -> Json {
+    json!({"op": "call_service", "id": id, "service": service})
+}
+
+async fn within<T>(work: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, work).await.expect("it should have come by now")
+}
+
+#[tokio::test]
+async fn who_becomes_another_loses_calls_under_way_and_what_stays_counts() {
+    let site = Site::new().await;
+    let program = site.session("program");
+    let mut silent = program.serve("/silent", Some("std_srvs/srv/SetBool")).await.unwrap();
+    let mut allowed = program.serve("/allowed", Some("std_srvs/srv/SetBool")).await.unwrap();
+    let limits = SessionLimits { calls_max: 2, ..SessionLimits::default() };
+    let mut browser = connect(bounded(&site, limits), becomes_partner()).await;
+    browser.send(call("1", "/silent")).await;
+    browser.send(call("2", "/allowed")).await;
+    within(silent.next()).await.unwrap();
+    let asked = within(allowed.next()).await.unwrap();
+    browser.send(json!({"op": "auth", "token": "x"})).await;
+    let told = "partner may not call /silent: its scope does not have it";
+    let ended =
+        json!({"op": "service_response", "id": "1", "service": "/silent", "values": told, "result": false});
+    assert_eq!(browser.next().await, ended);
+    // Of two there is room for one.
+    browser.send(call("3", "/allowed")).await;
+    within(allowed.next()).await.unwrap();
+    browser.send(call("4", "/allowed")).await;
+    let refused = browser.next().await;
+    assert_eq!(refused["values"], "call_service: 2 calls and goals under way at most for a client");
+    browser.status().await;
+    allowed.replier().reply(asked.id, &Content::json(r#"{"success": true}"#)).await.unwrap();
+    let answer = browser.next().await;
+    assert_eq!((&answer["id"], &answer["result"]), (&json!("2"), &json!(true)));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_becomes_another_loses_goals_under_way_which_are_canceled() {
+    let site = Site::new().await;
+    let of = "example_interfaces/action/Fibonacci";
+    let mut action = site.session("program").serve_action("/fib", Some(of)).await.unwrap();
+    let mut browser = connect(site.session("browser"), becomes_partner()).await;
+    let goal = json!({"op": "send_action_goal", "id": "g", "action": "/fib", "action_type": of, "args": {"order": 3}});
+    browser.send(goal).await;
+    let Some(ActionEvent::Goal { id, .. }) = within(action.next()).await else { panic!("a goal was sent") };
+    action.replier().answer(&id, true).await.unwrap();
+    browser.send(json!({"op": "auth", "token": "x"})).await;
+    let told = "partner may not call /fib: its scope does not have it";
+    let ended = json!({"op": "action_result", "id": "g", "action": "/fib", "values": told, "status": 0, "result": false});
+    assert_eq!(browser.next().await, ended);
+    assert_eq!(within(action.next()).await, Some(ActionEvent::Cancel { id }));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -1,8 +1,14 @@
 //! What the gateway answers in place of a `rosapi` node.
 
+use std::sync::{Arc, Mutex, mpsc};
+use std::time::Duration;
+
 use serde_json::{Value as Json, json};
+use sgc_cdr::{Layout, TypeName};
+use sgc_gateway::{FindDefinitions, Hub, HubOptions, Types};
 use sgc_ros::{GraphNode, RosNetwork as _, RosWriter as _};
 use sgc_wire::{Qos, RosNode};
+use tokio::sync::Notify;
 
 use crate::client::{Client, client};
 use crate::support::{Site, eventually};
@@ -110,4 +116,45 @@ async fn what_the_gateway_does_not_know_is_a_service_like_any_other() {
     let mut browser = client(&site).await;
     let (told, is_done) = browser.call("/rosapi/search_param", json!({})).await;
     assert!(!is_done && told.as_str().unwrap().contains("/rosapi/search_param is not known"), "{told}");
+}
+
+/// Finds a type once it is told to, and says that it waits for that.
+struct Slow(Mutex<mpsc::Receiver<()>>, Arc<Notify>);
+
+impl FindDefinitions for Slow {
+    fn text(&self, file: &TypeName) -> Option<String> {
+        let is_it = file.to_string() == "mine/msg/A";
+        if !is_it {
+            return None;
+        }
+        self.1.notify_one();
+        let told = self.0.lock().unwrap().recv_timeout(Duration::from_secs(10));
+        told.ok().map(|()| "int32 a".to_owned())
+    }
+
+    fn described(&self, _: &TypeName, _: Option<&str>) -> Option<Arc<Layout>> {
+        None
+    }
+}
+
+/// On the one thread that there is, whoever reads a file would be waited for by the one who has it read.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn files_that_are_read_hold_up_nobody() {
+    let site = Site::new().await;
+    let ((told, waits), begun) = (mpsc::channel(), Arc::new(Notify::new()));
+    let types = Types::new(Slow(Mutex::new(waits), Arc::clone(&begun)));
+    let hub = Hub::start(Arc::new(site.domain.join(false)), types, HubOptions::default()).await.unwrap();
+    let (other, mut browser) = (client(&site).await, client(&Site { hub, ..Site::new().await }).await);
+    browser.send(json!({"op": "call_service", "id": 1, "service": "/rosapi/message_details", "args": {"type": "mine/A"}})).await;
+    let beside = tokio::spawn(async move {
+        let mut other = other;
+        begun.notified().await;
+        other.settle().await;
+        told.send(()).unwrap();
+        // The file is looked at once for the type, and once for each that it contains.
+        told.send(()).unwrap();
+    });
+    let answer = browser.next().await;
+    assert_eq!(answer["values"]["typedefs"][0]["fieldnames"], json!(["a"]), "{answer}");
+    beside.await.unwrap();
 }

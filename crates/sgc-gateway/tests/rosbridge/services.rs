@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use serde_json::{Value as Json, json};
-use sgc_gateway::{Content, Form};
+use sgc_gateway::rosbridge::RosbridgeOptions;
+use sgc_gateway::{Content, Form, SessionLimits};
 
-use crate::client::{Client, client};
+use crate::client::{Client, PATIENCE, bounded, client, pipe};
 use crate::support::{Site, eventually};
 
 const SET_BOOL: &str = "std_srvs/srv/SetBool";
@@ -199,4 +200,46 @@ async fn a_call_that_is_not_answered_holds_nobody_up() {
     browser.send(json!({"op": "call_service", "id": "never", "service": "/silent"})).await;
     let answered = tokio::time::timeout(Duration::from_secs(10), browser.call("/switch", json!({})));
     assert!(answered.await.unwrap().1);
+}
+
+#[tokio::test]
+async fn long_answers_that_are_not_read_are_bounded_in_bytes_and_the_rest_are_refused() {
+    const LONG: usize = 300 << 10;
+    let site = Site::new().await;
+    let mut serving = site.session("program").serve("/long", Some(SET_BOOL)).await.unwrap();
+    let (all_answered, answered) = tokio::sync::oneshot::channel();
+    tokio::spawn(async move {
+        let mut requests = Vec::new();
+        while requests.len() < 20 {
+            requests.push(serving.next().await.unwrap().id);
+        }
+        let reply = Content::json(json!({"message": "x".repeat(LONG)}).to_string());
+        for id in requests {
+            serving.replier().reply(id, &reply).await.unwrap();
+        }
+        all_answered.send(()).unwrap();
+        std::future::pending::<()>().await;
+    });
+    let limits = SessionLimits { waiting_bytes_max: 1 << 20, ..SessionLimits::default() };
+    let mut browser = pipe(bounded(&site, limits), RosbridgeOptions::default(), 64 << 10).await;
+    for id in 0..20 {
+        browser.send(json!({"op": "call_service", "id": id, "service": "/long"})).await;
+    }
+    tokio::time::timeout(PATIENCE, answered).await.unwrap().unwrap();
+    // It reads nothing until nobody has anything left to do but wait for it: only then time goes on.
+    tokio::time::pause();
+    tokio::time::sleep(Duration::from_millis(1)).await;
+    let (mut whole, mut refused) = (0, 0);
+    for _ in 0..20 {
+        let answer = browser.next().await;
+        match answer["result"].as_bool().unwrap() {
+            true => whole += 1,
+            false => {
+                let told = "1048576 bytes of replies that it does not read at most for a client";
+                assert_eq!(answer["values"], told);
+                refused += 1;
+            }
+        }
+    }
+    assert!(whole >= 6 && refused > 0, "{whole} came, {refused} were refused");
 }

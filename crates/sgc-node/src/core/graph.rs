@@ -227,6 +227,7 @@ impl<N: RosNetwork> Core<N> {
                 ));
             }
         }
+        problems.extend(self.types.problems(|owner| self.called(owner)));
         problems
     }
 

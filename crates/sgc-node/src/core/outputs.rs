@@ -187,6 +187,7 @@ impl<N: RosNetwork> Core<N> {
             Event::Catalogue { owner, catalogue } => {
                 debug!(owner = %owner.short(), entries = catalogue.entries.len(), "catalogue");
                 routes.handle_catalogue(now.instant, owner, catalogue);
+                self.types_listed(owner);
             }
             Event::OwnerLost { owner, reason } => {
                 info!(owner = %owner.short(), ?reason, "owner out of reach");

@@ -58,9 +58,9 @@ impl<N: RosNetwork> Core<N> {
         };
         let id = self.endpoint.new_source_id();
         let (max, over) = (self.epoch_messages_max, self.epoch_over.clone());
-        let share = LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over);
+        let share = Arc::new(LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over));
         share.set_shaping(shaping);
-        self.shares.insert(name, Arc::new(share));
+        self.shares.insert(name, share);
         self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, Wish::Publish(offer));
@@ -156,7 +156,9 @@ impl<N: RosNetwork> Core<N> {
         let sink = self
             .sinks
             .entry(name)
-            .or_insert_with(|| Arc::new(LocalSink::new(name, false, self.requests.clone())))
+            .or_insert_with(|| {
+                Arc::new(LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone()))
+            })
             .clone();
         self.apply_type(&name);
         // What this node publishes itself does not come back to it: it is nobody's sink but its own.

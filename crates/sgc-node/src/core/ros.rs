@@ -100,7 +100,8 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
             Command::Join { name, owner, transient_local, describe } => {
-                let sink = LocalSink::new(name, transient_local, self.requests.clone());
+                let sink =
+                    LocalSink::new(name, transient_local, self.requests.clone(), self.data.holds().clone());
                 self.sinks.insert(name, Arc::new(sink));
                 self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
             }

@@ -48,7 +48,7 @@ impl<N: RosNetwork> Core<N> {
             Ok(queue) => queue,
             Err(why) => return error!(%why, "a service has no thread and cannot be used"),
         };
-        let sink = LocalSink::new(name, false, self.requests.clone());
+        let sink = LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone());
         sink.set_writer(None, Some(queue));
         self.sinks.insert(name, Arc::new(sink));
         self.calls.insert(name, calls);

@@ -5,29 +5,38 @@
 //! store, which others in this process look into, and to the ends of the interface that convert by it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::time::Instant;
 
 use sgc_cdr::{DescriptionError, TypeError, TypeName};
 use sgc_endpoint::{CompressionError, PackedType, unpack_type};
 use sgc_ros::RosNetwork;
-use sgc_types::{Definitions, Described, NotBelieved, StoreFull, TypeStore};
-use sgc_wire::{DescribedType, Metadata, Name, NodeId};
+use sgc_types::{
+    Definitions, Described, NotBelieved, StoreFull, TYPES_BYTES_MAX, TYPES_MAX, TYPES_PER_OWNER_BYTES_MAX,
+    TYPES_PER_OWNER_MAX, TypeStore,
+};
+use sgc_wire::{CatalogueEntry, DescribedType, Metadata, Name, NodeId};
 use tracing::{debug, warn};
 
 use super::{Core, CoreEvent, now};
 use crate::conversion::KnownType;
+use crate::type_questions::TypeQuestions;
 
-/// Bytes of descriptions that wait to be judged: what several owners may tell at once.
-const TOLD_BYTES_MAX: usize = 4 << 20;
+/// Types for which room is looked for once more when that of another returns.
+const RETRIES_MAX: usize = 16;
 
 /// The types of the interfaces that this node shares and uses.
 pub(super) struct Types {
     store: Arc<TypeStore>,
     definitions: Arc<Definitions>,
     needs: BTreeMap<Name, Need>,
-    /// At most one for each need, and for each answer that an owner owes.
+    /// At most one for each need.
     jobs: VecDeque<Job>,
     is_busy: bool,
+    questions: TypeQuestions,
+    /// Needs for which there was no room, those first that are looked at next.
+    no_room: VecDeque<Name>,
 }
 
 /// The type of an interface.
@@ -45,10 +54,28 @@ enum NeedState {
     Looking,
     /// Its owner is asked.
     Asked,
+    /// Its owner told it; it is judged.
+    Told,
     /// It is known.
     Known(Arc<Described>),
-    /// It is not, and nobody is asked for it.
+    /// There is no room for it, or none for another of its owner's.
+    NoRoom {
+        /// Whether the owner has as many as it may have.
+        of_owner: bool,
+    },
+    /// What its owner told is not what it was asked for.
+    Refused,
+    /// It is not known, and nobody is asked for it.
     Unknown,
+}
+
+impl Need {
+    fn known(&self) -> Option<&Arc<Described>> {
+        match &self.state {
+            NeedState::Known(described) => Some(described),
+            _ => None,
+        }
+    }
 }
 
 /// What takes its time.
@@ -56,6 +83,7 @@ struct Job {
     name: Name,
     type_name: TypeName,
     type_hash: Option<String>,
+    owner: Option<NodeId>,
     /// What an owner told; without it, files are looked into.
     told: Option<DescribedType>,
 }
@@ -71,10 +99,18 @@ type KnownOrNew = Result<Arc<Described>, Described>;
 
 /// What became of looking for a type.
 pub(crate) struct TypeOutcome {
-    name: Name,
-    type_hash: Option<String>,
-    was_told: bool,
+    of: LookedFor,
     found: Result<Found, TypeMiss>,
+}
+
+/// What was looked for.
+struct LookedFor {
+    name: Name,
+    type_name: TypeName,
+    type_hash: Option<String>,
+    owner: Option<NodeId>,
+    /// Bytes that an owner told of it, if it told.
+    told_bytes: Option<usize>,
 }
 
 /// Why a type is not known.
@@ -103,6 +139,19 @@ pub(crate) enum TypeMiss {
     /// There is no room for it.
     #[error(transparent)]
     Full(#[from] StoreFull),
+    /// One owner has as many as it may have.
+    #[error(
+        "{types} types with {bytes} bytes of descriptions are known of its owner already: it may have no more"
+    )]
+    OwnerFull {
+        /// Types of its.
+        types: usize,
+        /// Bytes of their descriptions.
+        bytes: usize,
+    },
+    /// Looking for it failed, by a fault in this program.
+    #[error("looking for it failed, which is a fault in this program")]
+    Failed,
 }
 
 impl TypeMiss {
@@ -113,15 +162,34 @@ impl TypeMiss {
             Self::Description(_) => Some("type_not_described"),
             Self::Differs { .. } => Some("type_differs"),
             Self::Packed(_) | Self::NotBelieved(_) => Some("type_refused"),
-            Self::Full(_) => Some("types_full"),
+            Self::Full(_) | Self::OwnerFull { .. } => Some("types_full"),
+            Self::Failed => Some("type_failed"),
+        }
+    }
+
+    /// What becomes of the need.
+    fn state(&self, asks: bool) -> NeedState {
+        match self {
+            Self::Full(_) => NeedState::NoRoom { of_owner: false },
+            Self::OwnerFull { .. } => NeedState::NoRoom { of_owner: true },
+            _ if asks => NeedState::Asked,
+            Self::Packed(_) | Self::NotBelieved(_) => NeedState::Refused,
+            _ => NeedState::Unknown,
         }
     }
 }
 
 impl Types {
     pub(super) fn new(store: Arc<TypeStore>, definitions: Definitions) -> Self {
-        let (needs, jobs) = (BTreeMap::new(), VecDeque::new());
-        Self { store, definitions: Arc::new(definitions), needs, jobs, is_busy: false }
+        Self {
+            store,
+            definitions: Arc::new(definitions),
+            needs: BTreeMap::new(),
+            jobs: VecDeque::new(),
+            is_busy: false,
+            questions: TypeQuestions::default(),
+            no_room: VecDeque::new(),
+        }
     }
 
     /// The type of an interface, if it is known; without one, that of this name and hash.
@@ -131,51 +199,211 @@ impl Types {
         type_name: &str,
         type_hash: Option<&str>,
     ) -> Option<Arc<Described>> {
-        if let Some(Need { state: NeedState::Known(described), .. }) = name.and_then(|n| self.needs.get(n)) {
+        if let Some(described) = name.and_then(|name| self.needs.get(name)?.known()) {
             return Some(described.clone());
         }
         self.store.described(&type_name.parse().ok()?, type_hash)
+    }
+
+    /// When an owner is to be asked for others of its types.
+    pub(super) fn deadline(&self) -> Option<Instant> {
+        self.questions.deadline()
+    }
+
+    /// What the user should know; `called` is what an owner is called.
+    pub(super) fn problems(&self, called: impl Fn(&NodeId) -> String) -> Vec<String> {
+        let count = |of: fn(&NeedState) -> bool| {
+            let mut all = self.needs.values().filter(|need| of(&need.state)).peekable();
+            let first = all.peek().map(|need| {
+                let whose = need.owner.map(|owner| format!(" of {}", called(&owner))).unwrap_or_default();
+                format!("{}{whose}", need.type_name)
+            });
+            first.map(|first| (all.count(), first))
+        };
+        let full = count(|state| matches!(state, NeedState::NoRoom { of_owner: false })).map(|(n, first)| {
+            format!(
+                "{n} interfaces have types for which there is no room, {first} for one: this node keeps {TYPES_MAX} \
+                 types, and {TYPES_BYTES_MAX} bytes that describe them. It looks again when others are not used any more"
+            )
+        });
+        let of_owner = count(|state| matches!(state, NeedState::NoRoom { of_owner: true })).map(|(n, first)| {
+            format!(
+                "{n} interfaces have types for which there is no room, {first} for one: of one node this one keeps \
+                 {TYPES_PER_OWNER_MAX} types, and {TYPES_PER_OWNER_BYTES_MAX} bytes that describe them. It asks again when \
+                 others are not used any more"
+            )
+        });
+        let refused = count(|state| matches!(state, NeedState::Refused)).map(|(n, first)| {
+            format!(
+                "what {n} interfaces look like was told and is refused, {first} for one: the description is not what its \
+                 hash says. Have the node that told it run with the definitions that its publishers are built from"
+            )
+        });
+        full.into_iter().chain(of_owner).chain(refused).collect()
     }
 }
 
 /// Keeping what is known.
 impl Types {
-    /// Takes a type into the store; what no interface has any more makes room.
-    fn keep(&self, described: KnownOrNew) -> Result<Arc<Described>, StoreFull> {
+    /// Takes a type into the store, for an interface of another if that has an `owner`; what no interface has any more makes
+    /// room.
+    fn keep(&self, described: KnownOrNew, owner: Option<&NodeId>) -> Result<Arc<Described>, TypeMiss> {
         let new = match described {
             Ok(known) => return Ok(known),
             Err(new) => new,
         };
+        if let Some(known) = self.store.described(new.name(), Some(new.type_hash())) {
+            return Ok(known);
+        }
+        if let Some(owner) = owner {
+            let of_owner = self.needs.values().filter(|need| need.owner.as_ref() == Some(owner));
+            let known = of_owner.filter_map(Need::known);
+            let known: BTreeMap<_, _> =
+                known.map(|known| ((known.name(), known.type_hash()), known.description().len())).collect();
+            let (types, bytes) = (known.len(), known.values().sum::<usize>());
+            if types >= TYPES_PER_OWNER_MAX || bytes + new.description().len() > TYPES_PER_OWNER_BYTES_MAX {
+                return Err(TypeMiss::OwnerFull { types, bytes });
+            }
+        }
         if !self.store.has_room_for(&new) {
-            let known = self.needs.values().filter_map(|need| match &need.state {
-                NeedState::Known(described) => Some((described.name(), described.type_hash())),
-                _ => None,
-            });
-            let known: BTreeSet<_> = known.collect();
+            let known = self.needs.values().filter_map(Need::known);
+            let known: BTreeSet<_> = known.map(|known| (known.name(), known.type_hash())).collect();
             self.store.retain(|type_name, type_hash| known.contains(&(type_name, type_hash)));
         }
-        self.store.insert(new)
+        Ok(self.store.insert(new)?)
+    }
+
+    /// An interface does not have this type any more: those are looked for once more that may have the room of it.
+    fn room_returns(&mut self, gone: &Described, owner: Option<NodeId>) {
+        let is_it =
+            |known: &Arc<Described>| (known.name(), known.type_hash()) == (gone.name(), gone.type_hash());
+        if self.no_room.is_empty() || self.needs.values().filter_map(Need::known).any(is_it) {
+            return;
+        }
+        let mut retried = 0;
+        for _ in 0..self.no_room.len() {
+            let Some(name) = self.no_room.pop_front() else { break };
+            let state = self.needs.get(&name).map(|need| (&need.state, need.owner));
+            let may = match state {
+                Some((NeedState::NoRoom { of_owner: true }, whose)) => whose == owner,
+                Some((NeedState::NoRoom { of_owner: false }, _)) => true,
+                // It found its room, or is no more.
+                _ => continue,
+            };
+            if may && retried < RETRIES_MAX {
+                retried += 1;
+                self.look_for(name);
+            } else {
+                self.no_room.push_back(name);
+            }
+        }
+    }
+
+    /// Looks for the type of a need, from the beginning.
+    fn look_for(&mut self, name: Name) {
+        let Some(need) = self.needs.get_mut(&name) else { return };
+        need.state = NeedState::Looking;
+        let Need { type_name, type_hash, owner, .. } = need;
+        let (type_name, type_hash, owner) = (type_name.clone(), type_hash.clone(), *owner);
+        if let Some(owner) = owner {
+            self.questions.begins(owner);
+        }
+        self.jobs.push_back(Job { name, type_name, type_hash, owner, told: None });
+    }
+
+    /// The interfaces of an owner of which it lists another type than the one that is known, or looked for.
+    fn listed_otherwise<'a>(
+        &self,
+        owner: &NodeId,
+        listed: impl Fn(&Name) -> Option<&'a CatalogueEntry>,
+    ) -> Vec<Name> {
+        let differs = |(name, need): &(&Name, &Need)| {
+            need.owner.as_ref() == Some(owner)
+                && listed(name).is_some_and(|entry| {
+                    need.type_hash != entry.type_hash
+                        || need.type_name.to_string() != entry.metadata.type_name
+                })
+        };
+        self.needs.iter().filter(differs).map(|(name, _)| *name).collect()
+    }
+
+    /// Forgets a need; says whose it was.
+    fn forget(&mut self, name: &Name) -> Option<NodeId> {
+        let need = self.needs.remove(name)?;
+        if let Some(owner) = &need.owner {
+            self.questions.settled(owner, name);
+        }
+        self.jobs.retain(|job| {
+            if job.name != *name {
+                return true;
+            }
+            if let Some(owner) = &job.owner {
+                self.questions.ends(owner, job.told_bytes().unwrap_or_default());
+            }
+            false
+        });
+        if let NeedState::NoRoom { .. } = need.state {
+            self.no_room.retain(|other| other != name);
+        }
+        if let Some(gone) = need.known() {
+            self.room_returns(gone, need.owner);
+        }
+        need.owner
+    }
+
+    /// Whether types of this node's own interfaces are still to be looked for.
+    fn has_own_jobs(&self) -> bool {
+        self.jobs.iter().any(|job| job.owner.is_none())
+    }
+
+    /// What was looked for is over; says whether its need still waits for it.
+    fn ends(&mut self, of: &LookedFor) -> bool {
+        if let Some(owner) = &of.owner {
+            self.questions.ends(owner, of.told_bytes.unwrap_or_default());
+        }
+        let Some(need) = self.needs.get(&of.name) else { return false };
+        let is_it =
+            (&need.type_name, &need.type_hash, need.owner) == (&of.type_name, &of.type_hash, of.owner);
+        let awaited = match need.state {
+            NeedState::Looking => of.told_bytes.is_none(),
+            NeedState::Told => of.told_bytes.is_some(),
+            _ => false,
+        };
+        is_it && awaited
     }
 }
 
 impl Job {
+    fn told_bytes(&self) -> Option<usize> {
+        Some(self.told.as_ref()?.description.len())
+    }
+
     /// Looks into the store, into files, or at what was told.
     fn run(self, store: &TypeStore, definitions: &Definitions) -> TypeOutcome {
-        let Self { name, type_name, type_hash, told } = self;
-        let was_told = told.is_some();
-        let found = match told {
+        let told_bytes = self.told_bytes();
+        let Self { name, type_name, type_hash, owner, told } = self;
+        let of = LookedFor { name, type_name, type_hash, owner, told_bytes };
+        let (type_name, type_hash) = (of.type_name.clone(), of.type_hash.clone());
+        of.found_by(move || match told {
             Some(told) => read(&type_name, type_hash.as_deref(), &told),
             None => find(&type_name, type_hash.as_deref(), store, definitions),
-        };
-        let found = found.map(|described| {
+        })
+    }
+}
+
+impl LookedFor {
+    /// What comes of looking; whatever happens there, something does, since others wait for their turn.
+    fn found_by(self, look: impl FnOnce() -> Result<KnownOrNew, TypeMiss>) -> TypeOutcome {
+        let look = || {
+            let described = look()?;
             let of: &Described = match &described {
                 Ok(known) => known,
                 Err(new) => new,
             };
-            let packed = PackedType::new(of.type_hash(), of.description());
-            Found { packed, described }
-        });
-        TypeOutcome { name, type_hash, was_told, found }
+            Ok(Found { packed: PackedType::new(of.type_hash(), of.description()), described })
+        };
+        let found = catch_unwind(AssertUnwindSafe(look)).unwrap_or(Err(TypeMiss::Failed));
+        TypeOutcome { of: self, found }
     }
 }
 
@@ -214,22 +442,23 @@ impl<N: RosNetwork> Core<N> {
         type_hash: Option<String>,
         owner: Option<NodeId>,
     ) {
-        let is_same = |need: &Need| need.type_hash == type_hash && need.owner == owner;
+        let type_name = metadata.type_name.parse::<TypeName>();
+        let is_same = |need: &Need| {
+            need.type_hash == type_hash
+                && need.owner == owner
+                && type_name.as_ref().is_ok_and(|type_name| need.type_name == *type_name)
+        };
         if self.types.needs.get(&name).is_some_and(is_same) {
             return self.apply_type(&name);
         }
-        let Ok(type_name) = metadata.type_name.parse::<TypeName>() else {
+        self.forget_type(&name);
+        let Ok(type_name) = type_name else {
             // Plain DDS programs may call theirs what they like.
-            return self.set_type(&name, &KnownType::Lacking, &KnownType::Lacking);
+            return self.set_type(&name, &KnownType::Lacking);
         };
-        let need = Need {
-            type_name: type_name.clone(),
-            type_hash: type_hash.clone(),
-            owner,
-            state: NeedState::Looking,
-        };
-        self.types.needs.insert(name, need);
-        self.types.jobs.push_back(Job { name, type_name, type_hash, told: None });
+        self.types.needs.insert(name, Need { type_name, type_hash, owner, state: NeedState::Looking });
+        self.types.look_for(name);
+        self.apply_type(&name);
         self.next_type_job();
     }
 
@@ -242,34 +471,41 @@ impl<N: RosNetwork> Core<N> {
         self.need_type(name, &metadata, type_hash, Some(owner));
     }
 
+    /// What an owner lists may have other types now.
+    pub(super) fn types_listed(&mut self, owner: NodeId) {
+        let Some(routes) = &self.routes else { return };
+        let listed = |name: &Name| routes.used_entry(name).map(|(_, entry)| entry);
+        for name in self.types.listed_otherwise(&owner, listed) {
+            self.need_type_of_used(name);
+        }
+    }
+
     /// The interface is no more.
     pub(super) fn forget_type(&mut self, name: &Name) {
-        if let Some(Need { owner: Some(owner), state: NeedState::Asked, .. }) = self.types.needs.remove(name)
-        {
+        if let Some(owner) = self.types.forget(name) {
             self.ask_types(owner);
         }
+        self.next_type_job();
     }
 
     /// An owner tells what types look like.
     pub(super) fn types_told(&mut self, owner: NodeId, types: Vec<DescribedType>) {
+        self.types.questions.answered(&owner);
         for told in types {
-            let Some(need) = self.types.needs.get(&told.name) else { continue };
+            let Some(need) = self.types.needs.get_mut(&told.name) else { continue };
             if need.owner != Some(owner) || !matches!(need.state, NeedState::Asked) {
                 continue;
             }
+            if !self.types.questions.takes_told(&owner, told.description.len()) {
+                self.control_drops.count("types_busy");
+                continue;
+            }
+            need.state = NeedState::Told;
             let (type_name, type_hash) = (need.type_name.clone(), need.type_hash.clone());
-            let waiting = self.types.jobs.iter().filter_map(|job| job.told.as_ref());
-            if waiting.clone().any(|other| other.name == told.name) {
-                continue;
-            }
-            let bytes: usize = waiting.map(|told| told.description.len()).sum();
-            if bytes + told.description.len() > TOLD_BYTES_MAX {
-                self.control_drops.count("types_full");
-                self.settle_need(&told.name, NeedState::Unknown);
-                continue;
-            }
-            self.types.jobs.push_back(Job { name: told.name, type_name, type_hash, told: Some(told) });
+            let (name, owner) = (told.name, need.owner);
+            self.types.jobs.push_back(Job { name, type_name, type_hash, owner, told: Some(told) });
         }
+        self.ask_types(owner);
         self.next_type_job();
     }
 
@@ -291,73 +527,94 @@ impl<N: RosNetwork> Core<N> {
     /// A type is known, or is not.
     pub(super) fn type_looked_for(&mut self, outcome: TypeOutcome) {
         self.types.is_busy = false;
-        let TypeOutcome { name, type_hash, was_told, found } = outcome;
-        let wanted = self.types.needs.get(&name).filter(|need| need.type_hash == type_hash);
-        let Some(owner) = wanted.map(|need| need.owner) else { return self.next_type_job() };
-        let found = found.and_then(|found| Ok((self.types.keep(found.described)?, found.packed)));
-        match found {
+        let TypeOutcome { of, found } = outcome;
+        if self.types.ends(&of) {
+            self.settle_need(&of, found);
+        }
+        match of.owner {
+            Some(owner) => self.ask_types(owner),
+            // What becomes known at about one time is told at one time.
+            None if !self.types.has_own_jobs() => self.endpoint.tell_types(now()),
+            None => {}
+        }
+        for owner in self.types.questions.have_room() {
+            self.ask_types(owner);
+        }
+        self.next_type_job();
+    }
+
+    fn settle_need(&mut self, of: &LookedFor, found: Result<Found, TypeMiss>) {
+        let (name, owner, was_told) = (of.name, of.owner, of.told_bytes.is_some());
+        let found =
+            found.and_then(|found| Ok((self.types.keep(found.described, owner.as_ref())?, found.packed)));
+        let state = match found {
             Ok((described, packed)) => {
                 debug!(name = %name.short(), type_name = %described.name(), hash = described.type_hash(), "type known");
                 if let (None, Some(packed)) = (owner, packed) {
                     self.endpoint.describe(now(), &name, packed);
                 }
-                self.settle_need(&name, NeedState::Known(described));
+                NeedState::Known(described)
             }
             Err(why) => {
                 debug!(name = %name.short(), %why, "type not known");
                 if let Some(key) = why.key()
                     && self.control_drops.count(key)
-                    && was_told
+                    && (was_told || why == TypeMiss::Failed)
                 {
                     warn!(%why, "a description of a type is refused; counted from here on");
                 }
-                let asks = owner.is_some() && !was_told;
-                self.settle_need(&name, if asks { NeedState::Asked } else { NeedState::Unknown });
+                why.state(owner.is_some() && !was_told)
             }
+        };
+        let Some(need) = self.types.needs.get_mut(&name) else { return };
+        need.state = state;
+        match (&need.state, owner) {
+            (NeedState::Asked, Some(owner)) => self.types.questions.lacks(owner, name),
+            (_, Some(owner)) => self.types.questions.settled(&owner, &name),
+            (_, None) => {}
         }
-        self.next_type_job();
+        if matches!(need.state, NeedState::NoRoom { .. }) {
+            self.types.no_room.push_back(name);
+        }
+        self.apply_type(&name);
     }
 
-    fn settle_need(&mut self, name: &Name, state: NeedState) {
-        let Some(need) = self.types.needs.get_mut(name) else { return };
-        need.state = state;
-        let owner = need.owner;
-        self.apply_type(name);
-        if let Some(owner) = owner {
+    /// It is the turn of other types to be asked for.
+    pub(super) fn types_due(&mut self, now: Instant) {
+        for owner in self.types.questions.due(now) {
             self.ask_types(owner);
         }
     }
 
-    /// Asks an owner for all that is not known of its types.
+    /// Asks an owner for what is not known of its types, if it is not asked for that already.
     fn ask_types(&mut self, owner: NodeId) {
-        let asked =
-            |(_, need): &(&Name, &Need)| need.owner == Some(owner) && matches!(need.state, NeedState::Asked);
-        let names = self.types.needs.iter().filter(asked).map(|(name, _)| *name).collect();
-        self.endpoint.ask_types(now(), owner, names);
+        let now = now();
+        if let Some(names) = self.types.questions.next(owner, now.instant) {
+            self.endpoint.ask_types(now, owner, names);
+        }
     }
 
     /// Tells both ends of an interface what is known of its type.
     pub(super) fn apply_type(&self, name: &Name) {
-        let Some(need) = self.types.needs.get(name) else { return };
-        match &need.state {
-            NeedState::Looking => {}
-            // What comes from there may wait for the answer; what is published here would wait for it in vain where the
-            // owner knows nothing.
-            NeedState::Asked => self.set_type(name, &KnownType::Lacking, &KnownType::Awaited),
-            NeedState::Known(described) => {
-                let known = KnownType::Known(described.layout().clone());
-                self.set_type(name, &known, &known);
-            }
-            NeedState::Unknown => self.set_type(name, &KnownType::Lacking, &KnownType::Lacking),
-        }
+        let Some(need) = self.types.needs.get(name) else {
+            // Its name is none of ROS: nobody looks for it, and nothing is to wait for it.
+            return self.set_type(name, &KnownType::Lacking);
+        };
+        let known = match &need.state {
+            NeedState::Looking => KnownType::Awaited,
+            NeedState::Asked | NeedState::Told => KnownType::Asked,
+            NeedState::Known(described) => KnownType::Known(described.layout().clone()),
+            NeedState::NoRoom { .. } | NeedState::Refused | NeedState::Unknown => KnownType::Lacking,
+        };
+        self.set_type(name, &known);
     }
 
-    fn set_type(&self, name: &Name, at_share: &KnownType, at_sink: &KnownType) {
+    fn set_type(&self, name: &Name, known: &KnownType) {
         if let Some(share) = self.shares.get(name) {
-            share.set_type(at_share.clone());
+            share.set_type(known.clone());
         }
         if let Some(sink) = self.sinks.get(name) {
-            sink.types().set(at_sink.clone());
+            sink.set_type(known.clone(), &self.data);
         }
     }
 }
@@ -373,7 +630,8 @@ mod tests {
 
     fn job(type_name: &str, type_hash: Option<&str>, told: Option<DescribedType>) -> Job {
         let type_name = type_name.parse().unwrap();
-        Job { name: Name([1; 32]), type_name, type_hash: type_hash.map(str::to_owned), told }
+        let type_hash = type_hash.map(str::to_owned);
+        Job { name: Name([1; 32]), type_name, type_hash, owner: None, told }
     }
 
     fn run(job: Job) -> Result<Described, TypeMiss> {
@@ -430,18 +688,160 @@ mod tests {
         }
     }
 
+    fn types(types_max: usize) -> Types {
+        Types::new(Arc::new(TypeStore::with_limits(types_max, usize::MAX)), Definitions::default())
+    }
+
+    /// An interface of a type; what it looks like is looked for.
+    fn need(types: &mut Types, name: u8, type_name: &str, owner: Option<NodeId>) -> Name {
+        let (name, type_name) = (Name([name; 32]), type_name.parse().unwrap());
+        let state = NeedState::Looking;
+        types.needs.insert(name, Need { type_name, type_hash: None, owner, state });
+        types.look_for(name);
+        name
+    }
+
+    /// What becomes of the next job, as the control task has it.
+    fn step(types: &mut Types) -> Result<Arc<Described>, TypeMiss> {
+        let job = types.jobs.pop_front().expect("something to do");
+        let TypeOutcome { of, found } = job.run(&TypeStore::default(), &Definitions::default());
+        assert!(types.ends(&of));
+        let kept = found.and_then(|found| types.keep(found.described, of.owner.as_ref()));
+        let need = types.needs.get_mut(&of.name).unwrap();
+        need.state = match &kept {
+            Ok(known) => NeedState::Known(known.clone()),
+            Err(why) => why.state(false),
+        };
+        if matches!(need.state, NeedState::NoRoom { .. }) {
+            types.no_room.push_back(of.name);
+        }
+        kept
+    }
+
     #[test]
     fn what_is_in_use_stays_in_a_full_store_and_what_is_not_makes_room() {
         let string = || run(job("std_msgs/msg/String", None, None)).unwrap();
-        let mut types = Types::new(Arc::new(TypeStore::with_limits(1, usize::MAX)), Definitions::default());
-        let kept = types.keep(Err(twist())).unwrap();
-        assert!(types.keep(Err(string())).is_ok(), "nobody uses the first");
+        let mut types = types(1);
+        let kept = types.keep(Err(twist()), None).unwrap();
+        assert!(types.keep(Err(string()), None).is_ok(), "nobody uses the first");
         assert!(types.store.described(kept.name(), None).is_none());
-        let (type_name, described) = (string().name().clone(), types.keep(Err(string())).unwrap());
-        let need = Need { type_name, type_hash: None, owner: None, state: NeedState::Known(described) };
-        types.needs.insert(Name([1; 32]), need);
-        let refused = TypeMiss::from(types.keep(Err(twist())).unwrap_err());
+        need(&mut types, 1, "std_msgs/msg/String", None);
+        step(&mut types).unwrap();
+        let refused = types.keep(Err(twist()), None).unwrap_err();
         assert_eq!(refused.key(), Some("types_full"), "{refused}");
+    }
+
+    #[test]
+    fn what_had_no_room_is_looked_for_again_when_there_is() {
+        let mut types = types(1);
+        let first = need(&mut types, 1, "std_msgs/msg/String", None);
+        let same = need(&mut types, 2, "std_msgs/msg/String", None);
+        need(&mut types, 3, TWIST, None);
+        step(&mut types).unwrap();
+        step(&mut types).unwrap();
+        assert_eq!(step(&mut types).unwrap_err().key(), Some("types_full"));
+        let said = types.problems(|_| unreachable!("it is of this node"));
+        assert!(said.len() == 1 && said[0].contains(TWIST) && said[0].contains("1024 types"), "{said:?}");
+        types.forget(&first);
+        assert!(types.jobs.is_empty(), "another interface has that type");
+        types.forget(&same);
+        assert!(
+            step(&mut types).is_ok()
+                && types.no_room.is_empty()
+                && types.problems(|_| String::new()).is_empty()
+        );
+    }
+
+    #[test]
+    fn one_owner_does_not_take_all_the_room() {
+        let (mut types, owner, other) = (types(TYPES_MAX), NodeId([1; 32]), NodeId([2; 32]));
+        let of = |n: usize| {
+            let mut text = |_: &TypeName| Some(format!("int8 a{n}"));
+            let mut library = sgc_cdr::Library::empty();
+            Described::of(library.layout(&"p/msg/A".parse().unwrap(), &mut text).unwrap()).unwrap()
+        };
+        let name = |n: usize| Name(std::array::from_fn(|i| n.to_be_bytes()[i % 8]));
+        for n in 0..TYPES_PER_OWNER_MAX {
+            let known = types.keep(Err(of(n)), Some(&owner)).unwrap();
+            let (type_name, state) = (known.name().clone(), NeedState::Known(known));
+            let need = Need { type_name, type_hash: None, owner: Some(owner), state };
+            types.needs.insert(name(n), need);
+        }
+        let refused = types.keep(Err(twist()), Some(&owner)).unwrap_err();
+        assert_eq!(refused.key(), Some("types_full"), "{refused}");
+        assert!(types.keep(Err(of(0)), Some(&owner)).is_ok(), "it has that already");
+        let late = need(&mut types, 0xfe, TWIST, Some(owner));
+        assert!(step(&mut types).is_err());
+        let said = types.problems(|owner| owner.short());
+        assert!(said.len() == 1 && said[0].contains("of one node this one keeps 512 types"), "{said:?}");
+        assert!(said[0].contains(&owner.short()), "{said:?}");
+        assert!(types.keep(Err(twist()), Some(&other)).is_ok() && types.keep(Err(twist()), None).is_ok());
+        // It has fewer.
+        types.forget(&name(0));
+        assert_eq!(types.jobs.front().map(|job| job.name), Some(late));
+    }
+
+    #[test]
+    fn a_fault_where_something_is_looked_for_keeps_no_others_waiting() {
+        let mut types = types(1);
+        let name = need(&mut types, 1, TWIST, Some(NodeId([1; 32])));
+        let owner = types.needs[&name].owner;
+        types.jobs.pop_front().unwrap();
+        let type_name = TWIST.parse().unwrap();
+        let of = LookedFor { name, type_name, type_hash: None, owner, told_bytes: None };
+        let TypeOutcome { of, found } = of.found_by(|| panic!("as a fault does"));
+        assert!(types.ends(&of));
+        let failed = found.map(|_| ()).unwrap_err();
+        assert_eq!(
+            (failed.key(), matches!(failed.state(true), NeedState::Asked)),
+            (Some("type_failed"), true)
+        );
+    }
+
+    #[test]
+    fn what_is_not_wanted_any_more_is_neither_looked_for_nor_taken() {
+        let (mut types, owner) = (types(1), NodeId([1; 32]));
+        let name = need(&mut types, 1, TWIST, Some(owner));
+        let job = types.jobs.pop_front().unwrap();
+        // Its owner lists another type by now.
+        assert_eq!(types.forget(&name), Some(owner));
+        need(&mut types, 1, "std_msgs/msg/String", Some(owner));
+        let outcome = job.run(&TypeStore::default(), &Definitions::default());
+        assert!(!types.ends(&outcome.of));
+        types.forget(&name);
+        assert!(types.jobs.is_empty());
+        types.questions.lacks(owner, name);
+        assert!(types.questions.next(owner, Instant::now()).is_some(), "nothing is under way");
+    }
+
+    #[test]
+    fn what_an_owner_lists_otherwise_is_looked_for_anew() {
+        let (mut types, owner) = (types(1), NodeId([1; 32]));
+        let [same, other_hash, other_type, _] =
+            [1, 2, 3, 4].map(|name| need(&mut types, name, TWIST, Some(owner)));
+        let of_another = need(&mut types, 5, TWIST, Some(NodeId([2; 32])));
+        let entry = |type_name: &str, type_hash: Option<&str>| CatalogueEntry {
+            metadata: Metadata::topic("arm", "/a", type_name),
+            blind: sgc_wire::Blind([0; 32]),
+            subscribe: true,
+            publish: false,
+            suite: 1,
+            keyless: true,
+            type_hash: type_hash.map(str::to_owned),
+            qos: sgc_wire::Qos::default(),
+            class: sgc_wire::Class::Default,
+            sources: vec![],
+        };
+        let string = "std_msgs/msg/String";
+        let listed = BTreeMap::from([
+            (same, entry(TWIST, None)),
+            (other_hash, entry(TWIST, Some("RIHS01_00"))),
+            (other_type, entry(string, None)),
+            (of_another, entry(string, None)),
+        ]);
+        let mut otherwise = types.listed_otherwise(&owner, |name| listed.get(name));
+        otherwise.sort_unstable();
+        assert_eq!(otherwise, [other_hash, other_type]);
     }
 
     #[test]

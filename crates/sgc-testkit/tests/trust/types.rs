@@ -65,6 +65,27 @@ fn what_the_owner_does_not_know_yet_is_told_when_it_does() {
 }
 
 #[test]
+fn what_becomes_known_at_one_time_is_told_at_one_time_and_again_to_who_asks_again() {
+    let mut scene = flowing(206);
+    let Scene { world, arm, desk, .. } = &mut scene;
+    let topics = ["/chatter", "/other"];
+    world.share(*arm, "/other", Sharing::to_fleet());
+    world.share(*arm, "/third", Sharing::to_fleet());
+    world.describe(*arm, "/third", HASH, &description(3));
+    world.ask_types(*desk, *arm, &topics);
+    world.run(ms(1000));
+    assert_eq!(told(world, *desk, *arm, &topics), [vec![]]);
+    world.describe_all(*arm, &topics, HASH, &description(1));
+    world.run(ms(1000));
+    let sizes = |world: &World| told(world, *desk, *arm, &topics).iter().map(Vec::len).collect::<Vec<_>>();
+    assert_eq!(sizes(world), [0, 2]);
+    // For who had no room for it.
+    world.ask_types(*desk, *arm, &topics);
+    world.run(ms(1000));
+    assert_eq!(sizes(world), [0, 2, 2]);
+}
+
+#[test]
 fn who_may_not_have_the_topic_is_not_told_what_it_looks_like() {
     let mut scene = scene_with(WorldConfig::new(202));
     let Scene { world, arm, desk, lap, .. } = &mut scene;

@@ -19,7 +19,7 @@ use super::machine::{Machine, cpu_us};
 use super::program::{End, Tally};
 use super::side::{self, Meeting, Side, Topics};
 use super::words::{Answer, Ask, Frame, Lane, PROTOCOL, Question, RunId, Tell};
-use super::{EVENTS_MAX, Event, failed, next_event, wait_ready};
+use super::{EVENTS_MAX, Event, failed, listen_addr, next_event, router_url, wait_ready};
 use crate::demo::domains::{HeldDomain, hold_one};
 use crate::error::CliError;
 use crate::output;
@@ -41,10 +41,10 @@ pub(crate) struct AnswerArgs {
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
     /// Where to listen, such as quic://0.0.0.0:7448; several with commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', required_unless_present = "router")]
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
     listen: Vec<String>,
     /// A router of yours instead, which the other side names as well; several with commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', conflicts_with = "listen")]
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "listen")]
     router: Vec<String>,
     /// The TCP and UDP port of the plain echo, if a firewall has to let it in; else the system chooses
     #[arg(long, value_name = "PORT", default_value_t = 0)]

@@ -21,7 +21,7 @@ use super::program::End;
 use super::report::{Flow, Path, Report, Trips};
 use super::side::{self, Meeting, Side, Topics};
 use super::words::{Answer, Ask, Counted, Frame, Kind, Lane, PROTOCOL, Question, RunId, Size, Tell};
-use super::{EVENTS_MAX, Event, failed, next_event, wait_ready};
+use super::{EVENTS_MAX, Event, failed, next_event, router_url, wait_ready};
 use crate::error::CliError;
 use crate::{fleet, output, status, why};
 
@@ -74,10 +74,10 @@ pub(crate) struct MeasureArgs {
     #[arg(long, value_name = "NODE")]
     with: NodeName,
     /// Where it listens, such as quic://desk.example:7448; several ways with commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', required_unless_present = "router")]
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
     to: Vec<String>,
     /// A router of yours instead, which the other side names as well; several with commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', conflicts_with = "to")]
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
     router: Vec<String>,
     /// Suites to measure, with commas
     #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,standard")]
@@ -277,6 +277,9 @@ impl<'a> Measuring<'a> {
             {
                 break;
             }
+            if self.another(&status.links).is_some() {
+                break;
+            }
         }
         Err(self.unreached())
     }
@@ -303,6 +306,12 @@ impl<'a> Measuring<'a> {
             );
             return CliError::Bench { reason: format!("no link to {who}"), facts };
         }
+        if let Some(link) = self.another(&status.links) {
+            let reason = format!("the node at {} is not {who}", output::clean(&link.remote));
+            let fact =
+                "`sgc bench answer` prints the name of its node there: that belongs behind --with".to_owned();
+            return CliError::Bench { reason, facts: vec![fact] };
+        }
         let mut facts = why::first_wrong(&self.side.socket(), &Lane::Control.answer())
             .or_else(|| why::first_wrong(&self.side.socket(), &Lane::Control.ask()))
             .unwrap_or_default();
@@ -314,6 +323,16 @@ impl<'a> Measuring<'a> {
         }
         let reason = format!("linked, but {who} does not answer after {} s", HELLO_MAX.as_secs());
         CliError::Bench { reason, facts }
+    }
+
+    /// A link straight to a node that is called otherwise than --with has it.
+    fn another<'l>(&self, links: &'l [status::Link]) -> Option<&'l status::Link> {
+        if !self.args.router.is_empty() {
+            return None;
+        }
+        let identity = sgc_node::load_identity(&self.args.identity).ok()?;
+        let wanted = identity.node_id_of(self.args.with.as_str())?.to_string();
+        links.iter().find(|link| link.peer != wanted)
     }
 
     /// Why the other side is heard no more, or a lane does not carry.

@@ -18,6 +18,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use clap::{Args, Subcommand};
+use sgc_node::config::RouterUrl;
+use sgc_transport::ListenAddr;
 
 use self::side::Side;
 use self::words::{Frame, Lane};
@@ -64,6 +66,16 @@ enum Event {
     NodeEnded,
     /// The node is up, and listens at these URLs.
     NodeReady(Vec<String>),
+}
+
+/// Where a router or the other side is, as it will stand in a configuration.
+fn router_url(text: &str) -> Result<String, String> {
+    text.parse::<RouterUrl>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
+}
+
+/// Where to listen, in the same way.
+fn listen_addr(text: &str) -> Result<String, String> {
+    text.parse::<ListenAddr>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
 }
 
 /// Why it does not go on, in one line.

@@ -394,8 +394,8 @@ pub struct SubscribeRequest {
     /// that comes. 0 is all.
     #[prost(double, tag = "6")]
     pub max_rate_hz: f64,
-    /// Rather than leaving messages out, the gateway stops reading. Publishers that are reliable and keep all then wait for this
-    /// client; others overwrite what they keep.
+    /// Rather than leaving messages out, the gateway stops reading for this client: up to 64 MiB or 4096 messages of reliable
+    /// publishers then wait for it. What comes beyond is left out, and counted in `dropped`: nobody on the network is held up.
     #[prost(bool, tag = "7")]
     pub waits: bool,
 }

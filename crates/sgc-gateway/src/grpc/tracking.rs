@@ -1,13 +1,13 @@
-//! [`Budget`]: room for long messages of one client, so that many streams that are not read take no more than a few.
+//! [`Tracking`]: what streams tell takes room of their client's [`Budget`](crate::budget::Budget) until it has left, and what they
+//! are sent until it was worked on.
 
 use std::convert::Infallible;
 use std::pin::Pin;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::mpsc;
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::body::Body;
@@ -15,69 +15,12 @@ use tonic::codegen::BoxFuture;
 use tonic::server::NamedService;
 use tonic::{Response, Status};
 
+use super::client::Guest;
+use super::incoming::{Incoming, Kept};
 use super::proto::gateway_server::GatewayServer;
 use super::service::{Responses, Service};
-use crate::error::GatewayError;
+use crate::budget::Room;
 use crate::hub::lock;
-
-/// Messages up to that length need no room, since streams are counted; that of longer ones is in multiples of it.
-const UNIT_BYTES: usize = 64 << 10;
-
-/// Room for long messages.
-pub(super) struct Budget {
-    room: Arc<Semaphore>,
-    units: usize,
-    /// Of replies that are there, and wait for room.
-    waiting_units: AtomicUsize,
-}
-
-/// A reply that waits for room.
-struct Waits<'a>(&'a AtomicUsize, usize);
-
-impl Drop for Waits<'_> {
-    fn drop(&mut self) {
-        self.0.fetch_sub(self.1, Ordering::Relaxed);
-    }
-}
-
-/// What a message takes of it, until it is dropped.
-#[derive(Debug)]
-pub(super) struct Room(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit);
-
-impl Budget {
-    pub(super) fn new(bytes_max: usize) -> Self {
-        let units = (bytes_max / UNIT_BYTES).clamp(1, Semaphore::MAX_PERMITS);
-        Self { room: Arc::new(Semaphore::new(units)), units, waiting_units: AtomicUsize::new(0) }
-    }
-
-    /// Waits for room for a message; one that is longer than all there is waits for all. Short ones need none.
-    pub(super) async fn take(&self, bytes: usize) -> Option<Room> {
-        if bytes <= UNIT_BYTES {
-            return None;
-        }
-        let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
-        Arc::clone(&self.room).acquire_many_owned(units).await.ok().map(Room)
-    }
-
-    /// The same for a reply, which nobody holds back while it waits: of those no more wait than there is room in all.
-    pub(super) async fn take_for_reply(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
-        if bytes <= UNIT_BYTES {
-            return Ok(None);
-        }
-        let units = self.units_of(bytes);
-        let before = self.waiting_units.fetch_add(units, Ordering::Relaxed);
-        let _waits = Waits(&self.waiting_units, units);
-        if before + units > self.units {
-            let max = self.units * UNIT_BYTES;
-            return Err(GatewayError::TooMany { what: "bytes of replies that it does not read", max });
-        }
-        Ok(self.take(bytes).await)
-    }
-
-    fn units_of(&self, bytes: usize) -> usize {
-        bytes.div_ceil(UNIT_BYTES).min(self.units)
-    }
-}
 
 /// Where a stream puts the room of the message that it gives next, for the body to take along.
 #[derive(Clone, Debug, Default)]
@@ -112,7 +55,8 @@ pub(super) fn with_slot<T>(message: T, slot: Slot) -> Response<T> {
     response
 }
 
-/// Has messages hold their room until they have left: the connection drops what it has written.
+/// Has messages hold their room, those that come from their heads on until they were worked on, and those that go until they
+/// have left: the connection drops what it has written.
 #[derive(Clone, Debug)]
 pub(super) struct Tracking(GatewayServer<Service>);
 
@@ -136,9 +80,17 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        // The one message of a call is worked on until that has its reply.
+        let kept: Option<Kept> = request.uri().path().ends_with("/Call").then(Kept::default);
+        let guest = request.extensions().get::<Arc<Guest>>().cloned();
+        let request = match guest {
+            Some(guest) => request.map(|body| Body::new(Incoming::new(body, guest, kept.clone()))),
+            None => request,
+        };
         let answered = self.0.call(request);
         Box::pin(async move {
             let mut response = answered.await?;
+            drop(kept);
             let slot = response.extensions_mut().remove::<Slot>();
             Ok(match slot {
                 Some(slot) => response.map(|body| Body::new(Tracked { body, slot })),
@@ -188,33 +140,5 @@ impl http_body::Body for Tracked {
 
     fn size_hint(&self) -> http_body::SizeHint {
         self.body.size_hint()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-
-    #[tokio::test]
-    async fn long_messages_wait_for_room_and_short_ones_do_not() {
-        let budget = Budget::new(1 << 20);
-        let first = budget.take(900 << 10).await.unwrap();
-        assert!(budget.take(1000).await.is_none());
-        let waits = tokio::time::timeout(Duration::from_millis(20), budget.take(200 << 10)).await;
-        assert!(waits.is_err());
-        drop(first);
-        // Replies wait for it as well, as many as there is room in all.
-        let all = budget.take(1 << 20).await;
-        let waits = budget.take_for_reply(900 << 10);
-        tokio::pin!(waits);
-        assert!(tokio::time::timeout(Duration::from_millis(20), &mut waits).await.is_err());
-        assert!(budget.take_for_reply(200 << 10).await.is_err());
-        assert!(budget.take_for_reply(1000).await.unwrap().is_none());
-        drop(all);
-        assert!(waits.await.unwrap().is_some());
-        // What is longer than all takes all.
-        assert!(budget.take(50 << 20).await.is_some());
     }
 }

@@ -1,0 +1,109 @@
+//! [`Budget`]: room for long messages of one client, so that many that are not read take no more than a few.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use crate::error::GatewayError;
+
+/// Messages up to that length need no room, since they are counted; that of longer ones is in multiples of it.
+const UNIT_BYTES: usize = 64 << 10;
+
+/// Room for long messages.
+#[derive(Debug)]
+pub(crate) struct Budget {
+    room: Arc<Semaphore>,
+    units: usize,
+    /// Of replies that are there, and wait for room.
+    waiting_units: AtomicUsize,
+}
+
+/// A reply that waits for room.
+struct Waits<'a>(&'a AtomicUsize, usize);
+
+impl Drop for Waits<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(self.1, Ordering::Relaxed);
+    }
+}
+
+/// What a message takes of it, until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Room(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit);
+
+impl Budget {
+    pub(crate) fn new(bytes_max: usize) -> Self {
+        let units = (bytes_max / UNIT_BYTES).clamp(1, Semaphore::MAX_PERMITS);
+        Self { room: Arc::new(Semaphore::new(units)), units, waiting_units: AtomicUsize::new(0) }
+    }
+
+    /// Waits for room for a message; one that is longer than all there is waits for all. Short ones need none.
+    pub(crate) async fn take(&self, bytes: usize) -> Option<Room> {
+        if bytes <= UNIT_BYTES {
+            return None;
+        }
+        let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
+        Arc::clone(&self.room).acquire_many_owned(units).await.ok().map(Room)
+    }
+
+    /// The same for a reply, which nobody holds back while it waits: of those no more wait than there is room in all.
+    pub(crate) async fn take_for_reply(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
+        if bytes <= UNIT_BYTES {
+            return Ok(None);
+        }
+        let units = self.units_of(bytes);
+        let before = self.waiting_units.fetch_add(units, Ordering::Relaxed);
+        let _waits = Waits(&self.waiting_units, units);
+        if before + units > self.units {
+            let max = self.units * UNIT_BYTES;
+            return Err(GatewayError::TooMany { what: "bytes of replies that it does not read", max });
+        }
+        Ok(self.take(bytes).await)
+    }
+
+    /// Room for a message that nobody can wait with.
+    pub(crate) fn take_at_once(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
+        if bytes <= UNIT_BYTES {
+            return Ok(None);
+        }
+        let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
+        let taken = Arc::clone(&self.room).try_acquire_many_owned(units);
+        let max = self.units * UNIT_BYTES;
+        taken
+            .map(|room| Some(Room(room)))
+            .map_err(|_| GatewayError::TooMany { what: "bytes of requests that come or are worked on", max })
+    }
+
+    fn units_of(&self, bytes: usize) -> usize {
+        bytes.div_ceil(UNIT_BYTES).min(self.units)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn long_messages_wait_for_room_and_short_ones_do_not() {
+        let budget = Budget::new(1 << 20);
+        let first = budget.take(900 << 10).await.unwrap();
+        assert!(budget.take(1000).await.is_none());
+        let waits = tokio::time::timeout(Duration::from_millis(20), budget.take(200 << 10)).await;
+        assert!(waits.is_err());
+        drop(first);
+        // Replies wait for it as well, as many as there is room in all.
+        let all = budget.take(1 << 20).await;
+        let waits = budget.take_for_reply(900 << 10);
+        tokio::pin!(waits);
+        assert!(tokio::time::timeout(Duration::from_millis(20), &mut waits).await.is_err());
+        assert!(budget.take_for_reply(200 << 10).await.is_err());
+        assert!(budget.take_for_reply(1000).await.unwrap().is_none());
+        drop(all);
+        assert!(waits.await.unwrap().is_some());
+        // What is longer than all takes all.
+        assert!(budget.take(50 << 20).await.is_some());
+    }
+}
