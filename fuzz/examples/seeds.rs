@@ -36,7 +36,45 @@ fn main() -> io::Result<()> {
     write("packet", packets(Suite::ALL.as_slice()))?;
     write("certs", certs())?;
     write("sink", sink())?;
-    write("grants", grants())
+    write("grants", grants())?;
+    write("gateway", gateway())
+}
+
+/// Conversations: by the rosbridge protocol, and by Foxglove's.
+fn gateway() -> Vec<Vec<u8>> {
+    let conversations = [
+        (
+            0,
+            [
+                r#"{"op":"advertise","id":"a","topic":"/cmd","type":"geometry_msgs/msg/Twist","qos":{"depth":3}}"#,
+                r#"{"op":"subscribe","id":"s","topic":"/cmd","compression":"cbor","throttle_rate":1,"fragment_size":20}"#,
+                r#"{"op":"publish","topic":"/cmd","msg":{"linear":{"x":1.5}}}"#,
+                r#"{"op":"fragment","id":"f","num":0,"total":1,"data":"{\"op\":\"unsubscribe\",\"topic\":\"/cmd\"}"}"#,
+                r#"{"op":"unadvertise","id":"a","topic":"/cmd"}"#,
+            ],
+        ),
+        (
+            0,
+            [
+                r#"{"op":"advertise_service","service":"/switch","type":"std_srvs/srv/SetBool"}"#,
+                r#"{"op":"call_service","id":"c","service":"/switch","args":[true],"timeout":0.01}"#,
+                r#"{"op":"service_response","id":"x","service":"/switch","values":{"success":true},"result":true}"#,
+                r#"{"op":"advertise_action","action":"/dock","type":"example_interfaces/action/Fibonacci"}"#,
+                r#"{"op":"call_service","id":"d","service":"/rosapi/topics"}"#,
+            ],
+        ),
+        (
+            1,
+            [
+                r#"{"op":"advertise","channels":[{"id":7,"topic":"/cmd","encoding":"json","schemaName":"std_msgs/msg/String"}]}"#,
+                r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":1}]}"#,
+                "\u{1}\u{7}\0\0\0{\"data\":\"left\"}",
+                r#"{"op":"setParameters","parameters":[{"name":"/n.p","value":[1,2.5]}],"id":"q"}"#,
+                r#"{"op":"subscribeConnectionGraph"}"#,
+            ],
+        ),
+    ];
+    conversations.map(|(which, lines)| [vec![which], lines.join("\n").into_bytes()].concat()).into()
 }
 
 fn control() -> Vec<Vec<u8>> {

@@ -63,7 +63,7 @@ def refused(code: str, words: str, work: object) -> None:
         raise AssertionError(f"not refused: {words}")
 
 
-def topics(robot: sgc.Client) -> None:
+def topics(robot: sgc.Client, address: str, token: str) -> None:
     with robot.subscribe("/chatter", depth=5) as heard:
         assert (heard.type, heard.type_hash[:7]) == ("std_msgs/msg/String", "RIHS01_")
         message = next(heard)
@@ -89,6 +89,12 @@ def topics(robot: sgc.Client) -> None:
     wrong = robot.publisher("/echoed", "std_msgs/msg/String")
     wrong.publish(date="no such member")
     refused("INVALID_ARGUMENT", "message 1 of this stream", wrong.close)
+
+    def forgetful() -> None:
+        with sgc.connect(address, token=token) as other:
+            other.publisher("/secret", "std_msgs/msg/String").publish(data="never closed")
+
+    refused("PERMISSION_DENIED", "may not publish /secret", forgetful)
 
     with robot.publisher("/large", "sensor_msgs/msg/Image") as large:
         with robot.subscribe("/large", "sensor_msgs/msg/Image") as back:
@@ -187,7 +193,7 @@ def main(port: str, token: str) -> None:
     cbor()
     address = f"grpc://127.0.0.1:{port}"
     with sgc.connect(address, token=token) as robot:
-        topics(robot)
+        topics(robot, address, token)
         services(robot, address, token)
         actions(robot, address, token)
         graph(robot)

@@ -1,7 +1,7 @@
 """A program without ROS at a gateway of SGC, by gRPC (`clients/python`) or by the rosbridge protocol (PyPI `roslibpy`).
 
 Reports in JSON lines as `peer.py` does. It hears a topic of texts, publishes on another, and calls `/add_two_ints`; with
-`--hear` it hears alone, says when that fails, and begins anew.
+`--serve` it serves one that adds as well; with `--hear` it hears alone, says when that fails, and begins anew.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ def grpc(args: argparse.Namespace) -> None:
 
 def hear_by_grpc(gateway: object, args: argparse.Namespace) -> None:
     emit("topics", topics=sorted(gateway.graph().topics))
+    if args.serve:
+        gateway.serve(args.serve, lambda call: {"sum": call.a + call.b}, "example_interfaces/srv/AddTwoInts")
+        emit("served", service=args.serve)
     if args.publish:
         publisher = gateway.publisher(args.publish, "std_msgs/msg/String")
         publish(lambda text: publisher.publish(data=text))
@@ -92,6 +95,7 @@ def main() -> None:
     parser.add_argument("address")
     parser.add_argument("--topic", default="/chatter")
     parser.add_argument("--publish", help="a topic to publish on")
+    parser.add_argument("--serve", help="by gRPC, a service that adds two numbers")
     parser.add_argument("--hear", action="store_true", help="hear, come what may")
     parser.add_argument("--token")
     parser.add_argument("--ca")

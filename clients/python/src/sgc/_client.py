@@ -225,16 +225,27 @@ class Client:
         return self
 
     def __exit__(self, kind: Optional[Type[BaseException]], _e: Any, _t: Optional[TracebackType]) -> None:
-        self.close()
+        try:
+            self.close()
+        except GatewayError as error:
+            if kind is None:
+                raise
+            # What ended the block says more.
+            _log.error("%s", error)
 
     def close(self) -> None:
-        """Ends everything that it began."""
+        """Ends everything that it began; raises what was wrong with a message that was published last."""
+        wrong: Optional[GatewayError] = None
         for one in list(self._open):
             try:
                 one.close()
             except GatewayError as error:
-                _log.error("%s", error)
+                if wrong is not None:
+                    _log.error("%s", error)
+                wrong = wrong or error
         self._channel.close()
+        if wrong is not None:
+            raise wrong
 
     def _unary(self, name: str, request: Any, timeout: Optional[float]) -> Any:
         try:
@@ -282,8 +293,8 @@ class Client:
         """Hears a topic; it is heard once this returns.
 
         ``type`` may be left out if somebody has the topic. At most ``rate`` messages a second come, 0 is all. Of what
-        comes too fast the newest ``depth`` are kept; with ``waits`` publishers that keep all wait instead. Without ``qos``
-        each publisher is heard as it offers.
+        comes too fast the newest ``depth`` are kept; with ``waits`` up to 64 MiB or 4096 messages wait at the gateway
+        before any is left out. Without ``qos`` each publisher is heard as it offers.
         """
         return Subscription(self, _subscribe_request(topic, type, _CBOR, qos, depth, rate, waits), _decode)
 
