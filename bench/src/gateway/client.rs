@@ -94,7 +94,7 @@ pub(super) enum Hearer {
 }
 
 impl Hearer {
-    /// With gRPC and `waits`, the gateway waits for this client, and DDS for the gateway.
+    /// With gRPC and `waits`, the gateway keeps for this client what it does not take at once, as far as it does.
     pub(super) async fn new(scene: &Scene, way: Way, topic: &str, size: usize, waits: bool) -> Result<Self> {
         if way.is_rosbridge() {
             let mut socket = socket(scene).await?;
@@ -164,7 +164,7 @@ fn number_in(json: &[u8]) -> Result<u64> {
 /// Says something on a topic.
 pub(super) enum Sayer {
     Rosbridge {
-        socket: Socket,
+        socket: Box<Socket>,
         begin: String,
         end: String,
         unflushed: usize,
@@ -196,7 +196,12 @@ impl Sayer {
             };
             tell(&mut socket, json!({"op": "advertise", "topic": topic, "type": TYPE, "qos": qos})).await?;
             let begin = format!("{{\"op\":\"publish\",\"topic\":\"{topic}\",\"msg\":");
-            return Ok(Self::Rosbridge { socket, begin, end: json_end + "}", unflushed: 0 });
+            return Ok(Self::Rosbridge {
+                socket: Box::new(socket),
+                begin,
+                end: json_end + "}",
+                unflushed: 0,
+            });
         }
         let publisher = publish_request::Publisher {
             topic: topic.into(),

@@ -107,8 +107,8 @@ struct Heard {
     last_ns: AtomicU64,
 }
 
-/// A DDS program says as much as it can, and the client hears. By gRPC it is waited for the client; rosbridge has no such thing, and
-/// what the client does not take in time is dropped.
+/// A DDS program says as much as it can, and the client hears. By gRPC the gateway keeps what the client does not take at once, as
+/// far as it does; what is beyond, and by rosbridge what is more than a queue, is dropped.
 pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let hearer = Hearer::new(scene, way, DOWN, size, true).await?;
     let heard = Arc::new(Heard::default());
