@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 
 use crate::dds::{Message, Network, Reader, Waiter, Writer};
-use crate::report::{Event, Next, Orders, say};
+use crate::report::{Event, Orders, say};
 use crate::{Common, now_ns};
 
 /// How long is waited where only an event ends the wait.
@@ -64,7 +64,7 @@ impl Node {
                 say(&Event::Matched)?;
                 return Ok(true);
             }
-            if matches!(self.orders.next()?, Next::End) {
+            if self.orders.have_ended()? {
                 return Ok(false);
             }
             self.waiter.wait(LONG)?;

@@ -1,5 +1,7 @@
 //! What goes in and out: orders and events, one line of JSON each.
 
+use std::cell::RefCell;
+use std::collections::VecDeque;
 use std::io::BufRead as _;
 use std::sync::mpsc::{Receiver, TryRecvError, channel};
 
@@ -73,6 +75,8 @@ pub(crate) enum Order {
 pub(crate) enum Event {
     /// It is up.
     Up,
+    /// `relay`: the other end may connect.
+    Listening,
     /// Somebody is there on the local network, on every topic.
     Matched,
     /// The first message has made its way.
@@ -137,7 +141,11 @@ pub(crate) fn say(event: &Event) -> Result<()> {
 
 /// Orders, as they come; a thread reads them and rings.
 #[derive(Debug)]
-pub(crate) struct Orders(Receiver<Result<Order>>);
+pub(crate) struct Orders {
+    come: Receiver<Result<Order>>,
+    /// Those that came while it was only looked whether there is an end.
+    kept: RefCell<VecDeque<Order>>,
+}
 
 /// What is there to do.
 #[derive(Debug)]
@@ -167,11 +175,25 @@ impl Orders {
             drop(orders);
             bell.ring();
         });
-        Self(receiver)
+        Self { come: receiver, kept: RefCell::default() }
+    }
+
+    /// Whether the program is to end: orders that come meanwhile are for later.
+    pub(crate) fn have_ended(&self) -> Result<bool> {
+        loop {
+            match self.come.try_recv() {
+                Ok(order) => self.kept.borrow_mut().push_back(order?),
+                Err(TryRecvError::Empty) => return Ok(false),
+                Err(TryRecvError::Disconnected) => return Ok(true),
+            }
+        }
     }
 
     pub(crate) fn next(&self) -> Result<Next> {
-        match self.0.try_recv() {
+        if let Some(order) = self.kept.borrow_mut().pop_front() {
+            return Ok(Next::Do(order));
+        }
+        match self.come.try_recv() {
             Ok(order) => Ok(Next::Do(order?)),
             Err(TryRecvError::Empty) => Ok(Next::Wait),
             Err(TryRecvError::Disconnected) => Ok(Next::End),
