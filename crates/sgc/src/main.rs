@@ -6,7 +6,7 @@
 //!
 //! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
 //! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod audit;
 mod bench;
@@ -15,6 +15,7 @@ mod demo;
 mod error;
 mod files;
 mod fleet;
+mod heap;
 mod name;
 mod output;
 mod policy;

@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use tracing_subscriber::EnvFilter;
 
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::output;
+use crate::{heap, output};
 
 const LOG_VARIABLE: &str = "SGC_LOG";
 const LOG_DEFAULT: &str = "info";
@@ -286,6 +286,7 @@ fn run_node(
     process: &ProcessArgs,
 ) -> Result<(), CliError> {
     let config = source().map_err(|errors| CliError::Config { what, errors })?;
+    heap::share_arenas();
     let stdin_closed = process.until_stdin_closes.then(stdin_closed);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
