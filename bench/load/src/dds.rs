@@ -163,24 +163,25 @@ pub(crate) struct Writer {
 impl Writer {
     /// On the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        Self::of(network, &types::MESSAGE, &types::dds_name(name), quality, false)
+        Self::of(network, &types::MESSAGE, &types::dds_name(name), Qos::of(quality, false)?)
+    }
+
+    /// The same, of which messages may share packets until [`Self::flush`].
+    pub(crate) fn that_batches(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        let qos = Qos::of(quality, false)?;
+        // SAFETY: the object is valid.
+        unsafe { dds_qset_writer_batching(qos.0, true) };
+        Self::of(network, &types::MESSAGE, &types::dds_name(name), qos)
     }
 
     /// The writer of the ROS graph, as every node has one.
     pub(crate) fn of_graph(network: &Network) -> Result<Self> {
         let quality = Quality { reliable: true, depth: 1 };
-        Self::of(network, &types::GRAPH, "ros_discovery_info", quality, true)
+        Self::of(network, &types::GRAPH, "ros_discovery_info", Qos::of(quality, true)?)
     }
 
-    fn of(
-        network: &Network,
-        descriptor: &types::Descriptor,
-        dds_name: &str,
-        quality: Quality,
-        transient_local: bool,
-    ) -> Result<Self> {
+    fn of(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
         let topic = network.topic(descriptor, dds_name)?;
-        let qos = Qos::of(quality, transient_local)?;
         // SAFETY: Cyclone checks the handles; the QoS outlives the call.
         let handle = unsafe { dds_create_writer(network.participant.0, topic.0, qos.0, null()) };
         let entity = Entity::new(handle).with_context(|| format!("a writer of {dds_name}"))?;
@@ -210,6 +211,12 @@ impl Writer {
             Sample { seq: message.seq, stamp_ns: message.stamp_ns, data: types::sequence(message.data) };
         // SAFETY: the sample is of the type of the topic and lives through the call, which reads it only.
         self.write_raw(unsafe { dds_write(self.entity.0, (&raw const sample).cast()) })
+    }
+
+    /// Sends what was written and waits for others to share its packet.
+    pub(crate) fn flush(&self) -> Result<()> {
+        // SAFETY: takes a number.
+        check(unsafe { dds_write_flush(self.entity.0) })
     }
 
     /// Says which node the endpoints of this participant belong to. For a writer [`Self::of_graph`].
@@ -259,10 +266,19 @@ pub(crate) struct Reader {
 impl Reader {
     /// On the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        Self::with(network, name, quality, null())
+    }
+
+    fn with(
+        network: &Network,
+        name: &str,
+        quality: Quality,
+        listener: *const dds_listener_t,
+    ) -> Result<Self> {
         let topic = network.topic(&types::MESSAGE, &types::dds_name(name))?;
         let qos = Qos::of(quality, false)?;
-        // SAFETY: Cyclone checks the handles; the QoS outlives the call.
-        let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, null()) };
+        // SAFETY: Cyclone checks the handles; QoS and listener outlive the call, which copies them.
+        let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, listener) };
         let entity = Entity::new(handle).with_context(|| format!("a reader of {name}"))?;
         let mask = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
         // SAFETY: take numbers.
@@ -271,6 +287,31 @@ impl Reader {
             dds_create_readcondition(entity.0, DDS_ANY_STATE)
         };
         Ok(Self { condition: Entity::new(condition)?, entity, _topic: topic })
+    }
+
+    /// The same, which calls `arrived` on the thread of Cyclone's that received a message, one call at a time. `arrived`
+    /// stays until the process ends.
+    pub(crate) fn with_listener<F: FnMut(Inbox) + Send + 'static>(
+        network: &Network,
+        name: &str,
+        quality: Quality,
+        arrived: F,
+    ) -> Result<Self> {
+        unsafe extern "C" fn call<F: FnMut(Inbox)>(reader: dds_entity_t, arrived: *mut c_void) {
+            // SAFETY: what the listener was made with, which is never freed; Cyclone makes one call at a time.
+            let arrived = unsafe { &mut *arrived.cast::<F>() };
+            arrived(Inbox(reader));
+        }
+        let arrived: *mut F = Box::leak(Box::new(arrived));
+        // SAFETY: `arrived` lives as long as the process and is used by calls of this listener only; the listener is copied
+        // by the call that makes the reader, and deleted once.
+        unsafe {
+            let listener = dds_create_listener(arrived.cast());
+            dds_lset_data_available(listener, Some(call::<F>));
+            let reader = Self::with(network, name, quality, listener);
+            dds_delete_listener(listener);
+            reader
+        }
     }
 
     /// Its GUID.
@@ -287,15 +328,31 @@ impl Reader {
         Ok(status.current_count)
     }
 
+    /// What waits to be taken.
+    pub(crate) fn inbox(&self) -> Inbox {
+        Inbox(self.entity.0)
+    }
+
     /// Takes all that is there.
-    pub(crate) fn take(&self, mut handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
+    pub(crate) fn take(&self, handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
+        self.inbox().take(handle)
+    }
+}
+
+/// What waits at a reader; nothing any more once that has gone.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Inbox(dds_entity_t);
+
+impl Inbox {
+    /// Takes all that is there.
+    pub(crate) fn take(self, mut handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
         loop {
             let mut samples: [*mut c_void; TAKE_MAX] = [null_mut(); TAKE_MAX];
             // SAFETY: plain data, of which zeros are a value.
             let mut infos: [dds_sample_info_t; TAKE_MAX] = unsafe { std::mem::zeroed() };
             let (buffer, limit) = (samples.as_mut_ptr(), TAKE_MAX);
             // SAFETY: both arrays have as many places as is said; null pointers ask for a loan.
-            let taken = unsafe { dds_take(self.entity.0, buffer, infos.as_mut_ptr(), limit, limit as u32) };
+            let taken = unsafe { dds_take(self.0, buffer, infos.as_mut_ptr(), limit, limit as u32) };
             check(taken)?;
             let taken = taken as usize;
             let mut outcome = Ok(());
@@ -311,7 +368,7 @@ impl Reader {
             }
             if taken > 0 {
                 // SAFETY: what was lent above.
-                check(unsafe { dds_return_loan(self.entity.0, buffer, taken as i32) })?;
+                check(unsafe { dds_return_loan(self.0, buffer, taken as i32) })?;
             }
             outcome?;
             if taken < TAKE_MAX {

@@ -12,6 +12,7 @@ mod dds;
 mod flow;
 mod node;
 mod ping;
+mod relay;
 mod report;
 mod types;
 
@@ -41,6 +42,8 @@ enum Role {
     Source(flow::SourceArgs),
     /// Counts messages and how old they were
     Sink(flow::SinkArgs),
+    /// Carries topics to another relay over TCP, as they are
+    Relay(relay::RelayArgs),
 }
 
 /// What every role is given.
@@ -77,6 +80,7 @@ fn main() -> Result<()> {
         Role::Answer(args) => ask::answer(&args),
         Role::Source(args) => flow::source(&args),
         Role::Sink(args) => flow::sink(&args),
+        Role::Relay(args) => relay::relay(&args),
     }
 }
 

@@ -16,6 +16,10 @@ pub(crate) struct Goal {
     pub(crate) bound: String,
     /// What was reached: the worst of the parts, or each of them.
     pub(crate) reached: String,
+    /// The same by TCP, where that was measured and the transport matters.
+    pub(crate) by_tcp: String,
+    /// What programs reach that do nothing but carry messages; empty where that says nothing.
+    pub(crate) by_relay: String,
     /// Whether that is within the bound.
     pub(crate) verdict: Verdict,
 }
@@ -46,7 +50,12 @@ impl Verdict {
 const GROUP: &str = "sgc-quic-group";
 /// What users have who choose nothing.
 const STANDARD: &str = "sgc-quic-standard";
+/// The same suites over the transport that the peers of most goals use.
+const GROUP_TCP: &str = "sgc-tcp-group";
+const STANDARD_TCP: &str = "sgc-tcp-standard";
 const ZENOH: &str = "zenoh-tcp";
+/// What every system with a program at each place does, and nothing else; the better of both counts.
+const RELAYS: [&str; 2] = ["relay", "relay-gathers"];
 /// Sizes of messages, bytes, that are small.
 const SMALL: [f64; 4] = [16.0, 100.0, 1e3, 8e3];
 const SIZES: [f64; 7] = [16.0, 100.0, 1e3, 8e3, 64e3, 1e6, 13e6];
@@ -105,12 +114,28 @@ fn goal(what: impl Into<String>, bound: Bound, unit: Option<Unit>, parts: Vec<Pa
         (false, true) => Verdict::Met,
         (false, false) => Verdict::NotMeasured,
     };
-    let say = |part: &Part| {
+    let (by_tcp, by_relay) = (String::new(), String::new());
+    Goal { what: what.into(), bound: bound.text(unit), reached: say(&parts, unit), by_tcp, by_relay, verdict }
+}
+
+fn say(parts: &[Part], unit: Option<Unit>) -> String {
+    let one = |part: &Part| {
         let value = part.value.map_or_else(|| "–".into(), |v| number(v, unit));
         if part.label.is_empty() { value } else { format!("{}: {value}", part.label) }
     };
-    let reached = parts.iter().map(say).collect::<Vec<_>>().join(", ");
-    Goal { what: what.into(), bound: bound.text(unit), reached, verdict }
+    parts.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+/// Nothing if nothing was measured.
+fn say_measured(parts: &[Part]) -> String {
+    if parts.iter().any(|part| part.value.is_some()) { say(parts, None) } else { String::new() }
+}
+
+impl Goal {
+    /// With the ratios that were reached by TCP, and by a relay.
+    fn beside(self, by_tcp: &[Part], by_relay: &[Part]) -> Self {
+        Self { by_tcp: say_measured(by_tcp), by_relay: say_measured(by_relay), ..self }
+    }
 }
 
 /// Every goal, in the order of the issue that set them.
@@ -123,15 +148,20 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
                 |&at: &f64| run.at_size(at, run.ratio(("round-trip", "bare", at, metric), ours, theirs));
             SMALL.iter().map(part).collect::<Vec<_>>()
         };
+        let by_relay =
+            |&at: &f64| run.at_size(at, run.by_relay(("round-trip", "bare", at, metric), ZENOH, f64::min));
+        let by_relay: Vec<_> = SMALL.iter().map(by_relay).collect();
         let over = |what: &str| format!("Round trip {tail}, 16 B to 8 KB, bare link: {what}");
         goals.extend([
-            goal(over("`group` to the Zenoh bridge over TCP"), Bound::AtMost(0.8), None, small(GROUP, ZENOH)),
+            goal(over("`group` to the Zenoh bridge over TCP"), Bound::AtMost(0.8), None, small(GROUP, ZENOH))
+                .beside(&small(GROUP_TCP, ZENOH), &by_relay),
             goal(
                 over("`standard` to the Zenoh bridge over TCP"),
                 Bound::AtMost(1.0),
                 None,
                 small(STANDARD, ZENOH),
-            ),
+            )
+            .beside(&small(STANDARD_TCP, ZENOH), &by_relay),
             goal(
                 over("with a router between to without, `group`"),
                 Bound::AtMost(1.15),
@@ -141,13 +171,18 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
         ]);
     }
     for (size, at) in [("1 MB", LARGE), ("13 MB", HUGE)] {
-        let ratio = run.ratio(("round-trip", "bare", at, "p50_us"), GROUP, ZENOH);
+        let place = ("round-trip", "bare", at, "p50_us");
+        let by = |ours| vec![part("", run.ratio(place, ours, ZENOH))];
+        let by_relay = part("", run.by_relay(place, ZENOH, f64::min));
         let what = format!("Round trip p50, {size}, bare link: `group` to the Zenoh bridge over TCP");
-        goals.push(goal(what, Bound::AtMost(0.6), None, vec![part("", ratio)]));
+        goals.push(goal(what, Bound::AtMost(0.6), None, by(GROUP)).beside(&by(GROUP_TCP), &[by_relay]));
     }
 
     let throughput = |metric, ours, theirs| {
         vec![part("", run.ratio(("throughput", "bare", MESSAGE, metric), ours, theirs))]
+    };
+    let by_relay = |metric, theirs, better: fn(f64, f64) -> f64| {
+        [part("", run.by_relay(("throughput", "bare", MESSAGE, metric), theirs, better))]
     };
     goals.extend([
         goal(
@@ -155,18 +190,27 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
             Bound::AtLeast(0.97),
             None,
             throughput("per_second", GROUP, "direct"),
-        ),
+        )
+        .beside(&throughput("per_second", GROUP_TCP, "direct"), &by_relay("per_second", "direct", f64::max)),
         goal(
             "Messages of 1000 B a second: `standard` to direct DDS",
             Bound::AtLeast(0.8),
             None,
             throughput("per_second", STANDARD, "direct"),
+        )
+        .beside(
+            &throughput("per_second", STANDARD_TCP, "direct"),
+            &by_relay("per_second", "direct", f64::max),
         ),
         goal(
             "CPU time a message of 1000 B, both proxies: `group` to the Zenoh bridge over TCP",
             Bound::AtMost(0.8),
             None,
             throughput("cpu_us_per_message", GROUP, ZENOH),
+        )
+        .beside(
+            &throughput("cpu_us_per_message", GROUP_TCP, ZENOH),
+            &by_relay("cpu_us_per_message", ZENOH, f64::min),
         ),
     ]);
 
@@ -187,7 +231,12 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
             }
         };
         let what = format!("Round trip p50, every size, `{path}`: `standard` to DDS over WireGuard");
-        goals.push(goal(what, Bound::AtMost(1.0), None, SIZES.iter().map(beside).collect()));
+        let goal = goal(what, Bound::AtMost(1.0), None, SIZES.iter().map(beside).collect());
+        let of = |ours: &str| {
+            let ratio = |&at: &f64| run.ratio(("round-trip", path, at, "p50_us"), ours, "wireguard");
+            SIZES.iter().map(|at| run.at_size(*at, ratio(at))).collect::<Vec<_>>()
+        };
+        goals.push(goal.beside(&of(STANDARD_TCP), &of(RELAYS[0])));
     }
     goals.extend(run.teleop());
     goals.extend(run.roaming());
@@ -232,6 +281,11 @@ impl Run<'_> {
     fn ratio(&self, place: Place<'_>, ours: &str, theirs: &str) -> Option<f64> {
         let (ours, theirs) = (self.number(place, ours)?, self.number(place, theirs)?);
         (theirs > 0.0).then(|| ours / theirs)
+    }
+
+    /// The better relay by theirs, at the same place.
+    fn by_relay(&self, place: Place<'_>, theirs: &str, better: fn(f64, f64) -> f64) -> Option<f64> {
+        RELAYS.iter().filter_map(|relay| self.ratio(place, relay, theirs)).reduce(better)
     }
 
     /// How long round trips were waited for of which none came back.
@@ -368,6 +422,22 @@ mod tests {
     fn a_goal_is_met_when_every_part_is_within_the_bound() {
         let reached = "16 B: 0.7 ×, 100 B: 0.8 ×, 1 KB: 0.71 ×, 8 KB: 0.6 ×".to_owned();
         assert_eq!(verdict(&figures(&[70.0, 80.0, 71.0, 60.0]), WHAT), (Verdict::Met, reached));
+    }
+
+    #[test]
+    fn beside_a_goal_stands_what_tcp_and_the_better_relay_reach() {
+        let mut figures = figures(&[70.0]);
+        let beside = |figures: &Figures| {
+            let goal = judge(figures).into_iter().find(|g| g.what == WHAT).unwrap();
+            (goal.by_tcp, goal.by_relay)
+        };
+        assert_eq!(beside(&figures), (String::new(), String::new()));
+        figures.push("round-trip", GROUP_TCP, "bare", 16.0, "p50_us", 68.0);
+        figures.push("round-trip", "relay", "bare", 16.0, "p50_us", 66.0);
+        figures.push("round-trip", "relay-gathers", "bare", 16.0, "p50_us", 82.0);
+        let (by_tcp, by_relay) = beside(&figures);
+        assert_eq!(by_tcp, "16 B: 0.68 ×, 100 B: –, 1 KB: –, 8 KB: –");
+        assert_eq!(by_relay, "16 B: 0.66 ×, 100 B: –, 1 KB: –, 8 KB: –");
     }
 
     #[test]

@@ -99,6 +99,7 @@ pub(crate) struct Compare {
     args: CompareArgs,
     load: PathBuf,
     systems: Vec<Box<dyn System>>,
+    relays: Vec<Box<dyn System>>,
     begun: Instant,
 }
 
@@ -111,7 +112,8 @@ impl Compare {
         };
         let load = load.canonicalize().with_context(|| format!("{}: is it built?", load.display()))?;
         let mut systems = system::all(&args.sgc, &args.peers)?;
-        let mut names: Vec<_> = systems.iter().map(|system| system.name()).collect();
+        let mut relays = system::relays();
+        let mut names: Vec<_> = systems.iter().chain(&relays).map(|system| system.name()).collect();
         names.extend(system::CONFIGURED.map(str::to_owned));
         names.push(tcp::NAME.to_owned());
         for pattern in &args.systems {
@@ -121,7 +123,9 @@ impl Compare {
                 names.join(", ")
             );
         }
-        systems.retain(|system| is_among(&args.systems, &system.name()));
+        for some in [&mut systems, &mut relays] {
+            some.retain(|system| is_among(&args.systems, &system.name()));
+        }
         if args.quick && args.systems.is_empty() {
             systems.retain(|system| !system.name().starts_with("sgc-") || QUICK.contains(&&*system.name()));
         }
@@ -129,12 +133,17 @@ impl Compare {
             let names: Vec<_> = TABLES.iter().map(|(name, _)| *name).collect();
             ensure!(names.contains(&&**only), "no table {only:?}: {}", names.join(", "));
         }
-        Ok(Self { args, load, systems, begun: Instant::now() })
+        Ok(Self { args, load, systems, relays, begun: Instant::now() })
     }
 
     /// What is compared in this run.
     pub(crate) fn systems(&self) -> &[Box<dyn System>] {
         &self.systems
+    }
+
+    /// The floor of what is compared, for tables of round trips and rates.
+    pub(crate) fn relays(&self) -> &[Box<dyn System>] {
+        &self.relays
     }
 
     /// Those that a table has, of what was asked for; what it has not is said. Who asks for systems by name gets them.

@@ -40,9 +40,19 @@ impl Breadth {
     }
 }
 
+/// The floor of round trips; see [`super::system::relays`].
+pub(crate) const RELAY: &str = "relay";
+
 /// Those that goals compare where the machine is the limit: they have a turn in each round, the others in the first.
-const OFTEN: [&str; 5] =
-    ["direct", "zenoh-tcp", "sgc-quic-group", "sgc-quic-standard", "sgc-quic-group-router"];
+const OFTEN: [&str; 7] = [
+    "direct",
+    RELAY,
+    "relay-gathers",
+    "zenoh-tcp",
+    "sgc-quic-group",
+    "sgc-quic-standard",
+    "sgc-quic-group-router",
+];
 pub(crate) const ROUNDS_MAX: usize = 3;
 
 /// How often a system has its turn.
@@ -76,7 +86,7 @@ pub(crate) fn together<T>(kind: &PathKind, who: Vec<T>, name: impl Fn(&T) -> Str
 
 /// Whether kernel TCP carries it.
 fn is_by_tcp(system: &str) -> bool {
-    system.split('-').any(|word| ["tcp", "tls"].contains(&word)) || system == tcp::NAME
+    system.split('-').any(|word| ["tcp", "tls"].contains(&word)) || [tcp::NAME, RELAY].contains(&system)
 }
 
 fn chunks<T>(all: Vec<T>, most: usize) -> Vec<Vec<T>> {

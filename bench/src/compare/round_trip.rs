@@ -41,7 +41,10 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
         let breadth = if matches!(kind, PathKind::Bare) { Breadth::Whole } else { Breadth::Cross };
         let why = "the path says how long it takes there, and hardly the suite";
         let systems = compare.systems_of(breadth, &format!("round-trip on {}", kind.name()), why, figures);
-        let mut who: Vec<_> = systems.into_iter().map(Who::System).collect();
+        // Gathering is for rates.
+        let is_in = |relay: &&dyn System| matches!(kind, PathKind::Bare) || relay.name() == plan::RELAY;
+        let relays = compare.relays().iter().map(|relay| &**relay).filter(is_in);
+        let mut who: Vec<_> = systems.into_iter().chain(relays).map(Who::System).collect();
         who.extend(compare.wants(tcp::NAME).then_some(Who::Tcp));
         let mut samples = BTreeMap::new();
         for round in 0..compare.rounds() {

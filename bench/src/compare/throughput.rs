@@ -28,11 +28,12 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     let why = "what a suite and what a transport costs at other sizes is in the rows of their own";
     let what = format!("throughput at other sizes than {SIZE_ASKED} B");
     let others = compare.systems_of(Breadth::Cross, &what, why, figures);
-    let others: Vec<_> = others.into_iter().map(System::name).collect();
+    let relays = compare.relays();
+    let others: Vec<_> = others.into_iter().chain(relays.iter().map(|r| &**r)).map(System::name).collect();
     Round::all(compare, figures, "throughput", compare.rounds(), |round| {
         let number = round.number;
         let has_turn = |name: &str| number < plan::rounds(&PathKind::Bare, name);
-        for system in compare.systems().iter().filter(|system| has_turn(&system.name())) {
+        for system in compare.systems().iter().chain(relays).filter(|system| has_turn(&system.name())) {
             let name = system.name();
             let is_measured = |size| size == SIZE_ASKED || (number == 0 && others.contains(&name));
             for size in SIZES.into_iter().filter(|size| is_measured(*size)) {

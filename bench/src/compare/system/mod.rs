@@ -1,6 +1,7 @@
 //! What is compared: ways to join the DDS networks of two places. A system is a file here and a row of [`all`].
 
 mod direct;
+mod relay;
 mod security;
 mod sgc;
 mod wireguard;
@@ -124,6 +125,11 @@ pub(crate) fn all(sgc: &Path, peers: &Peers) -> Result<Vec<Box<dyn System>>> {
     systems.extend(zenoh::all(&peers.zenoh_bridge).map(|system| Box::new(system) as Box<dyn System>));
     systems.extend(sgc::all(sgc)?.into_iter().map(|system| Box::new(system) as Box<dyn System>));
     Ok(systems)
+}
+
+/// What is no system for users, but about the least that programs between two networks take; in tables of round trips and rates.
+pub(crate) fn relays() -> Vec<Box<dyn System>> {
+    relay::all().map(|relay| Box::new(relay) as Box<dyn System>).into()
 }
 
 /// Systems that [`configured`] has beside those of [`all`].
