@@ -16,11 +16,10 @@ use super::wire::Wire;
 use super::{Shared, State};
 use crate::error::{CloseReason, LinkError, ProtocolError};
 
-/// Bytes fetched from the machine at once, at least and at most: what is urgent waits for no more. Between, a part of the
-/// window: what is written at once becomes TLS records of up to 16 KB, which can be read when the last byte is there,
-/// and on a thin path that takes long.
+/// Bytes fetched from the machine at once, at least and at most: what is urgent waits for no more. Between, what the path
+/// delivers in little time: what is written at once becomes TLS records of up to 16 KB, which can be read when the last byte
+/// is there, and on a thin path that takes long.
 const BATCH_BYTES: (u64, u64) = (2 << 10, 64 << 10);
-const BATCH_PART: u64 = 16;
 /// Bytes read at once.
 const READ_BYTES: usize = 64 << 10;
 /// Rounds of one wake-up, so that one link leaves time for others.
@@ -97,7 +96,7 @@ impl Driver {
                 }
                 if self.out.is_empty() {
                     let (least, most) = BATCH_BYTES;
-                    let batch = (state.mux.window_bytes() / BATCH_PART).clamp(least, most);
+                    let batch = state.mux.bytes_together().clamp(least, most);
                     state.mux.poll_transmit(now, batch, &mut self.out);
                     shared.drain_events(&mut state);
                 }

@@ -682,6 +682,11 @@ impl Mux {
         self.window.bytes()
     }
 
+    /// How much is written together.
+    pub(crate) fn bytes_together(&self) -> u64 {
+        self.window.together()
+    }
+
     // What comes in.
 
     fn next_head(&mut self, bytes: &mut &[u8]) -> Result<Option<Head>, StreamViolation> {

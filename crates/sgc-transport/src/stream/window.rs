@@ -9,6 +9,9 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+/// What is written together takes about so long on the path, or is this part of what may be under way.
+const TOGETHER: Duration = Duration::from_millis(2);
+const TOGETHER_PART: u64 = 16;
 /// How long bytes may queue on the path.
 const QUEUE_TARGET: Duration = Duration::from_millis(12);
 /// Least bytes that may be under way.
@@ -137,6 +140,13 @@ impl Window {
         self.bytes
     }
 
+    /// How many of them are written together: what the path delivers in [`TOGETHER`], and a part of them at least.
+    pub(crate) fn together(&self) -> u64 {
+        let rtt = self.rtt.unwrap_or(self.handshake).max(TOGETHER);
+        let delivered = self.bytes as f64 * TOGETHER.as_secs_f64() / rtt.as_secs_f64();
+        (delivered as u64).max(self.bytes / TOGETHER_PART)
+    }
+
     /// Smoothed and shortest round trip.
     pub(crate) fn rtt(&self) -> (Duration, Duration) {
         (self.rtt.unwrap_or(self.handshake), self.rtt_min.map_or(self.handshake, |(rtt, _)| rtt))
@@ -241,6 +251,24 @@ mod tests {
             assert!(window.on_pong(number, now));
         }
         (sent as f64, worst)
+    }
+
+    #[test]
+    fn a_short_path_is_given_much_at_once_and_a_thin_one_little() {
+        let now = Instant::now();
+        let measured = |rtt: Duration| {
+            let mut window = Window::new(16 << 20);
+            window.on_written(20_000);
+            let ping = window.ping(now).unwrap();
+            assert!(window.on_pong(ping, now + rtt));
+            window
+        };
+        let short = measured(Duration::from_micros(200));
+        assert_eq!(short.together(), short.bytes());
+        let thin = measured(Duration::from_millis(100));
+        assert_eq!(thin.together(), thin.bytes() / TOGETHER_PART);
+        let between = measured(Duration::from_millis(8));
+        assert_eq!(between.together(), between.bytes() / 4);
     }
 
     #[test]
