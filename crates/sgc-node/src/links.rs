@@ -11,7 +11,7 @@ use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
     AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
-    Refusal,
+    Refusal, prompt,
 };
 use sgc_trust::CertError;
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
@@ -540,6 +540,10 @@ impl Inflow {
             match flow.recv().await {
                 Ok(Some(packet)) if !self.belongs(&packet) => return flow.stop(FlowEnd::Unwanted),
                 Ok(Some(packet)) => match self.admit(&packet).await {
+                    // One that comes by itself goes on by itself: nothing of what it wakes has anything else to do.
+                    Admission::Granted if flow.is_at_rest() && packet.header.fragments() == 1 => {
+                        prompt::poll_at_hand(data.forward(id, packet)).await;
+                    }
                     Admission::Granted => data.forward(id, packet).await,
                     Admission::OverRate if packet.header.fragments() == 1 => {}
                     Admission::OverRate => return flow.stop(FlowEnd::Stale),

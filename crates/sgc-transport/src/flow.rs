@@ -148,6 +148,11 @@ impl FlowRx {
         self.tell(end);
     }
 
+    /// True if nothing has been received of what follows.
+    pub fn is_at_rest(&self) -> bool {
+        self.pieces.is_empty()
+    }
+
     async fn next(&mut self) -> Result<Option<Packet>, FlowError> {
         loop {
             match self.state {

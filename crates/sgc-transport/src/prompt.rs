@@ -8,7 +8,7 @@
 use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::fmt;
-use std::future::Future;
+use std::future::{Future, poll_fn};
 use std::marker::PhantomData;
 use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -157,12 +157,13 @@ impl Drop for Runner {
     }
 }
 
-/// While it is there, tasks that this thread wakes wait for its end, and then this thread runs them. Not for threads of the
-/// runtime.
+/// While it is there, tasks that this thread wakes wait for its end, and then this thread runs them. For threads of the
+/// runtime there is [`poll_at_hand`].
 pub struct AtHand<'a> {
     /// Whether this thread collects already: then the outer one runs them.
     is_inner: bool,
-    _runtime: EnterGuard<'a>,
+    /// None where the runtime is around it.
+    _runtime: Option<EnterGuard<'a>>,
     /// It is of one thread.
     _thread: PhantomData<*const ()>,
 }
@@ -170,12 +171,16 @@ pub struct AtHand<'a> {
 impl<'a> AtHand<'a> {
     /// Begins to collect, in this runtime.
     pub fn begin(runtime: &'a Handle) -> Self {
+        Self::collect(Some(runtime.enter()))
+    }
+
+    fn collect(runtime: Option<EnterGuard<'a>>) -> Self {
         let is_inner = AT_HAND.with_borrow_mut(|at_hand| {
             let is_inner = at_hand.is_some();
             at_hand.get_or_insert_default();
             is_inner
         });
-        Self { is_inner, _runtime: runtime.enter(), _thread: PhantomData }
+        Self { is_inner, _runtime: runtime, _thread: PhantomData }
     }
 }
 
@@ -197,6 +202,16 @@ impl Drop for AtHand<'_> {
         }
         hand_over(AT_HAND.take());
     }
+}
+
+/// Waits for something in a task of the runtime, whose thread runs what that wakes at once, instead of in its turn.
+pub async fn poll_at_hand<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    poll_fn(|cx| {
+        let _at_hand = AtHand::collect(None);
+        future.as_mut().poll(cx)
+    })
+    .await
 }
 
 /// Waits for something on a thread outside of the runtime. What it has at hand is the runtime's from then on, unless nothing
@@ -324,6 +339,19 @@ mod tests {
         assert_eq!(heard.lock().unwrap().len(), 1, "otherwise the runtime does");
         runtime.block_on(tokio::task::yield_now());
         assert_eq!(heard.lock().unwrap().len(), 2);
+    }
+
+    #[test]
+    fn a_task_of_the_runtime_runs_at_once_what_it_wakes() {
+        let runtime = runtime();
+        let (bell, heard) = listening(&runtime);
+        runtime.block_on(async {
+            bell.notify_one();
+            assert!(heard.lock().unwrap().is_empty(), "otherwise it is the runtime's turn");
+            tokio::task::yield_now().await;
+            poll_at_hand(async { bell.notify_one() }).await;
+            assert_eq!(heard.lock().unwrap().len(), 2);
+        });
     }
 
     #[test]
