@@ -44,6 +44,10 @@ impl Default for FlowLimits {
     }
 }
 
+/// Bytes of reliable packets that are written together if they wait together. That is less than the path has under way where
+/// it is fast, and where it is thin the link takes them piece by piece.
+const TOGETHER_BYTES_MAX: usize = 16 << 10;
+
 /// A packet, and since when it waits.
 type Waiting = (Packet, Instant);
 
@@ -84,24 +88,8 @@ impl OutFlow {
                 reliable: None,
                 messages: VecDeque::new(),
             };
-            // Of the message that is being sent, and what came between.
-            let mut taken = VecDeque::new();
-            while let Some((packet, since)) = task.next(&mut taken).await {
-                // Judged by its beginning: a large message that is under way goes on.
-                let begins = !packet.header.reliable && packet.header.index == 0;
-                let stale = begins && since.elapsed() > limits.max_age;
-                let newer = limits.newest_only && task.has_newer(&packet, &mut taken);
-                if task.is_superseded(&packet) || newer || stale {
-                    sender.abandon(&packet);
-                    continue;
-                }
-                if begins && !packet.header.is_last() {
-                    task.take_rest(&packet, &mut taken);
-                }
-                if let Err(error) = sender.send(packet).await {
-                    debug!(name = %name.short(), %error, "no more is sent over this link");
-                    break;
-                }
+            if let Err(error) = task.empty(&mut sender, limits).await {
+                debug!(name = %name.short(), %error, "no more is sent over this link");
             }
             task.close();
             sender.finish().await;
@@ -172,11 +160,38 @@ impl OutFlow {
         let _ = self.ended.subscribe().wait_for(|ended| *ended).await;
     }
 
-    async fn next(&self, taken: &mut VecDeque<Waiting>) -> Option<Waiting> {
-        match taken.pop_front() {
-            Some(next) => Some(next),
-            None => self.queue.pop().await,
+    /// Sends what is queued until the flow is closed and empty, or the link ends.
+    async fn empty(&self, sender: &mut Sender, limits: FlowLimits) -> Result<(), LinkError> {
+        // Of the message that is being sent, and what came between.
+        let mut taken = VecDeque::new();
+        loop {
+            let next = match self.at_hand(&mut taken) {
+                Some(next) => Some(next),
+                None => {
+                    // Nothing comes along.
+                    sender.flush().await?;
+                    self.queue.pop().await
+                }
+            };
+            let Some((packet, since)) = next else { return Ok(()) };
+            // Judged by its beginning: a large message that is under way goes on.
+            let begins = !packet.header.reliable && packet.header.index == 0;
+            let stale = begins && since.elapsed() > limits.max_age;
+            let newer = limits.newest_only && self.has_newer(&packet, &mut taken);
+            if self.is_superseded(&packet) || newer || stale {
+                sender.abandon(&packet);
+                continue;
+            }
+            if begins && !packet.header.is_last() {
+                self.take_rest(&packet, &mut taken);
+            }
+            sender.send(packet).await?;
         }
+    }
+
+    /// What is sent next, if it is there.
+    fn at_hand(&self, taken: &mut VecDeque<Waiting>) -> Option<Waiting> {
+        taken.pop_front().or_else(|| self.queue.try_pop())
     }
 
     /// Takes what is queued of a message that begins, so that newer ones do not push out its end while it is sent: on a
@@ -249,12 +264,27 @@ struct Sender {
 }
 
 impl Sender {
+    /// Sends a packet, or keeps a reliable one for the next [`Self::flush`].
     async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
         if packet.header.index == 0 {
             self.choose().await?;
         }
-        match self.send_by(packet).await {
-            // The lane ended and the link did not: the next message goes over that.
+        if !packet.header.reliable {
+            self.flush().await?;
+        }
+        let sent = self.send_by(packet).await;
+        self.outlive_lane(sent)
+    }
+
+    /// Sends what is kept.
+    async fn flush(&mut self) -> Result<(), LinkError> {
+        let sent = self.flush_by().await;
+        self.outlive_lane(sent)
+    }
+
+    /// If the lane ended and the link did not, the next message goes over that.
+    fn outlive_lane(&mut self, sent: Result<(), LinkError>) -> Result<(), LinkError> {
+        match sent {
             Err(error) if self.lane.is_some() && !error.is_link_alive() => {
                 debug!(name = %self.name.short(), %error, "a lane ended; its topic shares the link");
                 self.take_link();
@@ -304,14 +334,8 @@ impl Sender {
                 Some(flow) => flow,
                 none => none.insert(self.by.open_flow(header.class).await?),
             };
-            return match flow.send_as(&packet, label).await {
-                // The far side gave up this flow, not the link: begin another.
-                Err(LinkError::FlowStopped(_)) => {
-                    self.reliable = None;
-                    Ok(())
-                }
-                other => other,
-            };
+            flow.queue_as(&packet, label);
+            return if flow.queued_bytes() < TOGETHER_BYTES_MAX { Ok(()) } else { self.flush_by().await };
         }
         if header.fragments() == 1
             && self.by.datagram_max().is_some_and(|max| packet.encoded_bytes_as(label) <= max)
@@ -352,6 +376,18 @@ impl Sender {
             }
         }
         Ok(())
+    }
+
+    async fn flush_by(&mut self) -> Result<(), LinkError> {
+        let Some(flow) = &mut self.reliable else { return Ok(()) };
+        match flow.flush().await {
+            // The far side gave up this flow, not the link: begin another.
+            Err(LinkError::FlowStopped(_)) => {
+                self.reliable = None;
+                Ok(())
+            }
+            other => other,
+        }
     }
 
     async fn send_alone(&mut self, packet: &Packet) -> Result<(), LinkError> {
@@ -416,7 +452,7 @@ mod tests {
             assert!(flow.push(packet(1, index)).await.is_none());
         }
         let mut taken = VecDeque::new();
-        let (first, _) = flow.next(&mut taken).await.unwrap();
+        let (first, _) = flow.at_hand(&mut taken).unwrap();
         assert!(!flow.is_superseded(&first));
         flow.take_rest(&first, &mut taken);
         for seq in 2..1000 {
@@ -425,14 +461,14 @@ mod tests {
             }
         }
         for index in 1..3 {
-            let (next, _) = flow.next(&mut taken).await.unwrap();
+            let (next, _) = flow.at_hand(&mut taken).unwrap();
             assert_eq!((next.header.seq, next.header.index), (1, index));
             assert!(!flow.is_superseded(&next));
         }
         // Of those that wait, only the newest is begun.
         let mut begun = vec![];
         while flow.queue.bytes() > 0 {
-            let (next, _) = flow.next(&mut taken).await.unwrap();
+            let (next, _) = flow.at_hand(&mut taken).unwrap();
             if !flow.is_superseded(&next) && next.header.index == 0 {
                 begun.push(next.header.seq);
             }

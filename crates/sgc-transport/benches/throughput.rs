@@ -21,6 +21,8 @@ const FRAGMENT: usize = 16_384;
 const FRAGMENTS: usize = 800;
 /// Messages of 1 KB of a round.
 const MESSAGES: usize = 40_000;
+/// Bytes that are queued before they are sent, where packets leave together.
+const TOGETHER: usize = 16 << 10;
 
 fn main() {
     let (router, arm) = support::identities();
@@ -37,30 +39,35 @@ fn main() {
             let (near, far) = tokio::join!(dialer.dial(&url), listener.accept());
             links.push((congestion, near.unwrap(), far.unwrap().unwrap(), dialer, listener));
         }
-        println!("{:<10}{:>14}{:>14}", "", "13 MB, MB/s", "1 KB, MB/s");
-        let mut rates = vec![[vec![], vec![]]; links.len()];
+        println!("{:<10}{:>14}{:>14}{:>20}", "", "13 MB, MB/s", "1 KB, MB/s", "1 KB together, MB/s");
+        let mut rates = vec![[vec![], vec![], vec![]]; links.len()];
         for _ in 0..ROUNDS {
             for (n, (_, near, far, ..)) in links.iter().enumerate() {
-                rates[n][0].push(measure(near, far, FRAGMENT, FRAGMENTS).await);
-                rates[n][1].push(measure(near, far, 1000, MESSAGES).await);
+                rates[n][0].push(measure(near, far, FRAGMENT, FRAGMENTS, 0).await);
+                rates[n][1].push(measure(near, far, 1000, MESSAGES, 0).await);
+                rates[n][2].push(measure(near, far, 1000, MESSAGES, TOGETHER).await);
             }
         }
         for ((congestion, near, ..), rates) in links.iter().zip(rates) {
-            let [large, small] = rates.map(median);
-            println!("{:<10}{large:>14.0}{small:>14.0}", congestion.to_string());
+            let [large, small, together] = rates.map(median);
+            println!("{:<10}{large:>14.0}{small:>14.0}{together:>20.0}", congestion.to_string());
             near.close(CloseReason::Goodbye);
         }
     });
 }
 
-/// Megabytes a second of so many packets, over a flow of their own, until the last has arrived.
-async fn measure(near: &AnyLink, far: &AnyLink, bytes: usize, packets: usize) -> f64 {
+/// Megabytes a second of so many packets, over a flow of their own, until the last has arrived. Up to `together` bytes of them
+/// are sent at once.
+async fn measure(near: &AnyLink, far: &AnyLink, bytes: usize, packets: usize, together: usize) -> f64 {
     let packet = support::packet(1, bytes, 0);
     let begun = Instant::now();
     let mut flow = near.open_flow(Class::Default).await.unwrap();
     let sender = tokio::spawn(async move {
         for _ in 0..packets {
-            flow.send(&packet).await.unwrap();
+            flow.queue_as(&packet, None);
+            if flow.queued_bytes() > together {
+                flow.flush().await.unwrap();
+            }
         }
         flow.finish().await.unwrap();
     });

@@ -8,21 +8,25 @@ use bytes::Bytes;
 use sgc_wire::{Label, Packet, Slab};
 
 use crate::error::{FlowEnd, FlowError, LinkError};
-use crate::framing::{Pieces, packet_head};
+use crate::framing::{Gathered, Pieces, packet_head};
 use crate::labels::Labels;
 use crate::{quic, stream};
 
 /// Payloads up to this are copied behind their header: what that costs is less than what a transport takes to keep
 /// another piece (quinn looks through all that are not acknowledged for each that it sends).
-const JOINED_PAYLOAD_BYTES_MAX: usize = 1024;
+const JOINED_PAYLOAD_BYTES_MAX: usize = 2048;
 
-/// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once.
+/// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once; what was
+/// only queued is not sent.
 #[derive(Debug)]
 pub struct FlowTx {
     outlet: Outlet,
     has_begun: bool,
     /// For what stands before payloads.
     heads: Slab,
+    /// The end of what is queued.
+    gathered: Gathered,
+    queued_bytes: usize,
 }
 
 #[derive(Debug)]
@@ -43,7 +47,8 @@ macro_rules! each {
 
 impl FlowTx {
     pub(crate) fn new(outlet: Outlet) -> Self {
-        Self { outlet, has_begun: false, heads: Slab::default() }
+        let (heads, gathered) = (Slab::default(), Gathered::default());
+        Self { outlet, has_begun: false, heads, gathered, queued_bytes: 0 }
     }
 
     /// Sends a packet; waits while the peer or the network takes no more. The payload is not copied, unless it is
@@ -57,24 +62,59 @@ impl FlowTx {
     /// Sends a packet with this label in place of its name, if there is one: the peer must have said that it knows
     /// what it stands for. Otherwise as [`Self::send`].
     pub async fn send_as(&mut self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
-        let pieces = packet.payload.0.iter().filter(|p| !joined && !p.is_empty()).cloned();
-        each!(Outlet, &mut self.outlet, outlet => {
-            outlet.flush().await?;
-            let head = packet_head(packet, label, !self.has_begun, joined, &mut self.heads);
-            self.has_begun = true;
-            outlet.queue(std::iter::once(head).chain(pieces));
-            outlet.flush().await
-        })
+        self.flush().await?;
+        self.queue_as(packet, label);
+        self.flush().await
     }
 
-    /// Ends the flow after what was sent, which the transport still delivers.
+    /// Keeps a packet, in the form of [`Self::send_as`], to be sent with others at the next [`Self::flush`]: many short ones
+    /// take the transport hardly more than one. Whoever queues bounds it, by [`Self::queued_bytes`].
+    pub fn queue_as(&mut self, packet: &Packet, label: Option<Label>) {
+        let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
+        let head = packet_head(packet, label, !self.has_begun, joined, &mut self.heads);
+        self.has_begun = true;
+        self.queued_bytes += head.len();
+        let before = self.gathered.push(head);
+        self.queue(before);
+        if !joined {
+            self.queued_bytes += packet.payload.len();
+            self.settle();
+            self.queue(packet.payload.0.iter().filter(|piece| !piece.is_empty()).cloned());
+        }
+    }
+
+    /// Bytes that were queued since all that was queued had been sent.
+    pub fn queued_bytes(&self) -> usize {
+        self.queued_bytes
+    }
+
+    /// Sends what is queued; waits while the peer or the network takes no more. If the future is dropped, the next one goes
+    /// on where it stood.
+    pub async fn flush(&mut self) -> Result<(), LinkError> {
+        self.settle();
+        each!(Outlet, &mut self.outlet, outlet => outlet.flush().await?);
+        self.queued_bytes = 0;
+        Ok(())
+    }
+
+    fn settle(&mut self) {
+        let gathered = self.gathered.take();
+        self.queue(gathered);
+    }
+
+    fn queue(&mut self, pieces: impl IntoIterator<Item = Bytes>) {
+        each!(Outlet, &mut self.outlet, outlet => outlet.queue(pieces.into_iter()));
+    }
+
+    /// Ends the flow after what was sent or queued, which the transport still delivers.
     pub async fn finish(mut self) -> Result<(), LinkError> {
+        self.settle();
         each!(Outlet, &mut self.outlet, outlet => outlet.finish().await)
     }
 
-    /// Ends the flow after what was sent; the result waits until the far side has all of it, or wants no more.
+    /// Ends the flow after what was sent or queued; the result waits until the far side has all of it, or wants no more.
     pub async fn finish_slowly(mut self) -> Result<Delivery, LinkError> {
+        self.settle();
         each!(Outlet, &mut self.outlet, outlet => outlet.finish().await?);
         Ok(Delivery { outlet: self.outlet })
     }

@@ -176,10 +176,10 @@ pub(crate) fn packet_head(
     is_first: bool,
     joined: bool,
     slab: &mut Slab,
-) -> Bytes {
+) -> BytesMut {
     let payload_bytes = if joined { packet.payload.len() } else { 0 };
     let header_bytes = packet.header.encoded_bytes_as(label);
-    let mut head = slab.room(1 + LENGTH_BYTES + header_bytes + payload_bytes);
+    let mut head = slab.room(usize::from(is_first) + LENGTH_BYTES + header_bytes + payload_bytes);
     if is_first {
         head.put_u8(FLOW_VERSION);
     }
@@ -188,7 +188,25 @@ pub(crate) fn packet_head(
     if joined {
         packet.payload.copy_into(&mut head);
     }
-    head.freeze()
+    head
+}
+
+/// Bytes that are to be written one behind the other; those that lie so in memory, too, are one piece.
+#[derive(Debug, Default)]
+pub(crate) struct Gathered(BytesMut);
+
+impl Gathered {
+    /// Adds the next. What lies elsewhere and came before is a piece by itself.
+    pub(crate) fn push(&mut self, next: BytesMut) -> Option<Bytes> {
+        let before = if self.0.as_ptr_range().end == next.as_ptr() { None } else { self.take() };
+        self.0.unsplit(next);
+        before
+    }
+
+    /// What there is.
+    pub(crate) fn take(&mut self) -> Option<Bytes> {
+        (!self.0.is_empty()).then(|| std::mem::take(&mut self.0).freeze())
+    }
 }
 
 /// A packet in one piece, as a datagram carries it, in memory of `slab`.
@@ -308,6 +326,28 @@ mod tests {
         assert_eq!(got.payload.0.len(), 2);
         let inside = stream.as_ptr() as usize..stream.as_ptr() as usize + stream.len();
         assert!(got.payload.0.iter().all(|b| inside.contains(&(b.as_ptr() as usize))));
+    }
+
+    #[test]
+    fn short_packets_behind_each_other_are_one_piece() {
+        let p = packet(&[7; 300], None);
+        let (mut slab, mut gathered, mut pieces) = (Slab::default(), Gathered::default(), Vec::new());
+        let mut stream = Vec::new();
+        for n in 0..100 {
+            let head = packet_head(&p, None, n == 0, true, &mut slab);
+            stream.extend_from_slice(&head);
+            pieces.extend(gathered.push(head));
+        }
+        pieces.extend(gathered.take());
+        assert!(gathered.take().is_none());
+        assert_eq!(pieces.concat(), stream);
+        // As many as share memory there.
+        assert!(pieces.len() <= 100 / 8 + 2, "{}", pieces.len());
+        // Memory that was freed may be handed out where something else ends: that is one piece as well.
+        let mut apart = Gathered::default();
+        assert!(apart.push(BytesMut::from(&b"a"[..])).is_none());
+        let before = apart.push(BytesMut::from(&b"b"[..]));
+        assert_eq!([before.unwrap_or_default(), apart.take().unwrap()].concat(), b"ab");
     }
 
     #[test]

@@ -26,6 +26,7 @@ each_transport! {
         control_frames_go_both_ways_in_order
         thirteen_megabytes_arrive_intact_and_in_order
         flows_do_not_wait_for_each_other
+        what_is_queued_leaves_together_and_in_order
         a_flow_given_up_inside_of_a_packet_does_not_pass_for_finished
         either_end_can_end_a_flow
         datagrams_carry_small_packets
@@ -246,6 +247,43 @@ async fn flows_do_not_wait_for_each_other(scheme: &str) {
     };
     let ((), count) = soon(async { tokio::join!(finish, drain) }).await;
     assert!(count >= 2, "{count}");
+}
+
+async fn what_is_queued_leaves_together_and_in_order(scheme: &str) {
+    let (near, far) = pair_on(scheme, LinkOptions::default()).await;
+    let sizes = [0, 1, 100, 2048, 2049, 3, 16 << 10, 5];
+    let of = |seq: usize| packet(seq as u64, Bytes::from(vec![seq as u8; sizes[seq % sizes.len()]]));
+    let mut tx = near.open_flow(Class::Default).await.unwrap();
+    for seq in 0..100 {
+        let before = tx.queued_bytes();
+        tx.queue_as(&of(seq), None);
+        assert!(tx.queued_bytes() >= before + of(seq).encoded_bytes());
+        match seq % 30 {
+            20 => tx.flush().await.unwrap(),
+            29 => tx.send(&of(1000)).await.unwrap(),
+            _ => continue,
+        }
+        assert_eq!(tx.queued_bytes(), 0);
+    }
+    // What is queued at the end belongs to it.
+    tx.finish().await.unwrap();
+    let mut rx = soon(far.accept_flow()).await.unwrap();
+    let mut seqs = Vec::new();
+    while let Some(got) = soon(rx.recv()).await.unwrap() {
+        let seq = got.header.seq as usize;
+        assert_eq!(joined(&got.payload), joined(&of(seq).payload));
+        seqs.push(seq);
+    }
+    let sent = (0..100).flat_map(|seq| std::iter::once(seq).chain((seq % 30 == 29).then_some(1000)));
+    assert_eq!(seqs, sent.collect::<Vec<_>>());
+
+    let mut tx = near.open_flow(Class::Default).await.unwrap();
+    tx.send(&of(1)).await.unwrap();
+    tx.queue_as(&of(2), None);
+    drop(tx);
+    let mut rx = soon(far.accept_flow()).await.unwrap();
+    assert_eq!(soon(rx.recv()).await.unwrap().unwrap().header.seq, 1);
+    assert!(soon(rx.recv()).await.unwrap().is_none(), "it was never sent");
 }
 
 async fn a_flow_given_up_inside_of_a_packet_does_not_pass_for_finished(scheme: &str) {
