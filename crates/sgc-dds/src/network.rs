@@ -64,6 +64,7 @@ pub(crate) struct Participant {
     domain_id: u32,
     tag: Option<String>,
     pace: Pace,
+    holds: Pace,
 }
 
 impl CycloneNetwork {
@@ -91,6 +92,7 @@ impl CycloneNetwork {
             domain_id: config.domain,
             tag: config.tag.clone(),
             pace: Pace::new(),
+            holds: Pace::new(),
         };
         let participant = Arc::new(participant);
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
@@ -188,6 +190,11 @@ impl Participant {
     /// How much its receiving threads handle themselves.
     pub(crate) fn pace(&self) -> &Pace {
         &self.pace
+    }
+
+    /// How much they wait for readers' threads.
+    pub(crate) fn holds(&self) -> &Pace {
+        &self.holds
     }
 
     /// True if endpoints made by SGC are to be ignored.

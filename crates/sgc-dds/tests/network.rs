@@ -416,6 +416,38 @@ fn source_time_and_writer_are_preserved() {
 }
 
 #[test]
+fn one_that_blocks_delays_no_other_reader_where_writers_are_to_wait_either() {
+    const SAMPLES: usize = 2000;
+    let (ros, sgc) = (open(99, None), open(99, Some("arm-1")));
+    let (release, gate) = channel::<()>();
+    let (seen_tx, seen) = channel();
+    let all = with(spec("stuck_all"), |qos| qos.history = History::KeepAll);
+    let _stuck = sgc
+        .create_reader(
+            &all,
+            Box::new(move |sample: Sample| {
+                let _ = gate.recv();
+                let _ = seen_tx.send(sample.payload);
+            }),
+        )
+        .unwrap();
+    let (_free, free) = read(&sgc, &spec("free"));
+    let (w_stuck, w_free) = (writer(&ros, &all, 1), writer(&ros, &spec("free"), 1));
+    // More than are let gather, and fewer than may wait.
+    for i in 0..SAMPLES {
+        write(&w_stuck, &string_cdr(&format!("stuck {i}")));
+        if i % 20 == 0 {
+            write(&w_free, &string_cdr(&format!("free {i}")));
+            assert_eq!(next(&free).payload, padded(&string_cdr(&format!("free {i}"))));
+        }
+    }
+    drop(release);
+    for i in 0..SAMPLES {
+        assert_eq!(next(&seen), padded(&string_cdr(&format!("stuck {i}"))));
+    }
+}
+
+#[test]
 fn a_handler_that_blocks_delays_no_other_reader() {
     let (ros, sgc) = (open(82, None), open(82, Some("arm-1")));
     let (release, gate) = channel::<()>();
