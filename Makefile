@@ -18,7 +18,7 @@ help:
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
 	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
 	@echo '                 model-check (larger bounds)'
-	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, hours; ARGS="--quick" is minutes)'
+	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, most of an hour; ARGS="--quick" is minutes)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol: bench/README.md)'
