@@ -324,13 +324,7 @@ impl Run {
         for listener in &self.listeners {
             let talker = self.talkers.iter().find(|t| t.topic.name == listener.topic.name).unwrap();
             let (name, last) = (listener.name(), talker.last().unwrap());
-            // Seen once: Fast DDS handed out a message with a number and a time that nobody sent; `peers.rs` says more.
-            let (real, phantoms): (Vec<u64>, Vec<u64>) =
-                listener.got.iter().map(|(_, seq)| *seq).partition(|seq| *seq <= last);
-            if !phantoms.is_empty() {
-                say(&format!("THE PEER COUNTS WHAT NOBODY SENT: {name}: {phantoms:?}"));
-            }
-            let row = Row::of(real);
+            let row = Row::of(listener.got.iter().map(|(_, seq)| *seq));
             let sent = last + 1 - row.first;
             let share = row.received as f64 / sent as f64;
             report.push(format!(
