@@ -154,7 +154,10 @@ impl FakeDomain {
     }
 
     fn add(&self, network: &FakeRos, spec: &EndpointSpec, reader: Option<SampleHandler>) -> Guid {
-        let (guid, watchers, reader, missed) = {
+        let reader = reader.map(|r| Arc::new(Mutex::new(r)));
+        // Held until it has what it missed: what is written meanwhile comes behind that, as each writer's samples come in turn.
+        let handler = reader.as_ref().map(|r| r.lock().unwrap_or_else(PoisonError::into_inner));
+        let (guid, watchers, missed) = {
             let mut state = self.lock();
             state.next += 1;
             let kind = if reader.is_some() { EndpointKind::Reader } else { EndpointKind::Writer };
@@ -173,7 +176,6 @@ impl FakeDomain {
                 type_hash: spec.type_hash.clone(),
                 qos: spec.qos.clone(),
             };
-            let reader = reader.map(|r| Arc::new(Mutex::new(r)));
             let missed: Vec<_> = state
                 .endpoints
                 .values()
@@ -189,20 +191,19 @@ impl FakeDomain {
                 history: VecDeque::new(),
             };
             state.endpoints.insert(Guid(guid), endpoint);
-            (Guid(guid), state.watchers_of(network.network, network.tagged), reader, missed)
+            (Guid(guid), state.watchers_of(network.network, network.tagged), missed)
         };
+        if let Some(mut handler) = handler {
+            let last = missed.len().saturating_sub(1);
+            for (n, sample) in missed.into_iter().enumerate() {
+                handler.handle(Sample { more: n < last, ..sample });
+            }
+        }
         for watcher in watchers {
             let state = self.lock();
             let Some(endpoint) = state.endpoints.get(&guid).map(|e| e.discovered.clone()) else { break };
             drop(state);
             (watcher.lock().unwrap_or_else(PoisonError::into_inner))(DiscoveryEvent::Appeared(endpoint));
-        }
-        if let Some(reader) = reader {
-            let mut handler = reader.lock().unwrap_or_else(PoisonError::into_inner);
-            let last = missed.len().saturating_sub(1);
-            for (n, sample) in missed.into_iter().enumerate() {
-                handler.handle(Sample { more: n < last, ..sample });
-            }
         }
         guid
     }
