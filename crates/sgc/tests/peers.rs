@@ -90,8 +90,7 @@ impl Lab {
 
     /// A publisher at the robot and a subscriber at the desk, both matched: then `sent` messages, of which all from the
     /// first one heard on must arrive. A reader may be matched a moment before it knows, so that the first few may
-    /// be lost without anyone's fault; `wanted` must come. The subscriber may be matched before it says that it is ready: the
-    /// writer there stays for a while when its publisher has gone, and is the next one's, if it is alike.
+    /// be lost without anyone's fault; `wanted` must come.
     fn carries(&self, from: &str, to: &str, kind: &str, extra: &[&str], sent: u32, wanted: u32) {
         let what = format!("{kind} from {from} to {to}");
         let topic = format!("/{kind}");
@@ -105,8 +104,8 @@ impl Lab {
             talk.extend(["--size", if extra.contains(&"--timeout") { "13000000" } else { "1000000" }]);
         }
         let mut talker = self.peer(Site::Robot, from, "pub", &talk);
-        talker.wait("a match at the robot", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
-        listener.wait("a match at the desk", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
+        talker.wait_matched("a match at the robot");
+        listener.wait_matched("a match at the desk");
         talker.go();
         let summary = listener.summary();
         let count = |key: &str| summary[key].as_u64().unwrap();
@@ -151,8 +150,8 @@ fn a_subscriber_that_stands_still_for_a_moment_gets_what_its_publisher_keeps() {
     let sent = SENT.to_string();
     let talk = ["--count", &sent, "--rate", "20", "--size", "1000000", "--wait-go"];
     let mut talker = lab.peer(Site::Robot, "fastdds", "pub", &[&common[..], &talk].concat());
-    talker.wait("a match at the robot", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
-    listener.wait("a match at the desk", |e| e["event"] == "matched" && e["count"].as_u64() >= Some(1));
+    talker.wait_matched("a match at the robot");
+    listener.wait_matched("a match at the desk");
     talker.go();
     listener.wait("the first image", |e| e["event"] == "received");
     listener.signal(Signal::STOP);

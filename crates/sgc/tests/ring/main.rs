@@ -143,13 +143,12 @@ impl Run {
                 self.lab.peer(Node::ROBOT, "cyclone", "pub", &[&both[..], topic.talker, &control].concat());
             self.talkers.push(Talker::new(topic, peer));
         }
-        let is_match = |event: &Value| event["event"] == "matched" && event["count"].as_u64() >= Some(1);
         for talker in &mut self.talkers {
-            talker.peer.wait(&format!("a reader of {}", talker.topic.name), is_match);
+            talker.peer.wait_matched(&format!("a reader of {}", talker.topic.name));
         }
         for listener in &mut self.listeners {
             let what = format!("a writer of {}", listener.name());
-            listener.peer.wait(&what, is_match);
+            listener.peer.wait_matched(&what);
         }
         self.talkers.iter_mut().for_each(|talker| talker.peer.go());
         eventually("all that is sent comes", || {

@@ -212,6 +212,12 @@ impl Peer {
         }
     }
 
+    /// Waits until it is matched. Not after what else it reports: it may be matched before it says that it is ready, since a far
+    /// writer stays for a while when its publisher has gone, and is the next one's if that is alike.
+    pub(crate) fn wait_matched(&mut self, what: &str) {
+        self.wait(what, |event| event["event"] == "matched" && event["count"].as_u64() >= Some(1));
+    }
+
     /// Lets it go on: one line on its standard input.
     pub(crate) fn go(&mut self) {
         self.stdin.as_mut().unwrap().write_all(b"go\n").unwrap();

@@ -2,7 +2,6 @@
 
 use std::thread::sleep;
 
-use serde_json::Value;
 use sgc_testkit::netsim::Namespace;
 
 use crate::lab::{Lab, Lan, Nat, RANGES, schemes};
@@ -54,9 +53,8 @@ fn programs_of_others_lose_nothing_when_a_nat_forgets() {
         let mut listener = peer(&lab, &lab.desk, "sub", "fastdds", &["--verbose"]);
         let control = ["--wait-go", "--wait-stop", "--hold", HOLD, "--rate", "50", "--verbose"];
         let mut talker = peer(&lab, &lab.robot, "pub", "cyclone", &control);
-        let is_match = |event: &Value| event["event"] == "matched" && event["count"].as_u64() >= Some(1);
-        talker.wait("a reader", is_match);
-        listener.wait("a writer", is_match);
+        talker.wait_matched("a reader");
+        listener.wait_matched("a writer");
         talker.go();
         let said = |talker: &Peer| {
             let events = talker.events.try_iter().filter(|(_, event)| event["event"] == "sent");

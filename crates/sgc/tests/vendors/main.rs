@@ -16,7 +16,6 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use lab::{Lab, Plan, Site, robot_to_desk};
-use serde_json::Value;
 use sgc_testkit::netsim::Namespace;
 use support::{Peer, eventually, say};
 
@@ -147,9 +146,8 @@ impl Case {
         talk.extend(options.iter().chain(&size).map(String::as_str));
         let mut listener = lab.peer(far, self.to, "sub", &listen);
         let mut talker = lab.peer(Site::Robot, self.from, "pub", &talk);
-        let matched = |event: &Value| event["event"] == "matched" && event["count"].as_u64() >= Some(1);
-        talker.wait("a match of the talker", matched);
-        listener.wait("a match of the listener", matched);
+        talker.wait_matched("a match of the talker");
+        listener.wait_matched("a match of the listener");
         talker.go();
         if self.is_chance() {
             talker.wait("all is sent", |event| event["event"] == "all_sent");
@@ -285,9 +283,8 @@ fn xcdr2_stays_xcdr2_and_a_reader_that_cannot_take_it_is_named() {
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &listen);
     let talk = [&same[..], &["--xcdr2", "--rate", "20", "--wait-go"]].concat();
     let mut talker = lab.peer(Site::Robot, "cyclone", "pub", &talk);
-    let matched = |event: &Value| event["event"] == "matched" && event["count"].as_u64() >= Some(1);
-    talker.wait("a match of the talker", matched);
-    listener.wait("a match of the listener", matched);
+    talker.wait_matched("a match of the talker");
+    listener.wait_matched("a match of the listener");
     talker.go();
     let heard = listener.summary();
     let got = ["lost", "duplicated", "altered"].map(|key| heard[key].as_u64());
