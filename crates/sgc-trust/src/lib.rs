@@ -8,6 +8,7 @@
 mod batch;
 mod chains;
 mod crl;
+mod crowd;
 mod enrol;
 mod fleet;
 mod fleet_error;
@@ -35,6 +36,7 @@ mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
 pub use crl::CrlError;
+pub use crowd::{AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places};
 pub use enrol::EnrollRequest;
 pub use fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, ROSTER_BYTES_MAX};
 pub use fleet_error::FleetError;
