@@ -4,7 +4,7 @@
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
@@ -23,6 +23,7 @@ help:
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol: bench/README.md)'
 	@echo '                 bench-instructions (whether hot functions take more instructions than before: bench/README.md; ARGS=--accept)'
+	@echo '                 fuzz (each target for SGC_FUZZ_SECONDS, with a nightly compiler and cargo-fuzz; ARGS="control certs")'
 	@echo '                 scale (up to a thousand routers, simulated; some minutes)'
 
 demo: build
@@ -103,6 +104,10 @@ churn: peers
 stall: peers
 	SGC_STALL_SECONDS=$${SGC_STALL_SECONDS:-600} \
 		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) stands_still -- --nocapture
+
+# Long searches of the fuzz targets; adds what they find to fuzz/corpus. `unit` runs the targets over that folder.
+fuzz:
+	scripts/fuzz.sh $(ARGS)
 
 # What the gateway holds with 500 clients, one that does not read, and as many that come and go as one every two minutes makes in
 # 26 days. The suite runs a short one.

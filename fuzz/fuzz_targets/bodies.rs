@@ -1,34 +1,3 @@
-//! Signed bodies, grants and metadata: no input panics, and what decodes encodes to the same bytes.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-use sgc_endpoint::unpack_type;
-use sgc_wire::{
-    AdvertBody, AnswerBody, Decode, DescribedType, Encode, GrantContent, JoinBody, MessageHead, Metadata,
-    TYPE_DESCRIPTION_BYTES_MAX, TypeQuestion,
-};
-
-fn check<T: Decode + Encode>(input: &[u8]) {
-    if let Ok(value) = T::from_slice(input) {
-        assert_eq!(value.to_vec(), input);
-    }
-}
-
-fuzz_target!(|input: &[u8]| {
-    let Some((which, input)) = input.split_first() else { return };
-    match which % 8 {
-        0 => check::<AdvertBody>(input),
-        1 => check::<JoinBody>(input),
-        2 => check::<AnswerBody>(input),
-        3 => check::<GrantContent>(input),
-        4 => check::<Metadata>(input),
-        5 => check::<MessageHead>(input),
-        6 => check::<TypeQuestion>(input),
-        _ => {
-            check::<DescribedType>(input);
-            if let Ok(description) = DescribedType::from_slice(input).map(|told| unpack_type(&told)) {
-                assert!(description.map_or(true, |bytes| bytes.len() <= TYPE_DESCRIPTION_BYTES_MAX));
-            }
-        }
-    }
-});
+libfuzzer_sys::fuzz_target!(|input: &[u8]| sgc_fuzz_targets::bodies::run(input));

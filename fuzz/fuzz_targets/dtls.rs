@@ -1,4 +1,3 @@
-//! What stands in front of DTLS records, and what is said inside of them.
 #![no_main]
 
-libfuzzer_sys::fuzz_target!(|datagram: &[u8]| sgc_transport::exercise_front(datagram));
+libfuzzer_sys::fuzz_target!(|input: &[u8]| sgc_fuzz_targets::dtls::run(input));

@@ -1,13 +1,3 @@
-//! The multiplexer of stream links: two ends whose users do anything agree, and one end bears any bytes. The first byte
-//! chooses.
 #![no_main]
 
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|input: &[u8]| {
-    match input.split_first() {
-        Some((choice, rest)) if choice % 2 == 0 => sgc_transport::fuzzing::fuzz_operations(rest),
-        Some((_, rest)) => sgc_transport::fuzzing::fuzz_bytes(rest),
-        None => {}
-    }
-});
+libfuzzer_sys::fuzz_target!(|input: &[u8]| sgc_fuzz_targets::mux::run(input));

@@ -1,5 +1,5 @@
-//! Writes seeds for the fuzz targets to `corpus/`: `cargo run --example seeds` in this folder. Valid input of each kind,
-//! from which a fuzzer gets farther than from nothing.
+//! Writes valid inputs of each kind to `fuzz/corpus/`, from which a fuzzer gets farther than from nothing:
+//! `cargo run -p sgc-fuzz-targets --example seeds`.
 
 use std::path::Path;
 use std::{fs, io};
@@ -22,16 +22,20 @@ const NAME: Name = Name([1; 32]);
 const SINK: SinkId = SinkId([9; 16]);
 
 fn main() -> io::Result<()> {
-    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus");
     let write = |target: &str, seeds: Vec<Vec<u8>>| -> io::Result<()> {
         fs::create_dir_all(corpus.join(target))?;
         for (n, seed) in seeds.iter().enumerate() {
             fs::write(corpus.join(target).join(format!("seed-{n}")), seed)?;
         }
-        println!("{target}: {}", seeds.len());
         Ok(())
     };
+    write("access", access())?;
+    write("cdr", definitions(&[0, 1, 0, 0, 7, 0, 0, 0]))?;
     write("control", control())?;
+    write("dtls", dtls())?;
+    write("mux", mux())?;
+    write("values", definitions(br#"{"a":[1,2],"b":"x"}"#))?;
     write("bodies", bodies())?;
     write("packet", packets(Suite::ALL.as_slice()))?;
     write("certs", certs())?;
@@ -264,4 +268,44 @@ fn grants() -> Vec<Vec<u8>> {
     }
     out.push([&[6, 1], &token.metadata.to_vec()[..]].concat());
     out
+}
+
+/// Tokens, alterations of one, origins of pages, and patterns with names.
+fn access() -> Vec<Vec<u8>> {
+    let seeds: [(u8, &[u8]); 7] = [
+        (0, b"AAAA"),
+        (1, &[0, 9, 3]),
+        (1, &[0, 200, 0]),
+        (2, b"http://localhost:8080"),
+        (2, b"https://[2001:db8::1]"),
+        (3, b"/camera/** /camera/left/image"),
+        (3, b"/odom /odom"),
+    ];
+    seeds.into_iter().map(|(which, seed)| [&[which], seed].concat()).collect()
+}
+
+/// Definitions of a message, a service and an action, as `.msg` and as IDL, with `bytes` behind.
+fn definitions(bytes: &[u8]) -> Vec<Vec<u8>> {
+    let texts = [
+        "int32[] a\nstring b\n",
+        "float64<=3 a 1.5\nuint8 X=3\nwstring<=4 b\n",
+        "module p { module msg { struct M { sequence<long> a; string b; }; }; };",
+    ];
+    let seed = |(choice, text): (usize, &str)| {
+        let text_bytes = (text.len() as u16).to_be_bytes();
+        [&[choice as u8], &text_bytes[..], text.as_bytes(), bytes].concat()
+    };
+    texts.into_iter().enumerate().map(seed).collect()
+}
+
+/// Records of DTLS as they begin: a handshake, application data, an alert, a record with a connection id (RFC 9146).
+fn dtls() -> Vec<Vec<u8>> {
+    [[22, 254, 253], [23, 254, 253], [21, 254, 255], [25, 254, 253]]
+        .map(|head| [&head[..], &[0, 0, 0, 0, 0, 0, 0, 1, 0, 4, 1, 2, 3, 4]].concat())
+        .into()
+}
+
+/// Operations of two ends, and bytes to one.
+fn mux() -> Vec<Vec<u8>> {
+    vec![(0..200).map(|n| n % 7 * 2).collect(), [&[1][..], &[0; 40]].concat(), (1..=255).collect()]
 }

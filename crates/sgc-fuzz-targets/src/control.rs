@@ -1,0 +1,9 @@
+//! Control frames: no input panics, and what decodes encodes to the same bytes.
+use sgc_wire::{Control, Decode, Encode};
+
+/// Runs one input of the target.
+pub fn run(input: &[u8]) {
+    if let Ok(frame) = Control::from_slice(input) {
+        assert_eq!(frame.to_vec(), input);
+    }
+}

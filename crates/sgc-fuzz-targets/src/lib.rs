@@ -1,0 +1,53 @@
+//! Bodies of the fuzz targets, one module each.
+//!
+//! `fuzz/` links them to libFuzzer, which needs a nightly compiler. `cargo test` runs the same bodies over the committed
+//! inputs in `fuzz/corpus/` and over alterations of these from a fixed seed (`tests/corpus.rs`). A body panics if its
+//! input shows a defect. Long searches, and the choice of what to keep of them, are not here: `make fuzz`.
+#![forbid(unsafe_code)]
+// A panic is how a target reports a defect.
+#![allow(clippy::unwrap_used)]
+
+pub mod access;
+pub mod bodies;
+pub mod cdr;
+pub mod certs;
+pub mod control;
+pub mod dtls;
+pub mod gateway;
+pub mod grants;
+pub mod mux;
+pub mod packet;
+pub mod sink;
+pub mod values;
+
+/// Body of a fuzz target.
+pub type Target = fn(&[u8]);
+
+/// Fuzz targets by name, in the order of their names. The name is also that of the target's folder in `fuzz/corpus/`.
+pub const TARGETS: &[(&str, Target)] = &[
+    ("access", access::run),
+    ("bodies", bodies::run),
+    ("cdr", cdr::run),
+    ("certs", certs::run),
+    ("control", control::run),
+    ("dtls", dtls::run),
+    ("gateway", gateway::run),
+    ("grants", grants::run),
+    ("mux", mux::run),
+    ("packet", packet::run),
+    ("sink", sink::run),
+    ("values", values::run),
+];
+
+/// Splits an input into a byte that chooses, a text with its length in front (16 bits, big-endian), and the bytes behind.
+/// A text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
+fn choice_text_bytes(input: &[u8]) -> Option<(u8, &str, &[u8])> {
+    let [choice, high, low, rest @ ..] = input else { return None };
+    let text_bytes = usize::from(u16::from_be_bytes([*high, *low])).min(rest.len());
+    let (text, bytes) = rest.split_at(text_bytes);
+    let text = match std::str::from_utf8(text) {
+        Ok(text) => text,
+        Err(error) => std::str::from_utf8(&text[..error.valid_up_to()]).unwrap_or_default(),
+    };
+    Some((*choice, text, bytes))
+}

@@ -1,0 +1,11 @@
+//! The multiplexer of stream links: two ends whose users do anything agree, and one end bears any bytes. The first byte
+//! chooses.
+
+/// Runs one input of the target.
+pub fn run(input: &[u8]) {
+    match input.split_first() {
+        Some((choice, rest)) if choice % 2 == 0 => sgc_transport::fuzzing::fuzz_operations(rest),
+        Some((_, rest)) => sgc_transport::fuzzing::fuzz_bytes(rest),
+        None => {}
+    }
+}
