@@ -47,8 +47,7 @@ impl Router {
                 self.early_crls.push(der.clone());
                 self.early_at.get_or_insert(now.instant + EARLY_RETRY);
             }
-            // A CA that is not trusted here may be trusted there.
-            if !matches!(why, CrlError::UnknownIssuer) {
+            if why.is_forgery() {
                 self.count_forgery(now, link);
             }
             self.drop_frame(link, DropReason::Crl(why));
@@ -86,7 +85,7 @@ impl Router {
     pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
         let anchors = &self.config.anchors;
         let other_ca = certs.first().is_some_and(|c| anchors.ca_spki(&c.ca).is_none());
-        other_ca || certs.iter().any(|c| anchors.is_revoked(c))
+        other_ca || anchors.is_path_revoked(certs)
     }
 
     /// Until when something signed holds: for its lease, and not beyond its signer's certificate.

@@ -1,77 +1,82 @@
 //! Which certificates their CAs have taken back: X.509 revocation lists (RFC 5280, 5).
 //!
-//! A list is believed if a trusted CA signed it, whoever brought it, and replaces the one known of that CA if its
-//! number is greater. A list whose time is over still counts: what it revokes stays revoked, and what it does not
-//! name is believed. Whoever keeps newer lists from a node can so delay a revocation, and not undo one; refusing
-//! everybody instead would stop a fleet whose keeper is away. It reads no clock and stores no file.
+//! A list is believed if a trusted CA signed it, whoever brought it. The lists of a fleet add up: they name nodes and
+//! incarnations, and what one of them revokes stays revoked (`revocations.rs`). Of a CA that names serial numbers only,
+//! the list with the greatest number counts. A list whose time is over still counts. Whoever keeps newer lists from a
+//! node can so delay a revocation, and not undo one; refusing everybody instead would stop a fleet whose keeper is away.
+//! It reads no clock and stores no file.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
+use sgc_wire::{CRL_BYTES_MAX, Pseudonym, UnixMillis};
 use webpki::BorrowedCertRevocationList;
 
+use crate::revocations::{
+    CaLists, FLEET_LISTS_MAX, REVOKED_NODES_MAX, Revocation, RevocationList, RevokedNodes,
+};
 use crate::signed::CLOCK_SKEW_MAX;
-use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchors, VerifiedPeer};
-use crate::x509::{ListFields, may_sign_lists, split_spki, without_zeros};
-
-/// A verified list of one CA.
-#[derive(Clone)]
-pub(crate) struct RevocationList {
-    der: Bytes,
-    /// Big-endian, without leading zeros.
-    number: Box<[u8]>,
-    /// Serial numbers without leading zeros, and since when.
-    revoked: Arc<BTreeMap<Box<[u8]>, UnixMillis>>,
-}
+use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchors, VerifiedPeer, sha256};
+use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, without_zeros};
 
 impl TrustAnchors {
-    /// With one more list, if it verifies and is newer than the one known of its CA. `Ok(None)`: it is not newer.
+    /// With one more list, if it verifies and says something that is not known. `Ok(None)`: it is no news.
     pub fn with_crl(&self, der: &[u8], now: UnixMillis) -> Result<Option<Self>, CrlError> {
         if self.crls().any(|known| known == der) {
             return Ok(None);
         }
         let (ca, list) = self.verify_list(der, now)?;
-        if self.lists.get(&ca).is_some_and(|known| !is_greater(&list.number, &known.number)) {
-            return Ok(None);
-        }
+        let known = self.lists.get(&ca).cloned().unwrap_or_default();
+        let Some(more) = known.with(Arc::new(list))? else { return Ok(None) };
         let mut lists = BTreeMap::clone(&self.lists);
-        lists.insert(ca, list);
+        lists.insert(ca, more);
         Ok(Some(self.with_lists(Arc::new(lists))))
     }
 
-    /// The same CAs, with the lists in force elsewhere of those of them that are known there, where they are newer.
+    /// The same CAs, and what is revoked here or elsewhere by those of them that are known there.
     pub fn with_lists_of(&self, known: &Self) -> Self {
         let mut lists = BTreeMap::clone(&self.lists);
         let here = |ca: &CaFingerprint| self.ca_spki(ca).is_some();
-        for (ca, list) in known.lists.iter().filter(|(ca, _)| here(ca)) {
-            if lists.get(ca).is_none_or(|own| is_greater(&list.number, &own.number)) {
-                lists.insert(*ca, list.clone());
-            }
+        for (ca, theirs) in known.lists.iter().filter(|(ca, _)| here(ca)) {
+            let own = lists.entry(*ca).or_default();
+            *own = own.with_all_of(theirs);
         }
         self.with_lists(Arc::new(lists))
     }
 
-    /// The lists in force, DER, to be passed on; one for each CA at most.
+    /// The lists in force, DER, to be passed on: from them another node learns all that is revoked. Of each CA at most
+    /// one that names serial numbers only, and [`crate::FLEET_LISTS_MAX`] of a fleet.
     pub fn crls(&self) -> impl Iterator<Item = &Bytes> {
-        self.lists.values().map(|list| &list.der)
+        self.lists.values().flat_map(CaLists::lists).map(|list| &list.der)
     }
 
-    /// The same, each with its CA.
-    pub fn crls_by_ca(&self) -> impl Iterator<Item = (&CaFingerprint, &Bytes)> {
-        self.lists.iter().map(|(ca, list)| (ca, &list.der))
+    /// The same, each with its CA and its SHA-256.
+    pub fn crls_by_ca(&self) -> impl Iterator<Item = (&CaFingerprint, [u8; 32], &Bytes)> {
+        let all = self.lists.iter().flat_map(|(ca, lists)| lists.lists().map(move |list| (ca, list)));
+        all.map(|(ca, list)| (ca, sha256(&[&list.der]), &list.der))
     }
 
-    /// True if this very certificate is revoked. A certificate below an intermediate CA is over also when the
-    /// intermediate's is: see [`TrustAnchors::is_peer_revoked`].
-    pub fn is_revoked(&self, cert: &CertId) -> bool {
-        self.revoked_at(cert).is_some()
+    /// The nodes that a CA has revoked by name, in all of its lists.
+    pub fn revoked_nodes(&self, ca: &CaFingerprint) -> impl Iterator<Item = (Pseudonym, Revocation)> {
+        self.lists.get(ca).into_iter().flat_map(|lists| lists.nodes()).map(|(node, r)| (*node, *r))
     }
 
-    /// True if a certificate on the path to this peer is revoked.
+    /// The greatest number of the lists of a CA that revoke nodes by name.
+    pub fn fleet_list_number(&self, ca: &CaFingerprint) -> Option<u64> {
+        let number = self.lists.get(ca)?.fleet_number()?;
+        (number.len() <= 8).then(|| number.iter().fold(0, |n, byte| (n << 8) | u64::from(*byte)))
+    }
+
+    /// True if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
+    /// or that incarnation of the node.
+    pub fn is_path_revoked(&self, path: &[CertId]) -> bool {
+        self.path_revoked_at(path).is_some()
+    }
+
+    /// True if a certificate on the path to this peer is revoked, or the peer itself.
     pub fn is_peer_revoked(&self, peer: &VerifiedPeer) -> bool {
-        peer.path.iter().any(|cert| self.is_revoked(cert))
+        self.is_path_revoked(&peer.path)
     }
 
     /// True if the key of the first CA made this signature, with any algorithm that it has.
@@ -83,8 +88,16 @@ impl TrustAnchors {
         fitting.any(|a| a.verify_signature(key, message, signature).is_ok())
     }
 
-    pub(crate) fn revoked_at(&self, cert: &CertId) -> Option<UnixMillis> {
-        self.lists.get(&cert.ca)?.revoked.get(&*cert.serial).copied()
+    /// Since when a path is broken. Serial numbers count for the CA that gave them. A node is the trusted CA's, whatever
+    /// is between the two.
+    pub(crate) fn path_revoked_at(&self, path: &[CertId]) -> Option<UnixMillis> {
+        let of_serial = |cert: &CertId| self.lists.get(&cert.ca)?.serial_revoked_at(&cert.serial);
+        let of_node = || {
+            let node = path.last()?.node.as_ref()?;
+            let known = self.lists.get(&path.first()?.ca)?.nodes().get(&node.pseudonym)?;
+            known.covers(node.incarnation).then_some(known.at)
+        };
+        path.iter().find_map(of_serial).or_else(of_node)
     }
 
     fn verify_list(&self, der: &[u8], now: UnixMillis) -> Result<(CaFingerprint, RevocationList), CrlError> {
@@ -109,20 +122,20 @@ impl TrustAnchors {
         if may_sign_lists(&anchor.der) != Some(true) {
             return Err(CrlError::NotAListSigner);
         }
+        if now.secs() > anchor.validity.not_after.secs() {
+            return Err(CrlError::CaExpired { not_after: anchor.validity.not_after, now });
+        }
         if fields.this_update.0 > now.0.saturating_add(CLOCK_SKEW_MAX.as_millis() as u64) {
             return Err(CrlError::NotYetValid { this_update: fields.this_update, now });
         }
-        let mut revoked = BTreeMap::new();
+        let mut serials = BTreeMap::new();
         for entry in &list {
             let entry = entry.map_err(CrlError::from_webpki)?;
             let at = UnixMillis(entry.revocation_date.as_secs().saturating_mul(1000));
-            revoked.insert(without_zeros(entry.serial_number).into(), at);
+            serials.insert(without_zeros(entry.serial_number).into(), at);
         }
-        let list = RevocationList {
-            der: Bytes::copy_from_slice(der),
-            number: number.into(),
-            revoked: Arc::new(revoked),
-        };
+        let nodes = fields.revoked_nodes.map(read_revoked_nodes).transpose()?;
+        let list = RevocationList { der: Bytes::copy_from_slice(der), number: number.into(), serials, nodes };
         Ok((anchor.fingerprint, list))
     }
 }
@@ -139,8 +152,23 @@ impl Anchor {
     }
 }
 
-fn is_greater(number: &[u8], than: &[u8]) -> bool {
-    (number.len(), number) > (than.len(), than)
+/// Reads the extension by which a fleet's list revokes nodes (`docs/spec/trust.md`).
+fn read_revoked_nodes(extension: &[u8]) -> Result<RevokedNodes, CrlError> {
+    let broken = || CrlError::Malformed("its revoked nodes cannot be read".into());
+    let entries = RevokedNodeFields::all(extension).ok_or_else(broken)?;
+    if entries.len() > REVOKED_NODES_MAX {
+        return Err(CrlError::TooManyNodes);
+    }
+    let mut nodes = RevokedNodes::new();
+    for entry in entries {
+        let node = Pseudonym(entry.pseudonym);
+        if nodes.last_key_value().is_some_and(|(last, _)| *last >= node) {
+            return Err(broken());
+        }
+        let at = UnixMillis(entry.revoked_secs.checked_mul(1000).ok_or_else(broken)?);
+        nodes.insert(node, Revocation { incarnation: entry.incarnation, at });
+    }
+    Ok(nodes)
 }
 
 /// Why a revocation list is not believed.
@@ -173,6 +201,26 @@ pub enum CrlError {
     /// Its CA's certificate has a key usage without cRLSign.
     #[error("the CA's certificate does not let it sign revocation lists (key usage cRLSign)")]
     NotAListSigner,
+    /// Its CA is over, and so is everything that it could revoke.
+    #[error("the revocation list's CA expired at {not_after} and the clock here says {now}")]
+    CaExpired {
+        /// Its end.
+        not_after: UnixMillis,
+        /// The time of the check.
+        now: UnixMillis,
+    },
+    /// With it its CA would have revoked too many nodes.
+    #[error(
+        "with this revocation list its CA would have revoked more than {REVOKED_NODES_MAX} nodes: it is not taken; \
+         make a new fleet"
+    )]
+    TooManyNodes,
+    /// Too many lists of its CA say something of their own.
+    #[error(
+        "{FLEET_LISTS_MAX} revocation lists of this CA are in force and none says what another does: it is not taken; \
+         `sgc fleet merge` the copies of the fleet's file and hand out the list of the merged one"
+    )]
+    TooManyLists,
     /// It is from the future.
     #[error(
         "the revocation list begins at {this_update} and the clock here says {now}: which clock is wrong?"
@@ -186,6 +234,24 @@ pub enum CrlError {
 }
 
 impl CrlError {
+    /// True if an honest node never passes such a list on.
+    pub fn is_forgery(&self) -> bool {
+        match self {
+            // A CA that is not trusted here may be trusted there, clocks differ, and there may be room elsewhere.
+            Self::UnknownIssuer
+            | Self::NotYetValid { .. }
+            | Self::CaExpired { .. }
+            | Self::TooManyNodes
+            | Self::TooManyLists => false,
+            Self::TooLong { .. }
+            | Self::Malformed(_)
+            | Self::Partial
+            | Self::NoNumber
+            | Self::BadSignature
+            | Self::NotAListSigner => true,
+        }
+    }
+
     fn from_webpki(error: webpki::Error) -> Self {
         use webpki::Error as E;
         match error {

@@ -18,7 +18,7 @@ use crate::issue::{Leaf, RequestedKey};
 use crate::key::Key;
 use crate::label::{GroupName, NodeName};
 use crate::member::Membership;
-use crate::roster::{IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
+use crate::roster::{IssuedCertificate, ROSTER_NODES_MAX, RosterNode};
 use crate::verify::GROUPS_MAX;
 use crate::x509::{Validity, serial_of};
 
@@ -49,7 +49,8 @@ impl Fleet {
     /// last as long as a demonstration or a test.
     pub fn issue(&self, request: &EnrollRequest, rng: &mut impl CryptoRng) -> Result<Identity, FleetError> {
         let key = Key::generate(rng);
-        let member = self.member(&key, request, rng)?;
+        let incarnation = self.node(&request.node).map_or(0, |n| n.incarnation);
+        let member = self.member(&key, request, incarnation, rng)?;
         Identity::join(member, key.pkcs8(), rng).map_err(FleetError::making)
     }
 
@@ -114,17 +115,21 @@ impl Fleet {
         self.begin_roster_if_none(now)?;
         let entry = self.roster.nodes.entry(node.clone()).or_insert_with(|| RosterNode {
             name: node,
+            incarnation: 0,
+            changed: UnixMillis(0),
             groups: Vec::new(),
             router: false,
             may_route: peer.may_route,
-            revoked: None,
             certificates: Vec::new(),
         });
-        let certificate =
-            IssuedCertificate { serial: peer.cert.serial.clone(), not_after: peer.not_after, revoked: None };
-        if !entry.certificates.iter().any(|c| c.serial == certificate.serial) {
-            entry.certificates.push(certificate);
-        }
+        // The CA made the certificate, so the incarnation was given out, if only by another copy of the file.
+        entry.incarnation = entry.incarnation.max(peer.incarnation);
+        entry.add_certificates([IssuedCertificate {
+            serial: peer.cert.serial.clone(),
+            not_after: peer.not_after,
+            incarnation: peer.incarnation,
+            revoked: None,
+        }]);
         self.sign_roster()
     }
 
@@ -136,31 +141,44 @@ impl Fleet {
     ) -> Result<Membership, FleetError> {
         self.begin_roster_if_none(request.now)?;
         self.roster.prune(request.now);
-        match self.roster.nodes.get(&request.node) {
-            Some(RosterNode { revoked: Some(at), .. }) if !request.again => {
-                return Err(FleetError::NodeRevoked { node: request.node.clone(), at: *at });
-            }
-            Some(node) if node.certificates.len() >= NODE_CERTIFICATES_MAX => {
-                return Err(FleetError::TooManyCertificates { node: request.node.clone() });
-            }
-            None if self.roster.nodes.len() >= ROSTER_NODES_MAX => return Err(FleetError::TooManyNodes),
-            _ => {}
+        let known = self.roster.nodes.get(&request.node);
+        if known.is_none() && self.roster.nodes.len() >= ROSTER_NODES_MAX {
+            return Err(FleetError::TooManyNodes);
         }
-        let member = self.member(key, request, rng)?;
+        let known_incarnation = known.map_or(0, |n| n.incarnation);
+        let incarnation = match self.revocation_of(&request.node) {
+            Some(revoked) if revoked.covers(known_incarnation) => {
+                let next = revoked.incarnation.checked_add(1).filter(|_| request.again);
+                next.ok_or(FleetError::NodeRevoked { node: request.node.clone(), at: revoked.at })?
+            }
+            _ => known_incarnation,
+        };
+        let member = self.member(key, request, incarnation, rng)?;
         let leaf = member.chain.first().ok_or(FleetError::CaName)?;
         let made = Validity::of(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
         let (Validity { not_after, .. }, serial) = made;
-        let mut certificates =
-            self.roster.nodes.remove(&request.node).map(|n| n.certificates).unwrap_or_default();
-        certificates.push(IssuedCertificate { serial: serial.into(), not_after, revoked: None });
-        let node = RosterNode {
+        let mut node = RosterNode {
             name: request.node.clone(),
+            incarnation,
+            changed: request.now,
             groups: request.groups.iter().cloned().collect::<BTreeSet<_>>().into_iter().collect(),
             router: request.router,
             may_route: request.router || request.may_route,
-            revoked: None,
-            certificates,
+            certificates: Vec::new(),
         };
+        if let Some(known) = self.roster.nodes.get(&request.node) {
+            let is_same =
+                (&known.groups, known.router, known.may_route) == (&node.groups, node.router, node.may_route);
+            let later = UnixMillis(known.changed.0.saturating_add(1));
+            node.changed = if is_same { known.changed } else { node.changed.max(later) };
+            node.certificates = known.certificates.clone();
+        }
+        node.add_certificates([IssuedCertificate {
+            serial: serial.into(),
+            not_after,
+            incarnation,
+            revoked: None,
+        }]);
         self.roster.nodes.insert(request.node.clone(), node);
         self.sign_roster()?;
         Ok(member)
@@ -171,6 +189,7 @@ impl Fleet {
         &self,
         key: &impl PublicKeyData,
         request: &EnrollRequest,
+        incarnation: u32,
         rng: &mut impl CryptoRng,
     ) -> Result<Membership, FleetError> {
         self.check_ca_holds(request.now)?;
@@ -182,6 +201,7 @@ impl Fleet {
             pseudonym: self.secret.pseudonym(request.node.as_str()),
             groups: groups.into_iter().map(|g| self.secret.group_tag(g.as_str())).collect(),
             may_route: request.router || request.may_route,
+            incarnation,
             valid: request.valid,
             now: request.now,
         };
@@ -194,8 +214,8 @@ impl Fleet {
             anchors: self.anchors.clone(),
             secret: is_member.then(|| self.secret.clone()),
             naming: if is_member { self.naming.clone() } else { Vec::new() },
-            authority: self.roster.authority.as_ref().map(|a| self.node_id_of(a)),
-            post_quantum: self.roster.post_quantum,
+            authority: self.roster.settings.authority.as_ref().map(|a| self.node_id_of(a)),
+            post_quantum: self.roster.settings.post_quantum,
         })
     }
 
@@ -223,7 +243,7 @@ pub struct EnrollRequest {
     pub router: bool,
     /// For a member whose certificate lets it carry others' names as well.
     pub may_route: bool,
-    /// True if a node that was revoked may be one again.
+    /// True if a node that was revoked may be one again, in its next incarnation.
     pub again: bool,
     /// How long the certificate is to hold; never longer than the CA.
     pub valid: Duration,

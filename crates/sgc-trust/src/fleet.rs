@@ -4,6 +4,7 @@
 //! It makes identities, renews and revokes them, and writes no file. Certificates name nodes and groups by keyed
 //! hashes, so that whoever sees one (a router, the network) learns no name.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
@@ -23,7 +24,8 @@ use crate::issue::{self, Serial, hex};
 use crate::key::Key;
 use crate::label::{FleetName, LABEL_BYTES_MAX, NodeName};
 use crate::pem::{self, Block, FLEET_FILE_BYTES_MAX};
-use crate::roster::{Generation, Roster, RosterNode};
+use crate::revocations::{REVOKED_NODES_MAX, Revocation, RevokedNodes, add_revocation};
+use crate::roster::{Generation, ROSTER_NODES_MAX, Roster, RosterNode};
 use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret, SECRET_BLOCK};
 use crate::verify::{TrustAnchors, node_id, signature_input};
 use crate::x509::{CaFields, Validity, may_sign_lists};
@@ -189,24 +191,117 @@ impl Fleet {
             return Err(FleetError::UnknownNode { node: unknown.to_string() });
         }
         self.roster.prune(now);
-        for node in nodes {
-            let Some(node) = self.roster.nodes.get_mut(node) else { continue };
-            node.revoked.get_or_insert(now);
-            for certificate in &mut node.certificates {
-                certificate.revoked.get_or_insert(now);
-            }
+        let mut revoked = self.roster.revoked.clone();
+        for node in nodes.iter().filter_map(|n| self.roster.nodes.get(n)) {
+            let revocation = Revocation::new(node.incarnation, now);
+            add_revocation(&mut revoked, self.secret.pseudonym(node.name.as_str()), revocation);
         }
-        // Following the clock, so that a fleet file restored from a copy makes no list that is older than the last.
-        self.roster.crl_number = now.secs().max(self.roster.crl_number.saturating_add(1));
+        if revoked.len() > REVOKED_NODES_MAX {
+            return Err(FleetError::TooManyRevoked);
+        }
+        self.roster.revoked = revoked;
+        self.begin_list(now);
         self.sign_roster()
     }
 
-    /// The list of all revoked certificates that are not over: DER, to be handed to every node.
-    pub fn revocation_list(&self, now: UnixMillis) -> Result<Vec<u8>, FleetError> {
-        self.revocation_list_of(&self.roster.revoked(), self.roster.crl_number, now)
+    /// Gives the next list its number. It follows the clock, so that another copy of the fleet's file makes no list that
+    /// passes for a newer one.
+    fn begin_list(&mut self, now: UnixMillis) {
+        self.roster.crl_number = now.secs().max(self.roster.crl_number.saturating_add(1));
     }
 
-    /// Signs a list of any serial numbers, each with the time since when it is revoked, whatever the roster says.
+    /// Takes over what `other`, another copy of this fleet's file, knows: no revocation, enrolment or incarnation of
+    /// either is lost. The order in which copies are merged does not matter.
+    pub fn merge(&mut self, other: &Self, now: UnixMillis) -> Result<Merged, FleetError> {
+        if self.key.subject_public_key_info() != other.key.subject_public_key_info()
+            || self.secret.expose() != other.secret.expose()
+        {
+            return Err(FleetError::OtherFleet { name: other.name.clone() });
+        }
+        if !other.has_roster() {
+            return Ok(Merged::default());
+        }
+        self.begin_roster_if_none(now)?;
+        let mut roster = self.roster.clone();
+        roster.join(&other.roster);
+        if roster.nodes.len() > ROSTER_NODES_MAX {
+            return Err(FleetError::TooManyNodes);
+        }
+        if roster.revoked.len() > REVOKED_NODES_MAX {
+            return Err(FleetError::TooManyRevoked);
+        }
+        let merged = Merged::between(&self.roster, &roster, &self.secret);
+        let known: Vec<_> = self.naming.iter().chain(&other.naming).cloned().collect();
+        let named = |g: &Generation| known.iter().find(|n| n.generation == g.number && hash(n) == g.hash);
+        let naming: Option<Vec<_>> = roster.generations.iter().rev().map(|g| named(g).cloned()).collect();
+        self.naming = naming.ok_or(FleetError::NamingSecret)?;
+        let is_news = roster.revoked != self.roster.revoked || roster.revoked != other.roster.revoked;
+        self.roster = roster;
+        if is_news {
+            self.begin_list(now);
+        }
+        self.sign_roster()?;
+        Ok(merged)
+    }
+
+    /// Takes over the nodes that this fleet's CA has revoked by name in lists which `anchors` has. Another copy of the
+    /// fleet's file made a list that says more than this one.
+    pub fn absorb(&mut self, anchors: &TrustAnchors, now: UnixMillis) -> Result<Absorbed, FleetError> {
+        let Some(ca) = self.anchors.fingerprints().next() else { return Ok(Absorbed::default()) };
+        let mut absorbed = Absorbed::default();
+        let mut revoked = self.roster.revoked.clone();
+        for (node, revocation) in anchors.revoked_nodes(&ca) {
+            if add_revocation(&mut revoked, node, revocation) {
+                absorbed.revoked.push(self.name_of(&node));
+            }
+        }
+        if revoked.len() > REVOKED_NODES_MAX {
+            return Err(FleetError::TooManyRevoked);
+        }
+        let number = anchors.fleet_list_number(&ca).unwrap_or(0);
+        absorbed.is_behind = number > self.roster.crl_number;
+        if !absorbed.revoked.is_empty() || absorbed.is_behind {
+            self.begin_roster_if_none(now)?;
+            self.roster.revoked = revoked;
+            self.roster.crl_number = self.roster.crl_number.max(number);
+            self.sign_roster()?;
+        }
+        Ok(absorbed)
+    }
+
+    /// What people call the node that certificates call so: its name, if this copy has it, or the beginning of that.
+    fn name_of(&self, pseudonym: &Pseudonym) -> String {
+        self.node_by_pseudonym(pseudonym).map_or_else(|| pseudonym.short(), |n| n.name.to_string())
+    }
+
+    /// The list of all revoked nodes, and of their certificates that are not over: DER, to be handed to every node.
+    pub fn revocation_list(&self, now: UnixMillis) -> Result<Vec<u8>, FleetError> {
+        let serials = self.roster.revoked_serials(&self.secret);
+        self.fleet_list(&self.roster.revoked, &serials, self.roster.crl_number, now)
+    }
+
+    /// Signs a list of any nodes, up to which incarnation each is revoked, whatever the roster says.
+    pub fn revocation_list_of_nodes(
+        &self,
+        revoked: &[(Pseudonym, Revocation)],
+        number: u64,
+        now: UnixMillis,
+    ) -> Result<Vec<u8>, FleetError> {
+        self.fleet_list(&revoked.iter().copied().collect(), &[], number, now)
+    }
+
+    fn fleet_list(
+        &self,
+        nodes: &RevokedNodes,
+        serials: &[(Serial, UnixMillis)],
+        number: u64,
+        now: UnixMillis,
+    ) -> Result<Vec<u8>, FleetError> {
+        issue::fleet_list(&self.certificate, &self.key, nodes, serials, number, now)
+    }
+
+    /// Signs a list of any serial numbers, each with the time since when it is revoked, as a CA does that is not a
+    /// fleet's.
     pub fn revocation_list_of(
         &self,
         revoked: &[(Serial, UnixMillis)],
@@ -240,20 +335,27 @@ impl Fleet {
         }
         self.naming.retain(|n| n.generation >= before);
         self.roster.generations.retain(|g| g.number >= before);
+        self.roster.oldest_generation = self.roster.oldest_generation.max(before);
         self.sign_roster()
     }
 
     /// Says which node renews certificates for the fleet. Nodes learn it when they are enrolled or renewed by file.
     pub fn set_authority(&mut self, node: Option<NodeName>, now: UnixMillis) -> Result<(), FleetError> {
         self.begin_roster_if_none(now)?;
-        self.roster.authority = node;
-        self.sign_roster()
+        self.roster.settings.authority = node;
+        self.settings_changed(now)
     }
 
     /// Says whether links and grants of the fleet resist quantum computers. Nodes learn it as they do the authority.
     pub fn set_post_quantum(&mut self, on: bool, now: UnixMillis) -> Result<(), FleetError> {
         self.begin_roster_if_none(now)?;
-        self.roster.post_quantum = on;
+        self.roster.settings.post_quantum = on;
+        self.settings_changed(now)
+    }
+
+    fn settings_changed(&mut self, now: UnixMillis) -> Result<(), FleetError> {
+        let changed = &mut self.roster.settings.changed;
+        *changed = now.max(UnixMillis(changed.0.saturating_add(1)));
         self.sign_roster()
     }
 
@@ -302,6 +404,21 @@ impl Fleet {
         self.roster.nodes.get(name)
     }
 
+    /// Up to which incarnation the node of that name is revoked; it need not be in the roster.
+    pub fn revocation_of(&self, node: &NodeName) -> Option<Revocation> {
+        self.roster.revocation_of(node, &self.secret)
+    }
+
+    /// Since when a node of the roster is revoked in its present incarnation.
+    pub fn revoked_at(&self, node: &RosterNode) -> Option<UnixMillis> {
+        self.revocation_of(&node.name).filter(|r| r.covers(node.incarnation)).map(|r| r.at)
+    }
+
+    /// Revoked nodes, by what certificates call them.
+    pub fn revoked_nodes(&self) -> impl ExactSizeIterator<Item = (&Pseudonym, &Revocation)> {
+        self.roster.revoked.iter()
+    }
+
     /// The node that certificates call so.
     pub fn node_by_pseudonym(&self, pseudonym: &Pseudonym) -> Option<&RosterNode> {
         self.nodes().find(|n| self.secret.pseudonym(n.name.as_str()) == *pseudonym)
@@ -319,12 +436,12 @@ impl Fleet {
 
     /// The name of the node that renews certificates.
     pub fn authority(&self) -> Option<&NodeName> {
-        self.roster.authority.as_ref()
+        self.roster.settings.authority.as_ref()
     }
 
     /// True if links and grants of the fleet resist quantum computers.
     pub fn post_quantum(&self) -> bool {
-        self.roster.post_quantum
+        self.roster.settings.post_quantum
     }
 
     /// Who the node of that name is.
@@ -335,7 +452,7 @@ impl Fleet {
     pub(crate) fn active_node(&self, name: &NodeName) -> Result<&RosterNode, FleetError> {
         let node = self.roster.nodes.get(name);
         let node = node.ok_or_else(|| FleetError::UnknownNode { node: name.to_string() })?;
-        match node.revoked {
+        match self.revoked_at(node) {
             Some(at) => Err(FleetError::NodeRevoked { node: name.clone(), at }),
             None => Ok(node),
         }
@@ -383,7 +500,7 @@ impl Fleet {
         if !self.anchors.signed_by_first(&signature_input(ROSTER_CONTEXT, body), signature) {
             return Err(FleetError::RosterSignature);
         }
-        let roster = Roster::decode(body).map_err(FleetError::Roster)?;
+        let roster = Roster::decode(body, &self.secret).map_err(FleetError::Roster)?;
         if roster.generations.iter().any(|g| g.number < NamingSecret::STORED_FROM) {
             naming.push(NamingSecret { generation: 1, secret: self.secret.clone() });
         }
@@ -418,6 +535,58 @@ impl Fleet {
         let (roster, signed_roster) = (Roster::default(), None);
         Ok(Self { name, secret, naming, key, certificate, anchors, validity, roster, signed_roster })
     }
+}
+
+/// What a copy of a fleet's file gained by a merge.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Merged {
+    /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
+    pub revoked: Vec<String>,
+    /// Nodes that it did not know.
+    pub enrolled: Vec<NodeName>,
+    /// Nodes of which it has other groups, another role, incarnation, or more certificates now.
+    pub changed: Vec<NodeName>,
+    /// Generations of the secret that it did not have.
+    pub generations: Vec<u32>,
+    /// Generations that both copies made, each with a secret of its own, and of which it has the other one's now: nodes
+    /// that have its own one have to be renewed.
+    pub replaced: Vec<u32>,
+    /// True if nodes are told something else now when they are enrolled or renewed.
+    pub settings: bool,
+}
+
+impl Merged {
+    fn between(before: &Roster, after: &Roster, secret: &FleetSecret) -> Self {
+        let named: BTreeMap<_, _> = after.nodes.keys().map(|n| (secret.pseudonym(n.as_str()), n)).collect();
+        let name = |node: &Pseudonym| named.get(node).map_or_else(|| node.short(), |n| n.to_string());
+        let nodes = |is_meant: &dyn Fn(Option<&RosterNode>, &RosterNode) -> bool| {
+            let meant = after.nodes.values().filter(|n| is_meant(before.nodes.get(&n.name), n));
+            meant.map(|n| n.name.clone()).collect()
+        };
+        let generations = |is_meant: &dyn Fn(Option<&Generation>, &Generation) -> bool| {
+            let known = |g: &Generation| before.generations.iter().find(|b| b.number == g.number);
+            let meant = after.generations.iter().filter(|g| is_meant(known(g), g));
+            meant.map(|g| g.number).collect()
+        };
+        let revoked = after.revoked.iter().filter(|(node, r)| before.revoked.get(node) != Some(r));
+        Self {
+            revoked: revoked.map(|(node, _)| name(node)).collect(),
+            enrolled: nodes(&|before, _| before.is_none()),
+            changed: nodes(&|before, after| before.is_some_and(|b| b != after)),
+            generations: generations(&|before, _| before.is_none()),
+            replaced: generations(&|before, after| before.is_some_and(|b| b.hash != after.hash)),
+            settings: before.settings != after.settings,
+        }
+    }
+}
+
+/// What revocation lists told a copy of a fleet's file that did not know it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Absorbed {
+    /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
+    pub revoked: Vec<String>,
+    /// True if another copy made a list later than this one: what else was done with it is unknown here.
+    pub is_behind: bool,
 }
 
 impl fmt::Debug for Fleet {

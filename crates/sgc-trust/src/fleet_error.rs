@@ -5,9 +5,10 @@ use std::fmt;
 use sgc_wire::{DecodeError, SECRET_GENERATIONS_MAX, UnixMillis};
 
 use crate::fleet::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK, ROSTER_BYTES_MAX};
-use crate::label::{LabelError, NodeName};
+use crate::label::{FleetName, LabelError, NodeName};
 use crate::pem::PemError;
-use crate::roster::{NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX};
+use crate::revocations::REVOKED_NODES_MAX;
+use crate::roster::ROSTER_NODES_MAX;
 use crate::secret::{NAMING_BLOCK, SECRET_BLOCK, SECRET_BYTES};
 use crate::verify::{AnchorError, GROUPS_MAX};
 
@@ -66,13 +67,16 @@ pub enum FleetError {
     /// The fleet has too many nodes.
     #[error("a fleet has at most {ROSTER_NODES_MAX} nodes: make a second one")]
     TooManyNodes,
-    /// A node has too many certificates that hold.
+    /// The fleet has revoked too many nodes.
+    #[error("a fleet revokes at most {REVOKED_NODES_MAX} nodes: make a second one")]
+    TooManyRevoked,
+    /// Two files of different fleets cannot be merged.
     #[error(
-        "node {node} has {NODE_CERTIFICATES_MAX} certificates that hold, more are not made: renew more seldom"
+        "it is of another fleet, {name}, or of another one of that name: only copies of one fleet's file are merged"
     )]
-    TooManyCertificates {
-        /// Which.
-        node: NodeName,
+    OtherFleet {
+        /// The name of the other.
+        name: FleetName,
     },
     /// No such node.
     #[error("the fleet's roster has no node {node}: see `sgc fleet list`")]

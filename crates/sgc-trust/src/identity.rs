@@ -136,6 +136,10 @@ impl Identity {
         if new.node_id() != self.node_id() {
             return Err(IdentityError::NameMismatch { node: new.parts.member.node });
         }
+        // Another copy of the fleet's file is behind; what it makes may be revoked already.
+        if new.own.incarnation < self.own.incarnation {
+            return Err(IdentityError::OldIncarnation);
+        }
         Ok(new)
     }
 
@@ -148,6 +152,10 @@ impl Identity {
         let new = Self::assemble(parts)?;
         if new.node_id() != self.node_id() {
             return Err(IdentityError::NameMismatch { node: new.parts.member.node });
+        }
+        // Another copy of the fleet's file is behind; what it makes may be revoked already.
+        if new.own.incarnation < self.own.incarnation {
+            return Err(IdentityError::OldIncarnation);
         }
         Ok(new)
     }
@@ -347,6 +355,12 @@ pub enum IdentityError {
     /// Secrets that are older than those in use.
     #[error("the naming secrets are older than those in use: they were rotated meanwhile")]
     OldSecrets,
+    /// A certificate of an earlier incarnation of the node.
+    #[error(
+        "the certificate is of an earlier incarnation of the node than the one in use: the fleet's file that made it is \
+         an old copy, `sgc fleet merge` brings it up to date"
+    )]
+    OldIncarnation,
     /// A private key where none belongs.
     #[error("this is an identity with its private key, not an answer to a request for one")]
     HasKey,

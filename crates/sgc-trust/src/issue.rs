@@ -12,10 +12,10 @@ use rcgen::string::{BmpString, Ia5String, PrintableString, TeletexString, Univer
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateRevocationListParams, DistinguishedName, DnType, DnValue,
     ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyUsagePurpose, PublicKeyData, RevokedCertParams,
-    SanType, SerialNumber,
+    SanType, SerialNumber, SigningKey as _,
 };
 use rustls_pki_types::CertificateDer;
-use sgc_wire::{CSR_BYTES_MAX, GroupTag, Pseudonym, UnixMillis};
+use sgc_wire::{CRL_BYTES_MAX, CSR_BYTES_MAX, GroupTag, Pseudonym, UnixMillis};
 use zeroize::Zeroizing;
 
 use crate::fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY};
@@ -23,8 +23,9 @@ use crate::fleet_error::FleetError;
 use crate::key::Key;
 use crate::member::KEY_BLOCK;
 use crate::pem;
-use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, NODE_URI, ROUTER_URI};
-use crate::x509::{CaFields, RequestFields, Validity};
+use crate::revocations::{REVOKED_NODES_MAX, RevokedNodes};
+use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI};
+use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Validity};
 
 /// The year 9000: what certificates can say ends a little later.
 const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
@@ -37,6 +38,19 @@ macro_rules! date_time {
     };
 }
 
+/// Most bytes of a revocation list besides its entries: the name of its CA, a signature, and the fixed fields.
+const LIST_HEAD_BYTES_MAX: usize = 6500;
+/// Most bytes of an entry with a serial number: with its heads, 20 for the number and 15 for the time.
+const SERIAL_ENTRY_BYTES_MAX: usize = 2 + 22 + 17;
+/// Most bytes of all extensions of a list that path validation reads, and of those among them that are not ours.
+const EXTENSIONS_BYTES_MAX: usize = 0xffff;
+const OTHER_EXTENSIONS_BYTES_MAX: usize = 256;
+const _: () = assert!(
+    OTHER_EXTENSIONS_BYTES_MAX + REVOKED_NODES_MAX * RevokedNodeFields::BYTES_MAX <= EXTENSIONS_BYTES_MAX
+);
+const _: () =
+    assert!(LIST_HEAD_BYTES_MAX + REVOKED_NODES_MAX * RevokedNodeFields::BYTES_MAX <= CRL_BYTES_MAX);
+
 /// A certificate that takes revocation is known by this; big-endian, without leading zeros.
 pub(crate) type Serial = Arc<[u8]>;
 
@@ -45,6 +59,7 @@ pub(crate) struct Leaf {
     pub(crate) pseudonym: Pseudonym,
     pub(crate) groups: Vec<GroupTag>,
     pub(crate) may_route: bool,
+    pub(crate) incarnation: u32,
     pub(crate) valid: Duration,
     pub(crate) now: UnixMillis,
 }
@@ -53,7 +68,7 @@ impl Leaf {
     fn params(&self) -> Result<CertificateParams, FleetError> {
         let mut params = CertificateParams::default();
         params.distinguished_name = common_name(&self.pseudonym.to_string());
-        params.subject_alt_names = sans(&self.pseudonym, &self.groups, self.may_route)?;
+        params.subject_alt_names = sans(&self.pseudonym, &self.groups, self.may_route, self.incarnation)?;
         params.is_ca = IsCa::ExplicitNoCa;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages =
@@ -101,7 +116,35 @@ pub(crate) fn self_signed_ca(
     Ok(params.self_signed(key).map_err(FleetError::making)?.into())
 }
 
-/// A revocation list, DER.
+/// A fleet's revocation list, DER: it revokes nodes, for nodes of SGC, and as many of the serial numbers as there is
+/// room for, the last ones first, for everyone else.
+pub(crate) fn fleet_list(
+    ca: &CertificateDer<'_>,
+    ca_key: &Key,
+    nodes: &RevokedNodes,
+    serials: &[(Serial, UnixMillis)],
+    number: u64,
+    now: UnixMillis,
+) -> Result<Vec<u8>, FleetError> {
+    if nodes.len() > REVOKED_NODES_MAX {
+        return Err(FleetError::TooManyRevoked);
+    }
+    let room = CRL_BYTES_MAX - LIST_HEAD_BYTES_MAX - nodes.len() * RevokedNodeFields::BYTES_MAX;
+    let first = serials.len().saturating_sub(room / SERIAL_ENTRY_BYTES_MAX);
+    let list = revocation_list(ca, ca_key, serials.get(first..).unwrap_or_default(), number, now)?;
+    let value = RevokedNodeFields::write_all(nodes.iter().map(|(node, revocation)| RevokedNodeFields {
+        pseudonym: node.0,
+        incarnation: revocation.incarnation,
+        revoked_secs: revocation.at.secs(),
+    }));
+    let unreadable = || FleetError::Making("its own revocation list cannot be read".into());
+    let algorithm = ListFields::of(&list).ok_or_else(unreadable)?.algorithm;
+    let tbs = ListFields::tbs_with_revoked_nodes(&list, &value).ok_or_else(unreadable)?;
+    let signature = ca_key.sign(&tbs).map_err(FleetError::making)?;
+    Ok(ListFields::signed(&tbs, algorithm, &signature))
+}
+
+/// A revocation list that names serial numbers, DER.
 pub(crate) fn revocation_list(
     ca: &CertificateDer<'_>,
     ca_key: &Key,
@@ -140,7 +183,7 @@ pub(crate) fn signing_request(
     params.distinguished_name = DistinguishedName::new();
     if let Some(pseudonym) = pseudonym {
         params.distinguished_name = common_name(&pseudonym.to_string());
-        params.subject_alt_names = sans(pseudonym, groups, may_route).ok()?;
+        params.subject_alt_names = sans(pseudonym, groups, may_route, 0).ok()?;
     }
     Some(params.serialize_request(key).ok()?.der().to_vec())
 }
@@ -252,7 +295,12 @@ fn dn_value(tag: u8, value: &[u8]) -> Option<DnValue> {
     })
 }
 
-fn sans(pseudonym: &Pseudonym, groups: &[GroupTag], may_route: bool) -> Result<Vec<SanType>, FleetError> {
+fn sans(
+    pseudonym: &Pseudonym,
+    groups: &[GroupTag],
+    may_route: bool,
+    incarnation: u32,
+) -> Result<Vec<SanType>, FleetError> {
     let uri = |text: String| Ok(SanType::URI(text.try_into().map_err(FleetError::making)?));
     let mut names = vec![uri(format!("{NODE_URI}{pseudonym}"))?];
     for group in groups {
@@ -260,6 +308,9 @@ fn sans(pseudonym: &Pseudonym, groups: &[GroupTag], may_route: bool) -> Result<V
     }
     if may_route {
         names.push(uri(ROUTER_URI.to_owned())?);
+    }
+    if incarnation > 0 {
+        names.push(uri(format!("{INCARNATION_URI}{incarnation}"))?);
     }
     Ok(names)
 }

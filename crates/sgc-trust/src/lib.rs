@@ -24,6 +24,7 @@ mod names;
 mod pem;
 mod policy;
 mod replay;
+mod revocations;
 mod roster;
 mod seal;
 mod secret;
@@ -38,7 +39,9 @@ pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_by
 pub use crl::CrlError;
 pub use crowd::{AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places};
 pub use enrol::EnrollRequest;
-pub use fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, ROSTER_BYTES_MAX};
+pub use fleet::{
+    Absorbed, CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, Merged, ROSTER_BYTES_MAX,
+};
 pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError, Import};
@@ -50,6 +53,7 @@ pub use names::{TopicSecret, derive_name, name_of, renewal_blind, types_blind};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
+pub use revocations::{FLEET_LISTS_MAX, REVOKED_NODES_MAX, Revocation};
 pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};
@@ -60,6 +64,6 @@ pub use signed::{
 pub use suite::{ParseSuiteError, Suite};
 pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};
 pub use verify::{
-    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, SignatureError, TrustAnchors,
-    VerifiedPeer, node_id,
+    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, NodeIncarnation, SignatureError,
+    TrustAnchors, VerifiedPeer, node_id,
 };

@@ -14,7 +14,7 @@ use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, GroupTag, NodeId, Pseudonym, Uni
 use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, aws_lc_rs as algs};
 
 use crate::chains::{ChainHash, KnownChains};
-use crate::crl::RevocationList;
+use crate::revocations::CaLists;
 use crate::x509::{Validity, split_spki, without_zeros};
 
 /// Most groups of one node: that many fit into [`CERT_BYTES_MAX`].
@@ -26,6 +26,9 @@ pub(crate) const NODE_URI: &str = "sgc:node:";
 pub(crate) const GROUP_URI: &str = "sgc:group:";
 /// In certificates of nodes that may carry others' names.
 pub(crate) const ROUTER_URI: &str = "sgc:role:router";
+/// In certificates of nodes that were enrolled again after they had been revoked; without it a certificate is of
+/// incarnation 0.
+pub(crate) const INCARNATION_URI: &str = "sgc:incarnation:";
 
 /// What certificates and revocation lists may be signed with.
 pub(crate) const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
@@ -57,8 +60,8 @@ pub struct TrustAnchors {
     pub(crate) anchors: Arc<[Anchor]>,
     /// The same once more, in the form that path building wants.
     pub(crate) paths: Arc<[TrustAnchor<'static>]>,
-    /// One list for each CA at most.
-    pub(crate) lists: Arc<BTreeMap<CaFingerprint, RevocationList>>,
+    /// By the CA that signed them.
+    pub(crate) lists: Arc<BTreeMap<CaFingerprint, CaLists>>,
     /// What was verified with these CAs and lists, and with no others.
     pub(crate) chains: Arc<KnownChains>,
 }
@@ -67,7 +70,7 @@ pub(crate) struct Anchor {
     pub(crate) der: CertificateDer<'static>,
     pub(crate) spki: Box<[u8]>,
     pub(crate) fingerprint: CaFingerprint,
-    validity: Validity,
+    pub(crate) validity: Validity,
 }
 
 impl TrustAnchors {
@@ -106,7 +109,7 @@ impl TrustAnchors {
     }
 
     /// The same CAs with these lists.
-    pub(crate) fn with_lists(&self, lists: Arc<BTreeMap<CaFingerprint, RevocationList>>) -> Self {
+    pub(crate) fn with_lists(&self, lists: Arc<BTreeMap<CaFingerprint, CaLists>>) -> Self {
         let (anchors, paths) = (Arc::clone(&self.anchors), Arc::clone(&self.paths));
         Self { anchors, paths, lists, chains: Arc::default() }
     }
@@ -147,12 +150,12 @@ impl TrustAnchors {
             issuer = CaFingerprint(sha256(&[&certificate.subject_public_key_info()]));
         }
         certs.push(CertId::new(issuer, leaf.serial()));
-        if let Some(at) = certs.iter().find_map(|c| self.revoked_at(c)) {
-            return Err(CertError::Revoked { at });
-        }
         // With certificates that its path does not need, one chain could be varied without end.
         let is_minimal = certs.len() == chain.len();
         let peer = VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)?;
+        if let Some(at) = self.path_revoked_at(&peer.path) {
+            return Err(CertError::Revoked { at });
+        }
         if is_minimal && let Some(validity) = ca.validity_with(chain) {
             self.chains.remember(hash, peer.clone(), validity);
         }
@@ -238,11 +241,22 @@ pub struct CertId {
     pub ca: CaFingerprint,
     /// The serial number, big-endian, without leading zeros (RFC 5280, 4.1.2.2).
     pub serial: Arc<[u8]>,
+    /// For a node's certificate, of which node and incarnation it is.
+    pub node: Option<NodeIncarnation>,
+}
+
+/// A node between two re-enrolments: all of its certificates that are revoked together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct NodeIncarnation {
+    /// The node.
+    pub pseudonym: Pseudonym,
+    /// Grows when the node is enrolled again after it was revoked, and not when it is renewed.
+    pub incarnation: u32,
 }
 
 impl CertId {
     pub(crate) fn new(ca: CaFingerprint, serial: &[u8]) -> Self {
-        Self { ca, serial: without_zeros(serial).into() }
+        Self { ca, serial: without_zeros(serial).into(), node: None }
     }
 }
 
@@ -261,6 +275,8 @@ pub struct VerifiedPeer {
     pub node_id: NodeId,
     /// What its certificate calls it.
     pub pseudonym: Pseudonym,
+    /// How often it was enrolled again after it had been revoked.
+    pub incarnation: u32,
     /// Its groups, sorted, each once.
     pub groups: Arc<[GroupTag]>,
     /// When its certificate begins to hold.
@@ -301,9 +317,10 @@ impl VerifiedPeer {
         leaf: &EndEntityCert<'_>,
         der: &[u8],
         ca: &Anchor,
-        path: Vec<CertId>,
+        mut path: Vec<CertId>,
     ) -> Result<Self, CertError> {
         let mut pseudonym = None;
+        let mut incarnation = None;
         let mut groups = Vec::new();
         let mut may_route = false;
         // URIs that are unknown here are for later versions.
@@ -321,12 +338,19 @@ impl VerifiedPeer {
                 groups.push(tag.map_err(|_| CertError::Malformed("a group tag is no hash".into()))?);
             } else if uri == ROUTER_URI {
                 may_route = true;
+            } else if let Some(number) = uri.strip_prefix(INCARNATION_URI)
+                && incarnation.replace(read_incarnation(number)?).is_some()
+            {
+                return Err(CertError::Malformed("it names two incarnations".into()));
             }
         }
         groups.sort_unstable();
         groups.dedup();
         let pseudonym = pseudonym.ok_or(CertError::NoPseudonym)?;
-        let cert = path.last().cloned().ok_or(CertError::NoCertificate)?;
+        let incarnation = incarnation.unwrap_or(0);
+        let cert = path.last_mut().ok_or(CertError::NoCertificate)?;
+        cert.node = Some(NodeIncarnation { pseudonym, incarnation });
+        let cert = cert.clone();
         let Validity { not_before, not_after } =
             Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
         let spki = leaf.subject_public_key_info();
@@ -338,6 +362,7 @@ impl VerifiedPeer {
         Ok(Self {
             node_id: node_id(&ca.spki, &pseudonym),
             pseudonym,
+            incarnation,
             groups: groups.into(),
             not_before,
             not_after,
@@ -349,6 +374,12 @@ impl VerifiedPeer {
             algorithm,
         })
     }
+}
+
+/// An incarnation as certificates have it: decimal, from 1, in its shortest form.
+fn read_incarnation(number: &str) -> Result<u32, CertError> {
+    let read = number.parse::<u32>().ok().filter(|n| *n > 0 && n.to_string() == number);
+    read.ok_or_else(|| CertError::Malformed("its incarnation is no number from 1 on".into()))
 }
 
 /// `SHA-256(CA public key ‖ pseudonym)`, the CA's key as DER SubjectPublicKeyInfo (`docs/spec/names.md`).

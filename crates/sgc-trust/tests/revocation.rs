@@ -57,16 +57,14 @@ fn a_revoked_certificate_is_refused_and_its_neighbours_are_not() {
     // Another certificate of the same node, and another node.
     for identity in [&again, &desk] {
         assert_eq!(anchors.verify(identity.chain(), NOW).unwrap().node_id, identity.node_id());
-        assert!(
-            !anchors.is_revoked(&identity.as_peer().cert) && !anchors.is_peer_revoked(identity.as_peer())
-        );
+        assert!(!anchors.is_peer_revoked(identity.as_peer()));
     }
-    assert!(anchors.is_revoked(&arm.as_peer().cert) && anchors.is_peer_revoked(arm.as_peer()));
+    assert!(anchors.is_peer_revoked(arm.as_peer()));
     // The anchors from before are as they were: lists are values.
     assert!(fleet.anchors().verify(arm.chain(), NOW).is_ok() && fleet.anchors().crls().count() == 0);
     // A node can hold anchors that revoke itself.
     let arm = arm.with_anchors(anchors);
-    assert!(arm.anchors().is_revoked(&arm.as_peer().cert));
+    assert!(arm.anchors().is_peer_revoked(arm.as_peer()));
 }
 
 #[test]
@@ -79,7 +77,7 @@ fn an_older_list_never_replaces_a_newer_one() {
     for old in [&first, &second, &list(&fleet, 256, &[])] {
         assert!(anchors.with_crl(old, NOW).unwrap().is_none());
     }
-    assert!(anchors.is_revoked(&desk.as_peer().cert));
+    assert!(anchors.is_peer_revoked(desk.as_peer()));
     // The keeper may take a certificate off again.
     let third = with(&anchors, &list(&fleet, 257, &[]));
     assert!(third.verify(arm.chain(), NOW).is_ok() && third.crls().count() == 1);
@@ -117,7 +115,7 @@ fn the_list_of_another_ca_revokes_nothing_of_ours() {
     let both = with(&both, &list(&ours, 1, &[&arm]));
     assert_eq!(both.crls().count(), 2);
     for identity in [&arm, &stranger] {
-        assert!(both.is_revoked(&identity.as_peer().cert));
+        assert!(both.is_peer_revoked(identity.as_peer()));
     }
     // They survive more anchors, and anchors are not taken twice.
     let more = both.with_anchors([ours.ca_certificate().clone(), theirs.ca_certificate().clone()]).unwrap();
@@ -234,7 +232,7 @@ fn revoking_an_intermediate_ca_revokes_what_it_made() {
     assert!(other.verify(&chain, NOW).is_ok() && !other.is_peer_revoked(&peer));
     let anchors = with(&root.anchors(), &root.crl(&[2], &[5], None));
     assert!(matches!(anchors.verify(&chain, NOW), Err(CertError::Revoked { .. })));
-    assert!(anchors.is_peer_revoked(&peer) && !anchors.is_revoked(&peer.cert));
+    assert!(anchors.is_peer_revoked(&peer) && !anchors.is_path_revoked(std::slice::from_ref(&peer.cert)));
 }
 
 #[test]

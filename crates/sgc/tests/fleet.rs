@@ -246,15 +246,14 @@ fn commands_at_once_lose_nothing() {
     let all: Vec<_> = revoking.chain(renewing).collect();
     assert!(all.into_iter().all(|mut child| child.wait().unwrap().success()));
     let fleet = place.fleet();
-    assert_eq!(fleet.nodes().filter(|n| n.revoked.is_some()).count(), first.len());
+    assert_eq!(fleet.nodes().filter(|n| fleet.revoked_at(n).is_some()).count(), first.len());
     assert_eq!(fleet.nodes().map(|n| n.certificates.len()).sum::<usize>(), nodes.len() + rest.len());
     let anchors = place.anchors_with_list();
-    let revoked = nodes.iter().filter(|n| anchors.is_revoked(&cert(&place, n))).count();
+    let revoked = nodes
+        .iter()
+        .filter(|n| anchors.is_peer_revoked(place.identity(&format!("{n}.identity")).as_peer()))
+        .count();
     assert_eq!(revoked, first.len());
-}
-
-fn cert(place: &Place, node: &str) -> sgc_trust::CertId {
-    place.identity(&format!("{node}.identity")).as_peer().cert.clone()
 }
 
 #[test]

@@ -30,7 +30,7 @@ const END_MAX: Duration = Duration::from_secs(6);
 /// How often a node that ends is looked at.
 const END_PERIOD: Duration = Duration::from_millis(20);
 /// Revocation lists that are taken over, and bytes of each.
-const CRLS_MAX: usize = 32;
+const CRLS_MAX: usize = 128;
 const CRL_BYTES_MAX: u64 = 1 << 20;
 
 /// How the two nodes meet.

@@ -111,6 +111,7 @@ struct NodeJson<'a> {
     id: String,
     groups: Vec<&'a str>,
     role: &'static str,
+    incarnation: u32,
     expires: Option<String>,
     revoked: Option<String>,
     certificates: Vec<CertificateJson>,
@@ -119,6 +120,7 @@ struct NodeJson<'a> {
 #[derive(Serialize)]
 struct CertificateJson {
     serial: String,
+    incarnation: u32,
     expires: String,
     revoked: Option<String>,
 }
@@ -257,8 +259,8 @@ fn role(node: &RosterNode) -> &'static str {
     }
 }
 
-fn state(node: &RosterNode, now: UnixMillis) -> String {
-    match (node.revoked, node.expires()) {
+fn state(fleet: &Fleet, node: &RosterNode, now: UnixMillis) -> String {
+    match (fleet.revoked_at(node), node.expires(fleet.revocation_of(&node.name))) {
         (Some(at), _) => format!("revoked {at}"),
         (None, Some(until)) if until < now => format!("expired {until}"),
         (None, Some(until)) => format!("until {until}"),
@@ -270,7 +272,7 @@ fn table(fleet: &Fleet, now: UnixMillis) -> String {
     let heading = ["NODE", "ROLE", "CERTIFICATE", "GROUPS"].map(str::to_owned).to_vec();
     let row = |node: &RosterNode| {
         let groups: Vec<_> = node.groups.iter().map(GroupName::as_str).collect();
-        vec![node.name.to_string(), role(node).to_owned(), state(node, now), groups.join(", ")]
+        vec![node.name.to_string(), role(node).to_owned(), state(fleet, node, now), groups.join(", ")]
     };
     let rows: Vec<_> = std::iter::once(heading).chain(fleet.nodes().map(row)).collect();
     let mut text = format!("fleet {}, its CA holds until {}", fleet.name(), fleet.not_after());
@@ -298,10 +300,12 @@ fn table(fleet: &Fleet, now: UnixMillis) -> String {
 fn json(fleet: &Fleet) -> FleetJson<'_> {
     let time = |t: UnixMillis| t.to_string();
     let node = |node: &'_ RosterNode| {
+        let revocation = fleet.revocation_of(&node.name);
         let certificates = node.certificates.iter().map(|c| CertificateJson {
             serial: c.serial.iter().map(|b| format!("{b:02x}")).collect(),
             expires: time(c.not_after),
-            revoked: c.revoked.map(time),
+            incarnation: c.incarnation,
+            revoked: c.revoked_at(revocation).map(time),
         });
         (fleet.node_id_of(&node.name).to_string(), certificates.collect::<Vec<_>>())
     };
@@ -312,8 +316,9 @@ fn json(fleet: &Fleet) -> FleetJson<'_> {
             id,
             groups: n.groups.iter().map(GroupName::as_str).collect(),
             role: role(n),
-            expires: n.expires().map(time),
-            revoked: n.revoked.map(time),
+            incarnation: n.incarnation,
+            expires: n.expires(fleet.revocation_of(&n.name)).map(time),
+            revoked: fleet.revoked_at(n).map(time),
             certificates,
         }
     });

@@ -1,0 +1,181 @@
+//! What a CA has taken back: by node and incarnation, which only grows, and by serial number.
+//!
+//! It decides what is kept of the lists of a CA and what they revoke together. Reading and checking a list is the
+//! business of `crl.rs`, writing one that of `issue.rs`.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sgc_wire::{Pseudonym, UnixMillis};
+
+use crate::crl::CrlError;
+
+/// Most nodes that one CA has revoked, in all of its lists together. A list that would add more is refused.
+pub const REVOKED_NODES_MAX: usize = 1024;
+/// Most lists of one fleet's CA of which each says something that the others do not: one for each copy of the fleet's
+/// file that went its own way. A further one is refused until the copies are merged.
+pub const FLEET_LISTS_MAX: usize = 16;
+
+/// Up to which incarnation a node is revoked. Of two revocations of a node the one that covers more counts; of two
+/// that cover the same, the earlier one. So their order does not matter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Revocation {
+    /// The highest incarnation that is revoked, and with it all before it.
+    pub incarnation: u32,
+    /// Since when, in whole seconds.
+    pub at: UnixMillis,
+}
+
+impl Revocation {
+    /// From the second of `at` on.
+    pub(crate) fn new(incarnation: u32, at: UnixMillis) -> Self {
+        Self { incarnation, at: UnixMillis(at.secs() * 1000) }
+    }
+
+    /// True if certificates of this incarnation are revoked by it.
+    pub fn covers(&self, incarnation: u32) -> bool {
+        incarnation <= self.incarnation
+    }
+
+    /// True if `other` adds nothing to it.
+    fn includes(&self, other: &Self) -> bool {
+        self.incarnation > other.incarnation || (self.incarnation == other.incarnation && self.at <= other.at)
+    }
+}
+
+/// Revoked nodes of one CA. Nothing is ever taken out of it.
+pub(crate) type RevokedNodes = BTreeMap<Pseudonym, Revocation>;
+
+/// Adds a revocation; true if it says something new.
+pub(crate) fn add_revocation(nodes: &mut RevokedNodes, node: Pseudonym, revocation: Revocation) -> bool {
+    match nodes.get_mut(&node) {
+        Some(known) if known.includes(&revocation) => false,
+        Some(known) => {
+            *known = revocation;
+            true
+        }
+        None => {
+            nodes.insert(node, revocation);
+            true
+        }
+    }
+}
+
+/// A verified list of a CA.
+pub(crate) struct RevocationList {
+    pub(crate) der: Bytes,
+    /// Big-endian, without leading zeros.
+    pub(crate) number: Box<[u8]>,
+    /// Serial numbers without leading zeros, and since when.
+    pub(crate) serials: BTreeMap<Box<[u8]>, UnixMillis>,
+    /// Revoked nodes; `None` for a list that only names serial numbers, as other CAs than a fleet's write them.
+    pub(crate) nodes: Option<RevokedNodes>,
+}
+
+impl RevocationList {
+    fn order(&self) -> (usize, &[u8], &[u8]) {
+        (self.number.len(), &self.number, &self.der)
+    }
+}
+
+/// The lists of one CA that are in force.
+#[derive(Clone, Default)]
+pub(crate) struct CaLists {
+    /// Of lists that name serial numbers only, the one with the greatest number: such a list is the whole truth of its
+    /// CA, which may take an entry off again (RFC 5280, 5.3.1, certificateHold).
+    plain: Option<Arc<RevocationList>>,
+    /// Lists of a fleet, by rising number. They count together, and none of them is covered by the others.
+    fleet: Vec<Arc<RevocationList>>,
+    /// What those revoke together.
+    nodes: Arc<RevokedNodes>,
+}
+
+impl CaLists {
+    /// With one more list; `Ok(None)` if it is no news.
+    pub(crate) fn with(&self, list: Arc<RevocationList>) -> Result<Option<Self>, CrlError> {
+        let Some(added) = &list.nodes else {
+            let is_newer = |known: &Arc<RevocationList>| is_greater(&list.number, &known.number);
+            return Ok(self
+                .plain
+                .as_ref()
+                .is_none_or(is_newer)
+                .then(|| Self { plain: Some(list), ..self.clone() }));
+        };
+        let mut nodes = RevokedNodes::clone(&self.nodes);
+        let mut grows = false;
+        for (node, revocation) in added {
+            grows |= add_revocation(&mut nodes, *node, *revocation);
+        }
+        if nodes.len() > REVOKED_NODES_MAX {
+            return Err(CrlError::TooManyNodes);
+        }
+        let mut fleet = self.fleet.clone();
+        let place = fleet.partition_point(|known| known.order() < list.order());
+        fleet.insert(place, list);
+        drop_covered(&mut fleet, &nodes);
+        if !grows && fleet.len() >= self.fleet.len() {
+            return Ok(None);
+        }
+        if fleet.len() > FLEET_LISTS_MAX {
+            return Err(CrlError::TooManyLists);
+        }
+        Ok(Some(Self { plain: self.plain.clone(), fleet, nodes: Arc::new(nodes) }))
+    }
+
+    /// With the lists in force elsewhere that are news here and fit.
+    pub(crate) fn with_all_of(&self, other: &Self) -> Self {
+        let mut all = self.clone();
+        for list in other.lists() {
+            if let Ok(Some(more)) = all.with(Arc::clone(list)) {
+                all = more;
+            }
+        }
+        all
+    }
+
+    /// The lists in force, from which another node learns all that is revoked.
+    pub(crate) fn lists(&self) -> impl Iterator<Item = &Arc<RevocationList>> {
+        self.plain.iter().chain(&self.fleet)
+    }
+
+    /// Since when a certificate with this serial number is revoked by it.
+    pub(crate) fn serial_revoked_at(&self, serial: &[u8]) -> Option<UnixMillis> {
+        self.lists().filter_map(|list| list.serials.get(serial)).min().copied()
+    }
+
+    /// Revoked nodes.
+    pub(crate) fn nodes(&self) -> &RevokedNodes {
+        &self.nodes
+    }
+
+    /// The greatest number of a fleet's list.
+    pub(crate) fn fleet_number(&self) -> Option<&[u8]> {
+        self.fleet.last().map(|list| &*list.number)
+    }
+}
+
+/// Takes out every list of which the others say everything, from the oldest on.
+fn drop_covered(lists: &mut Vec<Arc<RevocationList>>, all: &RevokedNodes) {
+    // Of each node one revocation counts; how many of the lists have that one?
+    let decisive = |list: &RevocationList| {
+        let nodes: Vec<_> = list.nodes.iter().flatten().filter(|(n, r)| all.get(n) == Some(r)).collect();
+        nodes.into_iter().map(|(node, _)| *node).collect::<Vec<_>>()
+    };
+    let mut holders: BTreeMap<Pseudonym, usize> = BTreeMap::new();
+    for node in lists.iter().flat_map(|list| decisive(list)) {
+        *holders.entry(node).or_default() += 1;
+    }
+    lists.retain(|list| {
+        let nodes = decisive(list);
+        let is_needed = nodes.iter().any(|node| holders.get(node) == Some(&1));
+        if !is_needed {
+            nodes.iter().filter_map(|node| holders.get_mut(node).map(|n| *n -= 1)).count();
+        }
+        is_needed
+    });
+}
+
+fn is_greater(number: &[u8], than: &[u8]) -> bool {
+    (number.len(), number) > (than.len(), than)
+}
