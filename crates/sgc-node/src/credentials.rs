@@ -1,11 +1,12 @@
 //! What a node keeps of trust over restarts: the revocation lists that it knows, and its own renewed credentials.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_trust::{CLOCK_SKEW, Identity, TrustAnchors, VerifiedPeer};
+use sgc_trust::{CLOCK_SKEW, CaFingerprint, Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{CRL_BYTES_MAX, Credentials, Now};
 use tokio::sync::{mpsc, watch};
 use tracing::{debug, warn};
@@ -14,8 +15,10 @@ use crate::state;
 
 /// Where revocation lists are kept, below the state directory.
 const CRL_DIR: &str = "crl";
-/// Most lists that are read: one for each CA that can be trusted.
-const CRL_FILES_MAX: usize = sgc_trust::ANCHORS_MAX;
+/// Most files that are looked at: all lists of all CAs that can be trusted.
+const CRL_FILES_MAX: usize = sgc_trust::ANCHORS_MAX * (sgc_trust::FLEET_LISTS_MAX + 1);
+/// Bytes of a list's digest that are in the name of its file, to tell the lists of one CA apart.
+const CRL_NAME_BYTES: usize = 8;
 /// Part of a certificate's time that is left when it is renewed: a third.
 const RENEW_PART: u64 = 3;
 /// Shortest time between two requests for a certificate.
@@ -93,19 +96,41 @@ fn keep_newest<T: Send + Sync + 'static>(
     give
 }
 
+/// Writes the lists in force that are not on the disk yet, then removes those of the same CAs that are in force no more:
+/// whenever the process ends, what is there says at least as much as before.
 fn keep_crls(dir: &Path, anchors: &TrustAnchors) {
     let dir = dir.join(CRL_DIR);
     let made = state::create_state_dir(&dir).map_err(|e| e.to_string());
-    for (ca, der) in anchors.crls_by_ca() {
-        let path = dir.join(format!("{ca}.crl"));
+    let mut kept = BTreeSet::new();
+    let mut cas = BTreeSet::new();
+    for (ca, digest, der) in anchors.crls_by_ca() {
+        let file = crl_file_name(ca, &digest);
+        let path = dir.join(&file);
+        cas.insert(ca.to_string());
+        kept.insert(file);
+        if state::read(&path, CRL_BYTES_MAX as u64).is_ok_and(|there| there.as_deref() == Some(der)) {
+            continue;
+        }
         let written = made.clone().and_then(|()| state::replace(&path, der).map_err(|e| e.to_string()));
-        match written {
-            Ok(()) => debug!(path = %path.display(), "revocation list kept"),
-            Err(error) => {
-                warn!(path = %path.display(), %error, "a revocation list could not be kept for the next start")
-            }
+        if let Err(error) = written {
+            warn!(path = %path.display(), %error, "a revocation list could not be kept for the next start");
+            return;
+        }
+        debug!(path = %path.display(), "revocation list kept");
+    }
+    for entry in std::fs::read_dir(&dir).into_iter().flatten().flatten() {
+        let file = entry.file_name().to_string_lossy().into_owned();
+        let is_of_ca = file.split(['-', '.']).next().is_some_and(|ca| cas.contains(ca));
+        if is_of_ca && file.ends_with(".crl") && !kept.contains(&file) {
+            let _ = std::fs::remove_file(entry.path());
         }
     }
+}
+
+/// By CA and content, so that each of several lists has a name of its own, and always the same.
+fn crl_file_name(ca: &CaFingerprint, digest: &[u8; 32]) -> String {
+    let digits: String = digest.iter().take(CRL_NAME_BYTES).map(|byte| format!("{byte:02x}")).collect();
+    format!("{ca}-{digits}.crl")
 }
 
 fn keep_identity(file: &Path, identity: &Identity) {
