@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
-use sgc_trust::{EnrollRequest, Fleet, Identity, TrustAnchors};
+use sgc_trust::{EnrollRequest, Fleet, Identity, Revocation, TrustAnchors};
 use sgc_wire::UnixMillis;
 
 use crate::clock::GENESIS;
@@ -34,6 +34,8 @@ pub struct Member {
     pub valid: Option<Duration>,
     /// Which certificate of the node this is; 0 for the first.
     pub renewal: u32,
+    /// How often it was enrolled again after it had been revoked.
+    pub incarnation: u32,
 }
 
 impl Member {
@@ -48,6 +50,7 @@ impl Member {
             from: None,
             valid: None,
             renewal: 0,
+            incarnation: 0,
         }
     }
 }
@@ -92,12 +95,28 @@ pub fn identity(member: &Member) -> Arc<Identity> {
         valid: member.valid.unwrap_or(usual.valid),
         ..usual
     };
-    let seed = match member.renewal {
-        0 => format!("{}/{}", member.fleet, member.name),
-        n => format!("{}/{}/{n}", member.fleet, member.name),
+    let seed = match (member.renewal, member.incarnation) {
+        (0, 0) => format!("{}/{}", member.fleet, member.name),
+        (n, 0) => format!("{}/{}/{n}", member.fleet, member.name),
+        (n, again) => format!("{}/{}/{n}/{again}", member.fleet, member.name),
     };
     let fleet = cast.fleet(&member.fleet);
-    let identity = Arc::new(fleet.issue(&request, &mut rng(&seed)).expect("a fresh CA enrols"));
+    let made = match member.incarnation {
+        0 => fleet.issue(&request, &mut rng(&seed)),
+        again => {
+            // In a copy of the fleet's file, so that what is made of others does not depend on the order.
+            let mut copy = Fleet::parse(&fleet.to_text()).expect("it was written by itself");
+            let request = EnrollRequest { again: true, ..request };
+            copy.enroll(&request, &mut rng(&seed)).expect("a fresh CA enrols");
+            (0..again)
+                .fold(None, |_, _| {
+                    copy.revoke(std::slice::from_ref(&request.node), request.now).expect("it is enrolled");
+                    Some(copy.enroll(&request, &mut rng(&seed)))
+                })
+                .expect("at least once")
+        }
+    };
+    let identity = Arc::new(made.expect("a fresh CA enrols"));
     cast.identities.insert(member.clone(), identity.clone());
     identity
 }
@@ -108,8 +127,21 @@ pub(crate) fn with_fleet(anchors: &TrustAnchors, fleet: &str) -> TrustAnchors {
     anchors.with_anchors([ca]).expect("a CA that was made well")
 }
 
-/// A list of its fleet's CA that revokes these members, in that order of lists.
+/// A list of a fleet that revokes these members in their incarnations and says nothing of any other: also such as a copy
+/// of the fleet's file makes that does not know what another one revoked.
 pub fn revocation_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
+    let mut cast = cast();
+    let fleet = cast.fleet(fleet);
+    let revoked = |m: &Member| {
+        let revocation = Revocation { incarnation: m.incarnation, at: GENESIS };
+        (fleet.secret().pseudonym(&m.name), revocation)
+    };
+    let revoked: Vec<_> = members.iter().map(revoked).collect();
+    fleet.revocation_list_of_nodes(&revoked, number, GENESIS).expect("a fresh CA signs").into()
+}
+
+/// A list of serial numbers, as a CA writes it that knows nothing of SGC.
+pub fn serial_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     let revoked: Vec<_> =
         members.iter().map(|m| (identity(m).as_peer().cert.serial.clone(), GENESIS)).collect();
     let mut cast = cast();

@@ -45,7 +45,7 @@ mod world;
 pub use allocator::{
     Allocations, CountingAllocator, allocated_here, allocations, allocations_of, live_bytes,
 };
-pub use cast::{Member, identity, revocation_list};
+pub use cast::{Member, identity, revocation_list, serial_list};
 pub use clock::Clock;
 pub use evil::{Captured, CapturedPacket};
 pub use model::Model;

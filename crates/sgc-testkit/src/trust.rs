@@ -69,6 +69,15 @@ impl World {
         self.settle(node);
     }
 
+    /// Makes a node one again that was revoked: it starts with an identity of its next incarnation.
+    pub fn enroll_again(&mut self, node: NodeKey) {
+        self.note(format!("enroll {node:?} again"));
+        let member = &mut self.members[node.0];
+        member.incarnation += 1;
+        self.nodes[node.0].identity = identity(member);
+        self.restart(node);
+    }
+
     /// Gives a node a revocation list, as its user would; true if it is news to it.
     pub fn hand_crl(&mut self, node: NodeKey, der: &Bytes) -> bool {
         self.note(format!("hand a revocation list to {node:?}"));

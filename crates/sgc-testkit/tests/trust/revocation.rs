@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sgc_endpoint::{Event, JoinStatus, RefusedBy, Sink, SinkDrop, SinkLimits};
 use sgc_router::LinkClose;
-use sgc_testkit::{Member, NodeKey, Sharing, World, WorldConfig, revocation_list};
+use sgc_testkit::{Member, NodeKey, Sharing, World, WorldConfig, revocation_list, serial_list};
 use sgc_trust::OpenError;
 use sgc_wire::{RefuseReason, RejectReason};
 
@@ -341,11 +341,19 @@ fn an_older_list_and_one_of_another_ca_change_nothing() {
     let newer = revoke(world, &[*tab], 5);
     assert!(world.hand_crl(*arm, &newer));
     world.run(ms(500));
-    for number in [1, 4, 5] {
-        let older = revoke(world, &[*desk, *lap], number);
-        assert!(!world.hand_crl(*arm, &older));
-        world.inject(*west, *desk, &sgc_wire::Control::Crl { der: older });
+    // Nor does a list with a greater number that leaves it out.
+    for number in [1, 4, 5, 99] {
+        for who in [&[][..], &[*tab]] {
+            let list = revoke(world, who, number);
+            assert!(!world.hand_crl(*arm, &list));
+            world.inject(*west, *desk, &sgc_wire::Control::Crl { der: list });
+        }
     }
+    // A list of serial numbers stands beside those of the fleet, and only a newer one takes its place.
+    let on_hold = serial_list("acme", &[world.member(*lap).clone()], 7);
+    assert!(world.hand_crl(*arm, &serial_list("acme", &[], 8)));
+    assert!(!world.hand_crl(*arm, &on_hold));
+    world.inject(*west, *desk, &sgc_wire::Control::Crl { der: on_hold });
     // The list of another fleet's CA, which names serial numbers of ours as well.
     let members = [world.member(*desk).clone(), world.member(umbrella).clone()];
     let foreign = revocation_list("umbrella", &members, 99);
@@ -409,6 +417,107 @@ fn a_list_goes_over_a_net_with_rings_once_over_each_link_and_way() {
     let sent = world.captured().iter().filter(|c| matches!(c.frame, sgc_wire::Control::Crl { .. })).count();
     assert!(sent <= 2 * 7, "{sent}");
     assert_eq!(closed(&world, routers[2]), [LinkClose::Revoked]);
+}
+
+/// Links `node` to another router and lets it try what it can; true if it got the topic of `owner`.
+fn comes_back(world: &mut World, node: NodeKey, owner: NodeKey) -> bool {
+    let published = publish_steadily(world, owner, ms(50), ms(20_000), |_, _| ());
+    let heard = world.received(node, owner, "/chatter").iter().any(|id| published.contains(id));
+    heard || world.status(node, owner, "/chatter") == Some(JoinStatus::Granted)
+}
+
+#[test]
+fn a_certificate_that_was_renewed_elsewhere_is_revoked_with_its_node() {
+    for linked in [true, false] {
+        let mut scene = flowing(48);
+        let staying = scene.without(scene.tab);
+        let Scene { world, arm, east, west, tab, .. } = &mut scene;
+        let before = world.identity(*tab).as_peer().cert.clone();
+        // The copy of the fleet's file that revokes the node has never heard of this certificate.
+        world.renew(*tab);
+        assert_ne!(world.identity(*tab).as_peer().cert, before);
+        if linked {
+            world.restart(*tab);
+            world.run(ms(5000));
+            assert_eq!(world.status(*tab, *arm, "/chatter"), Some(JoinStatus::Granted));
+        } else {
+            world.crash(*tab);
+        }
+        let list = revoke(world, &[*tab], 1);
+        assert!(world.hand_crl(*east, &list));
+        world.run(ms(500));
+        world.start(*tab);
+        assert!(!comes_back(world, *tab, *arm));
+        assert!(closed(world, *west).contains(&LinkClose::Revoked));
+        // Nor does the next renewal help it.
+        world.renew(*tab);
+        world.restart(*tab);
+        let published = publish_steadily(world, *arm, ms(50), ms(5000), |_, _| ());
+        world.run(ms(500));
+        assert_nothing_received(world, *tab, *arm, &published);
+        for user in staying {
+            assert_received(&scene.world, user, scene.arm, &published);
+        }
+    }
+}
+
+#[test]
+fn lists_of_two_copies_of_a_fleet_add_up_everywhere() {
+    for order in [[0, 1], [1, 0]] {
+        let mut scene = flowing(49);
+        let Scene { world, arm, east, west, desk, lap, tab, .. } = &mut scene;
+        let lists = [revoke(world, &[*tab], 1), revoke(world, &[*lap], 2)];
+        for (at, which) in [*east, *west].into_iter().zip(order) {
+            assert!(world.hand_crl(at, &lists[which]));
+            world.run(ms(500));
+        }
+        // Also one that was off and has no disk is told both.
+        world.crash(*west);
+        world.forget_disk(*west);
+        world.start(*west);
+        world.run(ms(2000));
+        for node in [*arm, *east, *west, *desk] {
+            assert!(!world.believes(node, *tab) && !world.believes(node, *lap), "{order:?} {node:?}");
+            assert_eq!(world.revocations(node).len(), 2);
+        }
+        for revoked in [*tab, *lap] {
+            world.restart(revoked);
+        }
+        let published = publish_steadily(world, *arm, ms(50), ms(20_000), |_, _| ());
+        world.run(ms(500));
+        for revoked in [*tab, *lap] {
+            assert_nothing_received(world, revoked, *arm, &published);
+        }
+        let late = &published[published.len() / 2..];
+        assert_received(world, *desk, *arm, late);
+        // The list of the merged file takes the place of both.
+        let merged = revoke(world, &[*tab, *lap], 3);
+        assert!(world.hand_crl(*arm, &merged));
+        world.run(ms(500));
+        for node in [*arm, *east, *west, *desk] {
+            assert_eq!(world.revocations(node), std::slice::from_ref(&merged), "{node:?}");
+        }
+    }
+}
+
+#[test]
+fn a_node_that_was_enrolled_again_is_one_again_and_its_old_certificates_are_not() {
+    let mut scene = flowing(50);
+    let Scene { world, arm, east, tab, .. } = &mut scene;
+    let old = world.identity(*tab).as_peer().clone();
+    let list = revoke(world, &[*tab], 1);
+    world.hand_crl(*east, &list);
+    world.run(ms(500));
+    world.enroll_again(*tab);
+    assert!(comes_back(world, *tab, *arm));
+    let anchors = world.identity(*tab).anchors().with_crl(&list, old.not_after).unwrap().unwrap();
+    assert!(anchors.is_peer_revoked(&old) && !anchors.is_peer_revoked(world.identity(*tab).as_peer()));
+    // It can be revoked in its new incarnation as in the old one.
+    let list = revoke(world, &[*tab], 2);
+    assert!(world.hand_crl(*east, &list));
+    world.run(ms(500));
+    world.restart(*tab);
+    assert!(!comes_back(world, *tab, *arm));
 }
 
 /// Keeps revocation lists from crossing a link.
