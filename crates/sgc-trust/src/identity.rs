@@ -5,6 +5,7 @@
 //! certificate still holds is for its user to ask. No output of this module but [`Identity::to_text`] holds a
 //! secret.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 
@@ -18,7 +19,7 @@ use zeroize::Zeroizing;
 
 use crate::issue;
 use crate::key::Key;
-use crate::label::{FleetName, LabelError, NodeName};
+use crate::label::{FleetName, GroupName, LabelError, NodeName};
 use crate::member::{
     self, ABOUT_BLOCK, CA_BLOCK, CHAIN_BLOCK, FileParts, KEY_BLOCK, Membership, check_generations,
 };
@@ -68,14 +69,35 @@ impl Identity {
     }
 
     /// An identity from a certificate of an existing PKI, made for a request as [`Identity::csr`] or
-    /// `sgc fleet request` writes it. Without a secret it is a router's.
+    /// `sgc fleet request` writes it. Without a secret it is a router's. The certificate has to say what was asked for
+    /// and no more: whoever signed it may not know what its names mean.
     pub fn import(import: Import, rng: &mut impl CryptoRng) -> Result<Self, IdentityError> {
-        let Import { node, fleet, chain, key, cas, secret } = import;
+        let Import { node, fleet, chain, key, cas, secret, groups, may_route } = import;
+        let tag = |secret: &FleetSecret, group: &GroupName| secret.group_tag(group.as_str());
+        let asked: BTreeSet<_> =
+            secret.iter().flat_map(|s| groups.iter().map(|group| tag(s, group))).collect();
+        let is_router = secret.is_none();
         let naming = secret.iter().map(|s| NamingSecret { generation: 1, secret: s.clone() }).collect();
         let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
         let (authority, post_quantum) = (None, false);
         let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
-        Self::join(member, &key, rng)
+        let identity = Self::join(member, &key, rng)?;
+        let own = &identity.own;
+        if own.may_route && !may_route && !is_router {
+            return Err(IdentityError::UnaskedRole);
+        }
+        if may_route && !own.may_route {
+            return Err(IdentityError::MissingRole);
+        }
+        if own.incarnation > 0 {
+            return Err(IdentityError::UnaskedIncarnation);
+        }
+        let unasked = own.groups.iter().filter(|group| !asked.contains(group)).count();
+        let missing = asked.iter().filter(|group| !own.is_in(group)).count();
+        if unasked > 0 || missing > 0 {
+            return Err(IdentityError::OtherGroups { unasked, missing });
+        }
+        Ok(identity)
     }
 
     /// Everything in one text, for a file that only its owner may read.
@@ -306,6 +328,10 @@ pub struct Import {
     pub cas: Vec<CertificateDer<'static>>,
     /// The fleet's secret; the certificate's pseudonym has to be the node's under it.
     pub secret: Option<FleetSecret>,
+    /// The groups that it is to be in; none without the secret.
+    pub groups: Vec<GroupName>,
+    /// True for a member that is to route for others as well. A router may in any case.
+    pub may_route: bool,
 }
 
 /// Why a text is no identity.
@@ -364,6 +390,33 @@ pub enum IdentityError {
     /// A private key where none belongs.
     #[error("this is an identity with its private key, not an answer to a request for one")]
     HasKey,
+    /// The certificate lets the node route, and nobody asked for it.
+    #[error(
+        "the certificate lets the node route for others (URI sgc:role:router), which was not asked for: `--may-route` if \
+         it is meant, or else have the CA sign the request again with reviewed extensions (`sgc fleet extensions`)"
+    )]
+    UnaskedRole,
+    /// The certificate is of a later incarnation of its node: a revocation of the node would pass over it.
+    #[error(
+        "the certificate is of a later incarnation of the node (URI sgc:incarnation:…), which was not asked for: have the \
+         CA sign the request again with reviewed extensions (`sgc fleet extensions`)"
+    )]
+    UnaskedIncarnation,
+    /// The certificate does not let the node route.
+    #[error("the certificate does not let the node route for others: it lacks the URI sgc:role:router")]
+    MissingRole,
+    /// The certificate's groups are not those that were asked for.
+    #[error(
+        "the certificate's groups are not those of `--group`: it has {unasked} that were not asked for, and lacks \
+         {missing}; name them all, or have the CA sign the request again with reviewed extensions (`sgc fleet \
+         extensions`)"
+    )]
+    OtherGroups {
+        /// Groups of the certificate that were not asked for.
+        unasked: usize,
+        /// Groups that the certificate lacks.
+        missing: usize,
+    },
     /// The certificate is for a node of another name, or the secret is another fleet's.
     #[error("the certificate is not that of node \"{node}\" under the fleet secret in this file")]
     NameMismatch {

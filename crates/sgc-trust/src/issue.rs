@@ -2,6 +2,7 @@
 //!
 //! It keeps nothing and decides nothing: who gets what is [`crate::Fleet`]'s to know.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,10 +22,12 @@ use zeroize::Zeroizing;
 use crate::fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY};
 use crate::fleet_error::FleetError;
 use crate::key::Key;
+use crate::label::{GroupName, NodeName};
 use crate::member::KEY_BLOCK;
 use crate::pem;
 use crate::revocations::{REVOKED_NODES_MAX, RevokedNodes};
-use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI};
+use crate::secret::FleetSecret;
+use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI, sha256};
 use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Validity};
 
 /// The year 9000: what certificates can say ends a little later.
@@ -254,6 +257,15 @@ impl RequestedKey {
     }
 }
 
+/// Returns a hash of the key that a request (PKCS #10, DER) is about; that the key signed it is not checked. Requests
+/// that cannot be read differ by all their bytes.
+pub fn requested_key_hash(request: &[u8]) -> [u8; 32] {
+    match RequestFields::of(request) {
+        Some(RequestFields { key: (algorithm, key), .. }) => sha256(&[algorithm, key]),
+        None => sha256(&[request]),
+    }
+}
+
 impl PublicKeyData for RequestedKey {
     fn der_bytes(&self) -> &[u8] {
         &self.key
@@ -302,17 +314,28 @@ fn sans(
     incarnation: u32,
 ) -> Result<Vec<SanType>, FleetError> {
     let uri = |text: String| Ok(SanType::URI(text.try_into().map_err(FleetError::making)?));
-    let mut names = vec![uri(format!("{NODE_URI}{pseudonym}"))?];
-    for group in groups {
-        names.push(uri(format!("{GROUP_URI}{group}"))?);
-    }
-    if may_route {
-        names.push(uri(ROUTER_URI.to_owned())?);
-    }
-    if incarnation > 0 {
-        names.push(uri(format!("{INCARNATION_URI}{incarnation}"))?);
-    }
-    Ok(names)
+    uris(pseudonym, groups, may_route, incarnation).into_iter().map(uri).collect()
+}
+
+fn uris(pseudonym: &Pseudonym, groups: &[GroupTag], may_route: bool, incarnation: u32) -> Vec<String> {
+    let mut uris = vec![format!("{NODE_URI}{pseudonym}")];
+    uris.extend(groups.iter().map(|group| format!("{GROUP_URI}{group}")));
+    uris.extend(may_route.then(|| ROUTER_URI.to_owned()));
+    uris.extend((incarnation > 0).then(|| format!("{INCARNATION_URI}{incarnation}")));
+    uris
+}
+
+/// Returns the subject alternative names, URIs, that the certificate of a node needs from a CA that knows nothing of
+/// SGC.
+pub fn certificate_uris(
+    secret: &FleetSecret,
+    node: &NodeName,
+    groups: &[GroupName],
+    may_route: bool,
+) -> Vec<String> {
+    let groups: BTreeSet<_> = groups.iter().map(|group| secret.group_tag(group.as_str())).collect();
+    let groups: Vec<_> = groups.into_iter().collect();
+    uris(&secret.pseudonym(node.as_str()), &groups, may_route, 0)
 }
 
 fn common_name(name: &str) -> DistinguishedName {

@@ -45,7 +45,7 @@ pub use fleet::{
 pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, IdentityError, Import};
-pub use issue::KeyRequest;
+pub use issue::{KeyRequest, certificate_uris, requested_key_hash};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
@@ -67,3 +67,4 @@ pub use verify::{
     ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, NodeIncarnation, SignatureError,
     TrustAnchors, VerifiedPeer, node_id,
 };
+pub use x509::serial_of;

@@ -15,13 +15,15 @@ use webpki::{EndEntityCert, ExtendedKeyUsageValidator, KeyPurposeIdIter, aws_lc_
 
 use crate::chains::{ChainHash, KnownChains};
 use crate::revocations::CaLists;
-use crate::x509::{Validity, split_spki, without_zeros};
+use crate::x509::{Validity, names_certificate_signing, path_length, split_spki, without_zeros};
 
 /// Most groups of one node: that many fit into [`CERT_BYTES_MAX`].
 pub const GROUPS_MAX: usize = 32;
 /// Most CAs that one node trusts.
 pub const ANCHORS_MAX: usize = 64;
 
+/// Prefix of every URI that SGC reads in certificates.
+const SGC_URI: &str = "sgc:";
 pub(crate) const NODE_URI: &str = "sgc:node:";
 pub(crate) const GROUP_URI: &str = "sgc:group:";
 /// In certificates of nodes that may carry others' names.
@@ -71,6 +73,8 @@ pub(crate) struct Anchor {
     pub(crate) spki: Box<[u8]>,
     pub(crate) fingerprint: CaFingerprint,
     pub(crate) validity: Validity,
+    /// Most intermediate CAs below it, if it limits them.
+    path_length: Option<usize>,
 }
 
 impl TrustAnchors {
@@ -145,6 +149,15 @@ impl TrustAnchors {
         let mut certs = Vec::with_capacity(chain.len());
         let mut between: Vec<_> = path.intermediate_certificates().collect();
         between.reverse();
+        // Path validation takes the limit of a trusted CA for none.
+        if ca.path_length.is_some_and(|most| between.len() > most) {
+            return Err(CertError::PathTooLong { intermediates: between.len() });
+        }
+        if names_certificate_signing(leaf_der) != Some(false)
+            || between.iter().any(|c| c.valid_uri_names().any(|uri| uri.starts_with(SGC_URI)))
+        {
+            return Err(CertError::NodeIsCa);
+        }
         for certificate in between {
             certs.push(CertId::new(issuer, certificate.serial()));
             issuer = CaFingerprint(sha256(&[&certificate.subject_public_key_info()]));
@@ -194,8 +207,9 @@ impl Anchor {
         let spki: Box<[u8]> =
             EndEntityCert::try_from(&der).map_err(reason)?.subject_public_key_info().as_ref().into();
         let validity = Validity::of(&der).ok_or("its validity cannot be read")?;
+        let path_length = path_length(&der).ok_or("its path length cannot be read")?;
         let fingerprint = CaFingerprint(sha256(&[&spki]));
-        Ok((Self { der, spki, fingerprint, validity }, path))
+        Ok((Self { der, spki, fingerprint, validity, path_length }, path))
     }
 
     /// While this CA and all of these hold.
@@ -473,10 +487,24 @@ pub enum CertError {
     Malformed(String),
     /// The leaf does not say which node it is for.
     #[error(
-        "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign a \
-         request that `sgc fleet request` made, with its subject alternative names"
+        "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign the \
+         request of `sgc fleet request` with the extensions that `sgc fleet extensions` writes"
     )]
     NoPseudonym,
+    /// A certificate names a node and may sign certificates.
+    #[error(
+        "a node's certificate is that of a CA as well (basic constraints, or key usage keyCertSign), and could make any \
+         node: its CA has to sign the request again with the extensions that `sgc fleet extensions` writes"
+    )]
+    NodeIsCa,
+    /// The path has more intermediate CAs than the trusted one permits.
+    #[error(
+        "there are {intermediates} CAs between the certificate and the trusted CA, which permits fewer (path length)"
+    )]
+    PathTooLong {
+        /// Certificates between the leaf and the trusted CA.
+        intermediates: usize,
+    },
     /// The leaf names too many groups.
     #[error("the certificate names more than {GROUPS_MAX} groups")]
     TooManyGroups,
@@ -556,6 +584,7 @@ impl CertError {
             }
             E::UnknownIssuer => Self::UnknownIssuer,
             E::InvalidSignatureForPublicKey => Self::BadSignature,
+            E::CaUsedAsEndEntity => Self::NodeIsCa,
             E::EmptyEkuExtension | E::RequiredEkuNotFoundContext(_) => Self::WrongUsage,
             other => Self::Malformed(other.to_string()),
         }

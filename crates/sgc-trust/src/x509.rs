@@ -80,7 +80,7 @@ pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
 }
 
 /// The serial number of a DER certificate, without leading zeros.
-pub(crate) fn serial_of(certificate: &[u8]) -> Option<&[u8]> {
+pub fn serial_of(certificate: &[u8]) -> Option<&[u8]> {
     let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
     if tbs.peek()? == VERSION {
         tbs.skip()?;
@@ -188,6 +188,30 @@ fn object_id(content: &[u8]) -> Option<Vec<u64>> {
 /// True unless a DER certificate has a key usage that leaves out the signing of revocation lists.
 pub(crate) fn may_sign_lists(certificate: &[u8]) -> Option<bool> {
     Some(key_usage(certificate)?.is_none_or(|bits| bits & CRL_SIGN != 0))
+}
+
+/// True if the key usage of a DER certificate names the signing of certificates.
+pub(crate) fn names_certificate_signing(certificate: &[u8]) -> Option<bool> {
+    Some(key_usage(certificate)?.is_some_and(|bits| bits & KEY_CERT_SIGN != 0))
+}
+
+/// Most intermediate CAs below that of a DER certificate, if its basic constraints limit them.
+pub(crate) fn path_length(certificate: &[u8]) -> Option<Option<usize>> {
+    let Some(extensions) = extensions_of(certificate)? else { return Some(None) };
+    let Some(content) = extensions.find_extension(BASIC_CONSTRAINTS)? else { return Some(None) };
+    let mut constraints = Der(content).enter(SEQUENCE)?;
+    if constraints.peek() == Some(BOOLEAN) {
+        constraints.skip()?;
+    }
+    if constraints.peek().is_none() {
+        return Some(None);
+    }
+    // A longer number is no limit that a chain could reach.
+    match constraints.enter(INTEGER)?.0 {
+        [length] if *length < 0x80 => Some(Some(usize::from(*length))),
+        [first, ..] if *first < 0x80 => Some(None),
+        _ => None,
+    }
 }
 
 /// The first byte of its key usage, if it has one.

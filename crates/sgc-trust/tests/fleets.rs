@@ -409,6 +409,8 @@ fn certificates_of_another_pki_make_identities() {
             key: Zeroizing::new(key.serialize_der()),
             cas: vec![ca.clone()],
             secret: secret.cloned(),
+            groups: vec![],
+            may_route: false,
         };
         Identity::import(import, &mut rng(1))
     };

@@ -5,7 +5,10 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
-use rcgen::{CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
+    KeyUsagePurpose, SanType, SigningKey,
+};
 use rustls_pki_types::CertificateDer;
 use sgc_trust::*;
 use sgc_wire::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, Metadata, Pseudonym, UnixMillis};
@@ -216,7 +219,7 @@ fn chains_are_bounded() {
     assert_eq!(verify(&[leaf, big]), CertError::CertificateTooLong { bytes: CERT_BYTES_MAX + 1 });
     assert!(matches!(verify(&[CertificateDer::from(vec![0x30; 9])]), CertError::Malformed(_)));
     // The CA is no node.
-    assert!(matches!(verify(&[fleet.ca_certificate().clone()]), CertError::Malformed(_)));
+    assert_eq!(verify(&[fleet.ca_certificate().clone()]), CertError::NodeIsCa);
     assert_eq!(TrustAnchors::new([]).unwrap_err(), AnchorError::None);
     let many = vec![fleet.ca_certificate().clone(); ANCHORS_MAX + 1];
     assert_eq!(TrustAnchors::new(many).unwrap_err(), AnchorError::TooMany);
@@ -283,6 +286,82 @@ fn leaves_of_an_existing_pki_are_judged_by_what_they_say() {
     }
     let p521 = &rcgen::PKCS_ECDSA_P521_SHA512;
     assert_eq!(ca.issue(&[node], None, p521).unwrap_err(), CertError::KeyUnsupported);
+}
+
+/// A CA below `issuer`, with these URIs in its certificate.
+fn ca_below(
+    issuer: &Issuer<'_, impl SigningKey>,
+    uris: &[&str],
+) -> (CertificateDer<'static>, Issuer<'static, KeyPair>) {
+    let mut params = CertificateParams::default();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    params.distinguished_name.push(DnType::CommonName, "below");
+    params.subject_alt_names = uris.iter().map(|u| SanType::URI((*u).try_into().unwrap())).collect();
+    let key = KeyPair::generate().unwrap();
+    let made = params.signed_by(&key, issuer).unwrap();
+    (made.into(), Issuer::new(params, key))
+}
+
+#[test]
+fn a_node_whose_certificate_is_a_cas_is_refused_and_so_is_what_it_signs() {
+    let ca = ForeignCa::new();
+    let node = format!("sgc:node:{}", Pseudonym([0xab; 32]));
+    let victim = format!("sgc:node:{}", Pseudonym([1; 32]));
+    let top = Issuer::from_params(&ca.params, &ca.key);
+    // What `openssl x509 -req -copy_extensions copyall` makes of a request with CA:TRUE.
+    let key = KeyPair::generate().unwrap();
+    let mut params = CertificateParams::default();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    params.distinguished_name.push(DnType::CommonName, "robot");
+    params.subject_alt_names = vec![SanType::URI(node.as_str().try_into().unwrap())];
+    let robot: CertificateDer<'_> = params.signed_by(&key, &top).unwrap().into();
+    assert_eq!(ca.anchors.verify(std::slice::from_ref(&robot), NOW).unwrap_err(), CertError::NodeIsCa);
+
+    let robot_as_ca = Issuer::from_params(&params, &key);
+    let mut leaf = CertificateParams::default();
+    leaf.subject_alt_names = vec![SanType::URI(victim.as_str().try_into().unwrap())];
+    let forged = leaf.signed_by(&KeyPair::generate().unwrap(), &robot_as_ca).unwrap().into();
+    assert_eq!(ca.anchors.verify(&[forged, robot], NOW).unwrap_err(), CertError::NodeIsCa);
+
+    // A CA that names no node is one that its owner may have made.
+    let (below, below_as_ca) = ca_below(&top, &["https://example.com"]);
+    let good = leaf.signed_by(&KeyPair::generate().unwrap(), &below_as_ca).unwrap().into();
+    assert_eq!(ca.anchors.verify(&[good, below], NOW).unwrap().pseudonym, Pseudonym([1; 32]));
+    for role in ["sgc:role:router", "sgc:group:x", "sgc:later"] {
+        let (below, below_as_ca) = ca_below(&top, &[role]);
+        let forged = leaf.signed_by(&KeyPair::generate().unwrap(), &below_as_ca).unwrap().into();
+        assert_eq!(ca.anchors.verify(&[forged, below], NOW).unwrap_err(), CertError::NodeIsCa, "{role}");
+    }
+
+    // The right to sign certificates without basic constraints is none, and nothing that a node asks for.
+    leaf.key_usages = vec![KeyUsagePurpose::DigitalSignature, KeyUsagePurpose::KeyCertSign];
+    let signer = leaf.signed_by(&KeyPair::generate().unwrap(), &top).unwrap().into();
+    assert_eq!(ca.anchors.verify(&[signer], NOW).unwrap_err(), CertError::NodeIsCa);
+}
+
+#[test]
+fn the_path_length_of_a_trusted_ca_is_kept_to() {
+    for (length, permits) in [(None, true), (Some(1), true), (Some(0), false)] {
+        let mut params = CertificateParams::default();
+        let constraints = length.map_or(BasicConstraints::Unconstrained, BasicConstraints::Constrained);
+        params.is_ca = IsCa::Ca(constraints);
+        params.distinguished_name.push(DnType::CommonName, "Company CA");
+        let key = KeyPair::generate().unwrap();
+        let anchors = TrustAnchors::new([params.self_signed(&key).unwrap().into()]).unwrap();
+        let top = Issuer::new(params, key);
+        let (below, below_as_ca) = ca_below(&top, &[]);
+        let mut leaf = CertificateParams::default();
+        let node = format!("sgc:node:{}", Pseudonym([1; 32]));
+        leaf.subject_alt_names = vec![SanType::URI(node.as_str().try_into().unwrap())];
+        let node_key = KeyPair::generate().unwrap();
+        let direct = leaf.signed_by(&node_key, &top).unwrap().into();
+        assert!(anchors.verify(&[direct], NOW).is_ok());
+        let chain = [leaf.signed_by(&node_key, &below_as_ca).unwrap().into(), below];
+        match anchors.verify(&chain, NOW) {
+            Ok(_) => assert!(permits),
+            Err(why) => assert_eq!((why, permits), (CertError::PathTooLong { intermediates: 1 }, false)),
+        }
+    }
 }
 
 #[test]

@@ -385,6 +385,115 @@ fn a_certificate_of_a_ca_that_keeps_its_key() {
     assert!(!Path::new(&place.path("other.identity")).exists());
 }
 
+impl Place {
+    /// Runs `openssl`, which these tests need.
+    fn openssl(&self, args: &[&str]) -> String {
+        let ran = Command::new("openssl").args(args).current_dir(self.dir.path()).output();
+        let ran = ran.expect("these tests need the program `openssl`");
+        assert!(ran.status.success(), "{args:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        String::from_utf8(ran.stdout).unwrap()
+    }
+
+    /// Has a CA that `openssl` made sign `arm-1.csr`.
+    fn sign(&self, how: &[&str]) {
+        let sign = ["x509", "-req", "-in", "arm-1.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "90"];
+        self.openssl(&[&sign[..], &["-out", "arm-1.pem"], how].concat());
+    }
+}
+
+/// The recipe of docs/fleet.md, and the request of a node that wants more than it is given.
+#[test]
+fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
+    let place = Place::new();
+    place.openssl(&[
+        "req",
+        "-x509",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:P-256",
+        "-nodes",
+        "-keyout",
+        "ca.key",
+        "-out",
+        "ca.pem",
+        "-subj",
+        "/CN=Company CA",
+        "-days",
+        "3650",
+        "-addext",
+        "basicConstraints=critical,CA:TRUE,pathlen:0",
+        "-addext",
+        "keyUsage=critical,keyCertSign,cRLSign",
+    ]);
+    place.good(&["fleet", "create", "acme"]);
+    place.good(&["fleet", "request", "arm-1"]);
+    let said = place.good(&["fleet", "extensions", "arm-1", "--secret", "acme.fleet", "--group", "arms"]);
+    assert!(said.contains("-extfile arm-1.ext") && said.contains("--group arms"), "{said}");
+    place.sign(&["-extfile", "arm-1.ext"]);
+    let accept = [
+        "fleet",
+        "accept",
+        "arm-1.pem",
+        "--ca",
+        "ca.pem",
+        "--node",
+        "arm-1",
+        "--fleet-name",
+        "acme",
+        "--secret",
+        "acme.fleet",
+    ];
+    let said = place.bad(&accept);
+    assert!(said.contains("it has 1 that were not asked for, and lacks 0"), "{said}");
+    let said = place.bad(&[&accept[..], &["--group", "legs"]].concat());
+    assert!(said.contains("it has 1 that were not asked for, and lacks 1"), "{said}");
+    let with_group = [&accept[..], &["--group", "arms"]].concat();
+    assert!(
+        place.bad(&[&with_group[..], &["--may-route"]].concat()).contains("it lacks the URI sgc:role:router")
+    );
+    place.good(&with_group);
+    let identity = place.identity("arm-1.identity");
+    assert!(!identity.as_peer().may_route);
+
+    // The node asks for a role, another group, another name, and to be a CA.
+    let secret = Fleet::parse(&place.read("acme.fleet")).unwrap();
+    let tag = secret.secret().group_tag("operators");
+    let (arm, desk) = (secret.secret().pseudonym("arm-1"), secret.secret().pseudonym("desk"));
+    let greedy = |names: &str, ca: &str| {
+        place.write(
+            "greedy.cnf",
+            &format!(
+                "[req]\ndistinguished_name=dn\nreq_extensions=ext\nprompt=no\n[dn]\nCN=arm-1\n[ext]\n\
+             basicConstraints=critical,CA:{ca}\nsubjectAltName={names}\n"
+            ),
+            0o644,
+        );
+        place.openssl(&["req", "-new", "-key", "arm-1.key", "-config", "greedy.cnf", "-out", "arm-1.csr"]);
+    };
+    let force = [&with_group[..], &["--force"]].concat();
+    greedy(&format!("URI:sgc:node:{desk},URI:sgc:group:{tag},URI:sgc:role:router"), "TRUE");
+    place.sign(&["-extfile", "arm-1.ext"]);
+    place.good(&force);
+    let given = place.identity("arm-1.identity");
+    assert_eq!((given.node_id(), given.groups()), (identity.node_id(), identity.groups()));
+    assert!(!given.as_peer().may_route);
+
+    // The recipe that this page had: whatever the request says, the CA signs.
+    place.sign(&["-copy_extensions", "copyall"]);
+    let said = place.bad(&force);
+    assert!(said.contains("is that of a CA as well") && said.contains("sgc fleet extensions"), "{said}");
+    greedy(&format!("URI:sgc:node:{arm},URI:sgc:role:router"), "FALSE");
+    place.sign(&["-copy_extensions", "copyall"]);
+    let said = place.bad(&[&accept[..], &["--force"]].concat());
+    assert!(said.contains("lets the node route for others") && said.contains("was not asked for"), "{said}");
+    place.good(&[&accept[..], &["--force", "--may-route"]].concat());
+    greedy(&format!("URI:sgc:node:{arm},URI:sgc:incarnation:9"), "FALSE");
+    place.sign(&["-copy_extensions", "copyall"]);
+    let said = place.bad(&[&accept[..], &["--force"]].concat());
+    assert!(said.contains("is of a later incarnation of the node"), "{said}");
+}
+
 #[test]
 fn the_ca_is_shown_and_nothing_else() {
     let place = Place::with_fleet();

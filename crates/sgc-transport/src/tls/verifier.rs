@@ -215,9 +215,11 @@ pub(crate) fn alert(error: &CertError) -> CertificateError {
         CertError::BadSignature => CertificateError::BadSignature,
         CertError::Expired { .. } | CertError::CaExpired { .. } => CertificateError::Expired,
         CertError::NotYetValid { .. } => CertificateError::NotValidYet,
-        CertError::WrongUsage | CertError::NoPseudonym | CertError::KeyUnsupported => {
-            CertificateError::InvalidPurpose
-        }
+        CertError::WrongUsage
+        | CertError::NoPseudonym
+        | CertError::KeyUnsupported
+        | CertError::NodeIsCa
+        | CertError::PathTooLong { .. } => CertificateError::InvalidPurpose,
         CertError::NoCertificate
         | CertError::ChainTooLong { .. }
         | CertError::CertificateTooLong { .. }

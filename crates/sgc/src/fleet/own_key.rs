@@ -4,7 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use rustls_pki_types::CertificateDer;
-use sgc_trust::{FleetName, FleetSecret, Identity, Import, KeyRequest, Membership, NodeName, pem_contents};
+use sgc_trust::{
+    FleetName, FleetSecret, GroupName, Identity, Import, KeyRequest, Membership, NodeName, certificate_uris,
+    pem_contents,
+};
 use zeroize::Zeroizing;
 
 use super::system_rng;
@@ -22,8 +25,8 @@ const KEY_KEPT: &str = "; a key is never overwritten: an identity may need it";
 pub(super) struct RequestArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
     node: String,
-    /// For a CA that knows nothing of SGC: a file with the fleet's secret (a fleet file), so that the request names
-    /// the node as its certificate must
+    /// For a CA that takes names from requests: a file with the fleet's secret (a fleet file), so that the request
+    /// names the node as its certificate must
     #[arg(long, value_name = "FILE")]
     secret: Option<PathBuf>,
     /// Where to write the two files
@@ -52,12 +55,83 @@ pub(super) struct AcceptArgs {
     /// With --ca: a file with the fleet's secret; without it the identity is a router's
     #[arg(long, value_name = "FILE", requires = "ca")]
     secret: Option<PathBuf>,
+    /// With --ca: a group that the certificate has to name, and no others; may be repeated
+    #[arg(long = "group", value_name = "GROUP", requires = "secret")]
+    groups: Vec<String>,
+    /// With --ca: the certificate has to let the member route for others as well
+    #[arg(long, requires = "secret")]
+    may_route: bool,
     /// Where to write the identity [default: NODE.identity]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Replace an identity that is there
     #[arg(long)]
     force: bool,
+}
+
+/// For a CA that knows nothing of SGC: write the extensions that a node's certificate is to have.
+///
+/// The file is in the form of OpenSSL (`openssl x509 -req -extfile`) and holds no secret. The CA takes the extensions
+/// from it and none from the request, so that its keeper decides on name, groups and role.
+#[derive(Debug, Args)]
+pub(super) struct ExtensionsArgs {
+    /// Name of the node: a-z, 0-9, '-', '_' and '.'
+    node: String,
+    /// A file with the fleet's secret (a fleet file)
+    #[arg(long, value_name = "FILE")]
+    secret: PathBuf,
+    /// A group for the node to be in; may be repeated
+    #[arg(long = "group", value_name = "GROUP")]
+    groups: Vec<String>,
+    /// For a node that only routes
+    #[arg(long, conflicts_with_all = ["may_route", "groups"])]
+    router: bool,
+    /// Let a member route for others as well
+    #[arg(long)]
+    may_route: bool,
+    /// Where to write them [default: NODE.ext]
+    #[arg(short, long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+pub(super) fn extensions(args: &ExtensionsArgs) -> Result<(), CliError> {
+    let node: NodeName = args.node.parse()?;
+    let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
+    let secret = read_fleet_secret(&args.secret)?;
+    let may_route = args.router || args.may_route;
+    let path = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("{node}.ext")));
+    let uris = certificate_uris(&secret, &node, &groups, may_route);
+    files::write_public(&path, extensions_text(&node, &groups, may_route, &uris).as_bytes())?;
+    let file = path.display();
+    let mut accept = format!("sgc fleet accept {node}.pem --ca CA.pem --node {node} --fleet-name NAME");
+    if !args.router {
+        accept.push_str(" --secret FILE");
+        groups.iter().for_each(|group| accept.push_str(&format!(" --group {group}")));
+        accept.push_str(if args.may_route { " --may-route" } else { "" });
+    }
+    output::line(format!(
+        "{file}: extensions for the certificate of {node}, no secret. Where the CA is:\n  \
+         openssl x509 -req -in {node}.csr -CA CA.pem -CAkey CA.key -extfile {file} -days 90 -out {node}.pem\n\
+         Then, on the node's machine:\n  {accept}"
+    ))
+}
+
+fn extensions_text(node: &NodeName, groups: &[GroupName], may_route: bool, uris: &[String]) -> String {
+    let groups: Vec<_> = groups.iter().map(GroupName::as_str).collect();
+    let mut text = format!(
+        "# Extensions of the certificate of SGC node {node}\n# groups: {}; routes for others: {}\n\
+         # Sign with these alone: a request may ask for more (-copy_extensions none, as is the default).\n\
+         basicConstraints = critical, CA:FALSE\n\
+         keyUsage = critical, digitalSignature\n\
+         extendedKeyUsage = clientAuth, serverAuth\n\
+         subjectAltName = @sgc\n\n[sgc]\n",
+        if groups.is_empty() { "none".to_owned() } else { groups.join(", ") },
+        if may_route { "yes" } else { "no" },
+    );
+    for (place, uri) in (1..).zip(uris) {
+        text.push_str(&format!("URI.{place} = {uri}\n"));
+    }
+    text
 }
 
 pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
@@ -84,7 +158,8 @@ pub(super) fn request(args: &RequestArgs) -> Result<(), CliError> {
         ),
         Some(_) => format!(
             "{key}: the private key of {node}; it stays here\n\
-             {csr}: the request, no secret. Have the CA sign it with its subject alternative names. Then, here:\n  \
+             {csr}: the request, no secret. Have the CA sign it with the extensions that `sgc fleet extensions \
+             {node}` writes. Then, here:\n  \
              sgc fleet accept CERTIFICATE --ca CA --node {node} --fleet-name NAME --secret FILE"
         ),
     })
@@ -101,6 +176,8 @@ pub(super) fn accept(args: &AcceptArgs) -> Result<(), CliError> {
                 chain: read_certificates(&args.answer)?,
                 cas: read_certificates(ca)?,
                 secret: args.secret.as_deref().map(read_fleet_secret).transpose()?,
+                groups: args.groups.iter().map(|g| g.parse()).collect::<Result<_, _>>()?,
+                may_route: args.may_route,
                 node,
                 fleet,
             };
