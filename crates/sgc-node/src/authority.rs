@@ -1,73 +1,525 @@
-//! What a fleet's authority does for members: looks them up in the fleet's file, and gives them certificates and
-//! the secrets in use.
+//! The fleet's authority: looks members up in the fleet's file, and gives them certificates and the secrets in use.
+//!
+//! Members ask whenever they like, and the file is slow: it is locked, read, signed and replaced as a whole. So the
+//! control task queues requests ([`RenewalQueue`], pure) and hands them in batches to one blocking job at a time
+//! ([`FleetDesk`]), which reads the file once a batch and only for requests that it has not answered before.
 
-use std::path::Path;
-use std::time::Duration;
+use std::collections::{BTreeMap, VecDeque};
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
 
+use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore};
-use sgc_trust::{FleetError, VerifiedPeer};
-use sgc_wire::{Credentials, Now, RefuseReason};
+use sgc_trust::{CertId, Fleet, FleetError, VerifiedPeer, requested_key_hash, serial_of};
+use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId};
 use tracing::{error, info, warn};
 
-use crate::credentials::{is_due, lasts};
+use crate::credentials::{is_due, lasts, renewal_interval};
 use crate::fleet_file::{FleetFileError, LockedFleet};
 
 /// Shortest time for which a new certificate holds.
 const VALID_MIN: Duration = Duration::from_secs(60);
+/// Most nodes whose requests wait for the fleet's file; as many as may stay joined at the renewal name.
+const RENEWALS_WAITING_MAX: usize = 4096;
+/// Most requests that one job answers, so that the lock on the file is not held for long.
+const RENEWAL_BATCH_MAX: usize = 256;
+/// Most nodes whose last answers are remembered.
+const RENEWALS_ANSWERED_MAX: usize = 4096;
 
-/// Answers a member that asks for credentials; reads and writes files. A certificate that has time left is not
-/// replaced: then the chain of the answer is empty. A new one holds for as long as the old one did.
-pub(crate) fn answer(
-    file: &Path,
-    peer: &VerifiedPeer,
-    csr: &[u8],
+/// The place of a request's answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Asker {
+    /// The authority itself: no route leads from a node to itself.
+    Own,
+    /// A member, by the sink that it asked with.
+    Member(SinkId),
+}
+
+/// A node's request for credentials.
+#[derive(Debug)]
+pub(crate) struct RenewalRequest {
+    pub(crate) asker: Asker,
+    pub(crate) peer: VerifiedPeer,
+    pub(crate) csr: Bytes,
+}
+
+/// An answer to a [`RenewalRequest`].
+pub(crate) struct RenewalAnswer {
+    pub(crate) asker: Asker,
+    pub(crate) node: NodeId,
+    pub(crate) answer: Result<Credentials, RenewalRefusal>,
+}
+
+/// Why a request for credentials is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+pub(crate) enum RenewalRefusal {
+    /// Another request of the same node was answered a moment ago.
+    #[error("the node asked for something else a moment ago")]
+    TooSoon,
+    /// Too many nodes wait.
+    #[error("{RENEWALS_WAITING_MAX} nodes wait for the fleet's file already")]
+    QueueFull,
+    /// The fleet's file could not be read or written.
+    #[error("the fleet's file cannot be used")]
+    File,
+    /// The roster lacks the node.
+    #[error("the fleet's roster lacks the node")]
+    UnknownNode,
+    /// The roster says that the node is revoked.
+    #[error("the node is revoked")]
+    Revoked,
+    /// The signing request is unusable, or no certificate can be made for it.
+    #[error("no certificate can be made for the request")]
+    Unusable,
+}
+
+impl RenewalRefusal {
+    /// A short, stable name for counters.
+    pub(crate) fn key(self) -> &'static str {
+        match self {
+            Self::TooSoon => "renewal_too_soon",
+            Self::QueueFull => "renewal_queue_full",
+            Self::File => "renewal_fleet_file",
+            Self::UnknownNode => "renewal_unknown_node",
+            Self::Revoked => "renewal_revoked",
+            Self::Unusable => "renewal_unusable",
+        }
+    }
+
+    /// The reason that the node is told.
+    pub(crate) fn refuse_reason(self) -> RefuseReason {
+        match self {
+            Self::TooSoon | Self::QueueFull | Self::File => RefuseReason::Limit,
+            Self::UnknownNode => RefuseReason::NotPermitted,
+            Self::Revoked => RefuseReason::Revoked,
+            Self::Unusable => RefuseReason::NotVerified,
+        }
+    }
+
+    fn from_fleet(error: &FleetError) -> Self {
+        match error {
+            FleetError::NodeRevoked { .. } => Self::Revoked,
+            FleetError::UnknownNode { .. } => Self::UnknownNode,
+            _ => Self::Unusable,
+        }
+    }
+}
+
+/// Requests that wait for the fleet's file: one for each node, first come, first served, one batch at a time.
+#[derive(Debug, Default)]
+pub(crate) struct RenewalQueue {
+    waiting: BTreeMap<NodeId, RenewalRequest>,
+    order: VecDeque<NodeId>,
+    is_busy: bool,
+}
+
+impl RenewalQueue {
+    /// Queues a request. A newer request of a node takes the place of its older one.
+    pub(crate) fn push(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
+        let node = request.peer.node_id;
+        if let Some(older) = self.waiting.get_mut(&node) {
+            *older = request;
+            return Ok(());
+        }
+        if self.waiting.len() >= RENEWALS_WAITING_MAX {
+            return Err(RenewalRefusal::QueueFull);
+        }
+        self.waiting.insert(node, request);
+        self.order.push_back(node);
+        Ok(())
+    }
+
+    /// Returns the next requests to answer, unless a batch is under way.
+    pub(crate) fn next_batch(&mut self) -> Option<Vec<RenewalRequest>> {
+        if self.is_busy || self.order.is_empty() {
+            return None;
+        }
+        self.is_busy = true;
+        let nodes: Vec<_> = self.order.drain(..self.order.len().min(RENEWAL_BATCH_MAX)).collect();
+        Some(nodes.into_iter().filter_map(|node| self.waiting.remove(&node)).collect())
+    }
+
+    /// Ends the batch that is under way.
+    pub(crate) fn end_batch(&mut self) {
+        self.is_busy = false;
+    }
+}
+
+/// This node's work as its fleet's authority.
+pub(crate) struct Authority {
+    pub(crate) queue: RenewalQueue,
+    desk: Arc<Mutex<FleetDesk>>,
+}
+
+impl Authority {
+    /// The authority that keeps this fleet file.
+    pub(crate) fn new(file: PathBuf) -> Self {
+        Self { queue: RenewalQueue::default(), desk: Arc::new(Mutex::new(FleetDesk::new(file))) }
+    }
+
+    /// Returns a blocking job that answers the next batch, unless one is under way or nobody waits.
+    pub(crate) fn next_job(&mut self) -> Option<impl FnOnce(Now) -> Vec<RenewalAnswer> + Send + use<>> {
+        let batch = self.queue.next_batch()?;
+        let desk = self.desk.clone();
+        Some(move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).answer(batch, now))
+    }
+}
+
+/// A version of a file, which another writer replaces as a whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct FileStamp {
+    inode: (u64, u64),
+    bytes: u64,
+    modified: SystemTime,
+}
+
+impl FileStamp {
+    fn of(file: &Path) -> Option<Self> {
+        let metadata = fs::metadata(file).ok()?;
+        let modified = metadata.modified().ok()?;
+        Some(Self { inode: (metadata.dev(), metadata.ino()), bytes: metadata.len(), modified })
+    }
+}
+
+/// The last answer to a node.
+struct Answered {
+    /// The certificate that the node asked with.
+    cert: CertId,
+    /// The key that it wants certified.
+    key: [u8; 32],
+    answer: Result<Credentials, RenewalRefusal>,
+    /// The serial number of the certificate in the answer.
+    made: Option<Arc<[u8]>>,
+    at: Instant,
+    /// How long it is remembered, and nothing else is done for the node.
+    interval: Duration,
+}
+
+impl Answered {
+    /// The answer, if this request is the one that it answers, or is that of the certificate in it.
+    fn answer_to(&self, peer: &VerifiedPeer, key: &[u8; 32]) -> Option<Result<Credentials, RenewalRefusal>> {
+        if self.key != *key {
+            return None;
+        }
+        if self.cert == peer.cert {
+            return Some(self.answer.clone());
+        }
+        let made = self.made.as_ref().is_some_and(|serial| *serial == peer.cert.serial);
+        // The node has taken it up: it keeps what it has.
+        made.then(|| self.answer.clone().map(|c| Credentials { chain: Vec::new(), ..c }))
+    }
+}
+
+/// Answers batches of requests from the fleet's file, or from memory while the file is unchanged.
+struct FleetDesk {
+    file: PathBuf,
+    /// The version of the file that the remembered answers come from.
+    stamp: Option<FileStamp>,
+    answered: BTreeMap<NodeId, Answered>,
+    /// Times that the file was read.
+    reads: u64,
+}
+
+impl FleetDesk {
+    fn new(file: PathBuf) -> Self {
+        Self { file, stamp: None, answered: BTreeMap::new(), reads: 0 }
+    }
+
+    /// Answers a batch; blocks on the file. A certificate that has time left is not replaced: then the chain of the
+    /// answer is empty. A new one holds for as long as the old one did.
+    fn answer(&mut self, batch: Vec<RenewalRequest>, now: Now) -> Vec<RenewalAnswer> {
+        self.answered.retain(|_, a| now.instant < a.at + a.interval);
+        let stamp = FileStamp::of(&self.file);
+        if stamp.is_none() || stamp != self.stamp {
+            self.answered.clear();
+            self.stamp = stamp;
+        }
+        let mut answers = Vec::with_capacity(batch.len());
+        let mut unanswered = Vec::new();
+        for request in batch {
+            let node = request.peer.node_id;
+            let key = requested_key_hash(&request.csr);
+            let known = self.answered.get(&node);
+            let answer = match known.map(|a| a.answer_to(&request.peer, &key)) {
+                Some(Some(same)) => same,
+                Some(None) => Err(RenewalRefusal::TooSoon),
+                None if self.answered.len() + unanswered.len() >= RENEWALS_ANSWERED_MAX => {
+                    Err(RenewalRefusal::QueueFull)
+                }
+                None => {
+                    unanswered.push((request, key));
+                    continue;
+                }
+            };
+            answers.push(RenewalAnswer { asker: request.asker, node, answer });
+        }
+        if !unanswered.is_empty() {
+            answers.extend(self.look_up(unanswered, now));
+        }
+        answers
+    }
+
+    /// Answers from the file, and remembers the answers.
+    fn look_up(&mut self, batch: Vec<(RenewalRequest, [u8; 32])>, now: Now) -> Vec<RenewalAnswer> {
+        self.reads += 1;
+        let mut found = match LockedFleet::open(&self.file) {
+            Ok(mut locked) => {
+                // Whoever had the lock may have replaced the file.
+                self.stamp = FileStamp::of(&self.file);
+                let found: Vec<_> = batch.iter().map(|(r, _)| renew(&mut locked.fleet, r, now)).collect();
+                self.save(&locked, found)
+            }
+            Err(why) => refuse_all(&why, batch.len()),
+        };
+        let mut answers = Vec::with_capacity(batch.len());
+        for ((request, key), (answer, made)) in batch.into_iter().zip(found.drain(..)) {
+            let RenewalRequest { asker, peer, .. } = request;
+            let interval = renewal_interval(&peer);
+            let remembered =
+                Answered { cert: peer.cert, key, answer: answer.clone(), made, at: now.instant, interval };
+            self.answered.insert(peer.node_id, remembered);
+            answers.push(RenewalAnswer { asker, node: peer.node_id, answer });
+        }
+        answers
+    }
+
+    /// Writes the file if certificates were made: the roster has them before an answer leaves.
+    fn save(&mut self, locked: &LockedFleet, found: Vec<Found>) -> Vec<Found> {
+        if found.iter().all(|(_, made)| made.is_none()) {
+            return found;
+        }
+        let saved = locked.save();
+        self.stamp = FileStamp::of(&self.file);
+        match saved {
+            Ok(()) => found,
+            Err(why) => refuse_all(&why, found.len()),
+        }
+    }
+}
+
+/// An answer, and the serial number of the certificate that was made for it.
+type Found = (Result<Credentials, RenewalRefusal>, Option<Arc<[u8]>>);
+
+fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<Found> {
+    error!(requests, "cannot give credentials: {why}");
+    vec![(Err(RenewalRefusal::File), None); requests]
+}
+
+fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Found {
+    match try_renew(fleet, request, now) {
+        Ok((credentials, made)) => (Ok(credentials), made),
+        Err(why) => {
+            warn!(peer = %request.peer.node_id.short(), %why, "gives no credentials");
+            (Err(RenewalRefusal::from_fleet(&why)), None)
+        }
+    }
+}
+
+fn try_renew(
+    fleet: &mut Fleet,
+    request: &RenewalRequest,
     now: Now,
-) -> Result<Credentials, RefuseReason> {
-    match try_answer(file, peer, csr, now) {
-        Ok(credentials) => Ok(credentials),
-        Err(Refusal::File(why)) => {
-            error!(peer = %peer.node_id.short(), "cannot give credentials: {why}");
-            Err(RefuseReason::Limit)
-        }
-        Err(Refusal::Fleet(why)) => {
-            warn!(peer = %peer.node_id.short(), %why, "gives no credentials");
-            Err(match why {
-                FleetError::NodeRevoked { .. } => RefuseReason::Revoked,
-                FleetError::UnknownNode { .. } => RefuseReason::NotPermitted,
-                _ => RefuseReason::NotVerified,
-            })
-        }
-    }
-}
-
-enum Refusal {
-    File(FleetFileError),
-    Fleet(FleetError),
-}
-
-impl From<FleetFileError> for Refusal {
-    fn from(why: FleetFileError) -> Self {
-        Self::File(why)
-    }
-}
-
-impl From<FleetError> for Refusal {
-    fn from(why: FleetError) -> Self {
-        Self::Fleet(why)
-    }
-}
-
-fn try_answer(file: &Path, peer: &VerifiedPeer, csr: &[u8], now: Now) -> Result<Credentials, Refusal> {
-    let mut locked = LockedFleet::open(file)?;
+) -> Result<(Credentials, Option<Arc<[u8]>>), FleetError> {
+    let RenewalRequest { peer, csr, .. } = request;
     let unknown = || FleetError::UnknownNode { node: peer.pseudonym.short() };
-    let node = locked.fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
+    let node = fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
     if !is_due(peer, now) {
-        return Ok(locked.fleet.credentials_for(&node, Vec::new())?);
+        return Ok((fleet.credentials_for(&node, Vec::new())?, None));
     }
     let valid = Duration::from_millis(lasts(peer)).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
-    let credentials = locked.fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
-    locked.save()?;
+    let credentials = fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
+    let made = credentials.chain.first().and_then(|leaf| serial_of(leaf)).map(Arc::from);
     info!(%node, "renewed its certificate");
-    Ok(credentials)
+    Ok((credentials, made))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use sgc_trust::{EnrollRequest, Identity, KeyRequest, NodeName, pem_contents};
+    use sgc_wire::UnixMillis;
+
+    use super::*;
+    use crate::state;
+
+    const DAY: u64 = 86_400_000;
+
+    fn now() -> Now {
+        crate::core::now()
+    }
+
+    /// A fleet's file with members whose certificates are due.
+    struct Bench {
+        dir: tempfile::TempDir,
+        desk: FleetDesk,
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let dir = tempfile::tempdir().unwrap();
+            let file = dir.path().join("lab.fleet");
+            let made = UnixMillis(now().unix.0 - 400 * DAY);
+            let fleet = Fleet::create("lab".parse().unwrap(), made, &mut OsRng.unwrap_err()).unwrap();
+            state::replace(&file, fleet.to_text().as_bytes()).unwrap();
+            Self { desk: FleetDesk::new(file), dir }
+        }
+
+        fn file(&self) -> PathBuf {
+            self.dir.path().join("lab.fleet")
+        }
+
+        fn enroll(&self, node: &str) -> Identity {
+            let mut locked = LockedFleet::open(&self.file()).unwrap();
+            let long_ago = UnixMillis(now().unix.0 - 80 * DAY);
+            let request = EnrollRequest::new(node.parse().unwrap(), long_ago);
+            let identity = locked.fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap();
+            locked.save().unwrap();
+            identity
+        }
+
+        fn certificates(&self, node: &str) -> usize {
+            let fleet = crate::fleet_file::read_fleet(&self.file()).unwrap();
+            fleet.node(&node.parse().unwrap()).unwrap().certificates.len()
+        }
+
+        fn ask(&mut self, node: &Identity, csr: &[u8], now: Now) -> Result<Credentials, RenewalRefusal> {
+            let mut answers = self.desk.answer(vec![request(node, csr)], now);
+            assert_eq!(answers.len(), 1);
+            answers.remove(0).answer
+        }
+    }
+
+    fn request(node: &Identity, csr: &[u8]) -> RenewalRequest {
+        let (asker, peer) = (Asker::Member(SinkId([1; 16])), node.as_peer().clone());
+        RenewalRequest { asker, peer, csr: Bytes::copy_from_slice(csr) }
+    }
+
+    /// A request for a key that was made for it.
+    fn other_key() -> Vec<u8> {
+        let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
+        pem_contents(&made.csr_text(), &["CERTIFICATE REQUEST"]).unwrap().remove(0).to_vec()
+    }
+
+    #[test]
+    fn a_flood_of_one_request_makes_one_certificate_and_reads_the_file_once() {
+        let mut bench = Bench::new();
+        let arm = bench.enroll("arm");
+        let began = now();
+        let first = bench.ask(&arm, &arm.csr(), began).unwrap();
+        assert_eq!((bench.certificates("arm"), bench.desk.reads), (2, 1));
+        for _ in 0..100 {
+            // Signed anew each time: what counts is the key.
+            assert_eq!(bench.ask(&arm, &arm.csr(), began).unwrap(), first);
+        }
+        assert_eq!((bench.certificates("arm"), bench.desk.reads), (2, 1));
+
+        // With what it was given it asks again, and keeps it.
+        let renewed = arm.with_credentials(&first).unwrap();
+        let kept = bench.ask(&renewed, &renewed.csr(), began).unwrap();
+        assert!(kept.chain.is_empty());
+        assert_eq!((kept.secrets, bench.desk.reads), (first.secrets, 1));
+    }
+
+    #[test]
+    fn a_flood_of_keys_makes_one_certificate_in_each_interval() {
+        let mut bench = Bench::new();
+        let arm = bench.enroll("arm");
+        let mut at = now();
+        let interval = renewal_interval(arm.as_peer());
+        for round in 1..=3 {
+            assert!(bench.ask(&arm, &other_key(), at).is_ok());
+            for _ in 0..20 {
+                assert_eq!(bench.ask(&arm, &other_key(), at), Err(RenewalRefusal::TooSoon));
+            }
+            assert_eq!((bench.certificates("arm"), bench.desk.reads), (1 + round, round as u64));
+            at.instant += interval;
+        }
+    }
+
+    #[test]
+    fn refusals_are_remembered_until_the_file_is_another() {
+        let mut bench = Bench::new();
+        let arm = bench.enroll("arm");
+        let change = |bench: &Bench, change: &dyn Fn(&mut Fleet)| {
+            let mut locked = LockedFleet::open(&bench.file()).unwrap();
+            change(&mut locked.fleet);
+            locked.save().unwrap();
+        };
+        let name: NodeName = "arm".parse().unwrap();
+        change(&bench, &|fleet| fleet.revoke(std::slice::from_ref(&name), now().unix).unwrap());
+        let began = now();
+        for _ in 0..10 {
+            assert_eq!(bench.ask(&arm, &arm.csr(), began), Err(RenewalRefusal::Revoked));
+        }
+        assert_eq!(bench.desk.reads, 1);
+        let arm = bench.enroll_again("arm");
+        assert!(bench.ask(&arm, &arm.csr(), began).is_ok());
+        assert_eq!(bench.desk.reads, 2);
+        std::fs::remove_file(bench.file()).unwrap();
+        assert_eq!(bench.ask(&arm, &arm.csr(), began), Err(RenewalRefusal::File));
+    }
+
+    impl Bench {
+        fn enroll_again(&self, node: &str) -> Identity {
+            let mut locked = LockedFleet::open(&self.file()).unwrap();
+            let long_ago = UnixMillis(now().unix.0 - 80 * DAY);
+            let request =
+                EnrollRequest { again: true, ..EnrollRequest::new(node.parse().unwrap(), long_ago) };
+            let identity = locked.fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap();
+            locked.save().unwrap();
+            identity
+        }
+    }
+
+    #[test]
+    fn a_batch_reads_and_writes_the_file_once() {
+        let mut bench = Bench::new();
+        let nodes: Vec<_> = (0..5).map(|n| bench.enroll(&format!("arm-{n}"))).collect();
+        let batch = nodes.iter().map(|node| request(node, &node.csr())).collect();
+        let answers = bench.desk.answer(batch, now());
+        assert!(answers.iter().all(|a| a.answer.as_ref().is_ok_and(|c| !c.chain.is_empty())));
+        assert_eq!((bench.desk.reads, bench.certificates("arm-4")), (1, 2));
+    }
+
+    #[test]
+    fn requests_of_a_node_take_one_place_and_one_batch_is_under_way() {
+        let bench = Bench::new();
+        let (arm, desk) = (bench.enroll("arm"), bench.enroll("desk"));
+        let mut queue = RenewalQueue::default();
+        for _ in 0..1000 {
+            queue.push(request(&arm, &other_key()[..10])).unwrap();
+        }
+        queue.push(request(&arm, b"last")).unwrap();
+        queue.push(request(&desk, b"desk")).unwrap();
+        let batch = queue.next_batch().unwrap();
+        assert_eq!(batch.iter().map(|r| &r.csr[..]).collect::<Vec<_>>(), [b"last", b"desk"]);
+        queue.push(request(&arm, b"next")).unwrap();
+        assert!(queue.next_batch().is_none(), "a second job would wait for the file's lock");
+        queue.end_batch();
+        assert_eq!(queue.next_batch().unwrap().len(), 1);
+        queue.end_batch();
+        assert!(queue.next_batch().is_none());
+    }
+
+    #[test]
+    fn the_queue_is_bounded_and_goes_in_batches() {
+        let arm = Bench::new().enroll("arm");
+        let mut queue = RenewalQueue::default();
+        let numbered = |n: usize| {
+            let mut request = request(&arm, b"csr");
+            request.peer.node_id.0[..8].copy_from_slice(&n.to_be_bytes());
+            request
+        };
+        for n in 0..RENEWALS_WAITING_MAX {
+            queue.push(numbered(n)).unwrap();
+        }
+        assert_eq!(queue.push(numbered(RENEWALS_WAITING_MAX)), Err(RenewalRefusal::QueueFull));
+        assert_eq!(queue.push(numbered(0)), Ok(()), "who has a place keeps it");
+        assert_eq!(queue.next_batch().unwrap().len(), RENEWAL_BATCH_MAX);
+    }
 }

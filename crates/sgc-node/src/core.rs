@@ -28,11 +28,12 @@ use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
 use sgc_trust::{CrlError, Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Credentials, Name, NodeId, Now, RefuseReason, SinkId, SourceId, UnixMillis};
+use sgc_wire::{Control, Name, NodeId, Now, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
+use crate::authority::{Authority, RenewalAnswer};
 use crate::calls::Calls;
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
@@ -136,8 +137,6 @@ pub(crate) enum CoreEvent {
         /// Either.
         end: ServiceEnd,
     },
-    /// What the fleet's file holds for this authority itself.
-    OwnRenewal(Result<Credentials, RefuseReason>),
     /// The user wants something else from now on; answered when it is under way.
     Reload {
         /// What is shared.
@@ -151,13 +150,8 @@ pub(crate) enum CoreEvent {
         /// Told when it is done.
         reply: oneshot::Sender<()>,
     },
-    /// The authority's answer to a member is ready.
-    RenewalReady {
-        /// Whom to answer.
-        sink: SinkId,
-        /// What.
-        answer: Result<Credentials, RefuseReason>,
-    },
+    /// What the fleet's file holds for those who asked this authority.
+    RenewalsReady(Vec<RenewalAnswer>),
     /// The user brings a revocation list; answered with whether it is news.
     Crl {
         /// The list, DER.
@@ -240,8 +234,8 @@ pub(crate) struct Core<N: RosNetwork> {
     epoch_over: Arc<Notify>,
     credentials: CredentialStore,
     gateway: Arc<Gateway>,
-    /// The fleet's file, if this node is the authority of its fleet.
-    authority: Option<PathBuf>,
+    /// Set if this node is the authority of its fleet.
+    authority: Option<Authority>,
     keeper: Keeper,
     /// When to ask for another certificate.
     renew_due: Option<Instant>,
@@ -352,7 +346,7 @@ impl<N: RosNetwork> Core<N> {
             epoch_over: Arc::default(),
             credentials: parts.credentials,
             gateway: parts.gateway,
-            authority: parts.authority,
+            authority: parts.authority.map(Authority::new),
             keeper: parts.keeper,
             renew_due: None,
             redial: parts.redial,
@@ -479,8 +473,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
-            CoreEvent::RenewalReady { sink, answer } => self.give_credentials(sink, answer),
-            CoreEvent::OwnRenewal(answer) => self.own_renewal(answer),
+            CoreEvent::RenewalsReady(answers) => self.renewals_ready(answers),
             CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
                 self.add_message_keys(message_keys);
                 self.reconfigure(shares, uses, anchors);

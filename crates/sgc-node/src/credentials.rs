@@ -154,8 +154,13 @@ pub(crate) fn lasts(peer: &VerifiedPeer) -> u64 {
 pub(crate) fn renew_at(identity: &Identity, now: Now) -> Instant {
     let own = identity.as_peer();
     let due = own.not_after.0.saturating_sub(lasts(own) / RENEW_PART);
-    let wait_min = RENEW_MIN.min(Duration::from_millis(lasts(own) / (2 * RENEW_PART)));
-    now.instant + Duration::from_millis(due.saturating_sub(now.unix.0)).max(wait_min)
+    now.instant + Duration::from_millis(due.saturating_sub(now.unix.0)).max(renewal_interval(own))
+}
+
+/// Shortest time between two requests of a node for a certificate: at most half of the time that is left when one is
+/// due.
+pub(crate) fn renewal_interval(peer: &VerifiedPeer) -> Duration {
+    RENEW_MIN.min(Duration::from_millis(lasts(peer) / (2 * RENEW_PART)))
 }
 
 /// True if a certificate that holds from and until then has less than a third of its time left.

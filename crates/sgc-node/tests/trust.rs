@@ -17,7 +17,7 @@ use sgc_node::admin::AdminRequest;
 use sgc_node::audit::AuditRecord;
 use sgc_node::config::{Config, TokenConfig, TokenSource, UseConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords};
-use sgc_trust::{Identity, ShareToken, Suite, TopicSecret, derive_name};
+use sgc_trust::{EnrollRequest, Identity, ShareToken, Suite, TopicSecret, derive_name};
 use sgc_wire::{Metadata, UnixMillis};
 use support::*;
 
@@ -269,6 +269,51 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     let id = lab.id("desk").to_string();
     wait("the renewed one is cut off, too", || !cloud.peers().contains(&id));
     drop((robot, desk, thief));
+}
+
+#[test]
+fn a_node_that_asks_again_gets_the_same_certificate() {
+    let lab = Lab::new(&[]);
+    lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
+    lab.enroll("keeper", |_| {});
+    // Less than a third of an hour is left.
+    lab.enroll("desk", |request| {
+        request.valid = Duration::from_secs(3600);
+        request.now.0 -= 2_500_000;
+    });
+    let (_cloud, keeper) = (lab.cloud(), lab.start("keeper", |c| c.authority = Some(lab.fleet_file())));
+    let old = lab.identity("desk");
+    let desk = lab.start("desk", |_| {});
+    wait("it is renewed", || lab.identity("desk").chain() != old.chain());
+    let renewed = lab.identity("desk");
+    drop(desk);
+    let certificates = || {
+        let read = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+        read.node(&"desk".parse().unwrap()).unwrap().certificates.len()
+    };
+    assert_eq!(certificates(), 2);
+
+    // For another key it has to wait, and is told so.
+    let request = EnrollRequest {
+        valid: Duration::from_secs(3600),
+        ..EnrollRequest::new("desk".parse().unwrap(), UnixMillis(unix_now().0 - 2_500_000))
+    };
+    let read = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+    let other = read.issue(&request, &mut OsRng.unwrap_err()).unwrap();
+    write_secret(&lab.path("desk.identity"), &other.to_text());
+    let desk = lab.start("desk", |_| {});
+    wait("it is refused", || desk.status()["drops"]["renewal_refused"].as_u64() >= Some(1));
+    assert_eq!(keeper.status()["drops"]["renewal_too_soon"], 1, "{}", keeper.status());
+    drop(desk);
+
+    // For the same key it gets the same again, as after a start from a copy.
+    for _ in 0..2 {
+        write_secret(&lab.path("desk.identity"), &old.to_text());
+        let desk = lab.start("desk", |_| {});
+        wait("it has the same certificate", || lab.identity("desk").chain() == renewed.chain());
+        drop(desk);
+    }
+    assert_eq!(certificates(), 2);
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! Trust that changes while the node runs: its own credentials, those of members if it is the authority, and
 //! revocations.
 
-use std::path::Path;
 use std::sync::Arc;
 
+use bytes::Bytes;
 use sgc_ros::RosNetwork;
 use sgc_transport::{CloseReason, Link as _};
 use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
@@ -12,7 +12,7 @@ use tracing::{info, warn};
 
 use super::{Core, CoreEvent, now};
 use crate::audit::{AuditEvent, AuditRecord};
-use crate::authority;
+use crate::authority::{Asker, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
@@ -30,33 +30,61 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Looks a member up in the fleet's file.
-    pub(super) fn answer_renewal(&self, sink: SinkId, peer: VerifiedPeer, csr: bytes::Bytes) {
-        self.look_up(move |file| {
-            let answer = authority::answer(file, &peer, &csr, now());
-            CoreEvent::RenewalReady { sink, answer }
-        });
+    /// Queues a member's request for the fleet's file.
+    pub(super) fn answer_renewal(&mut self, sink: SinkId, peer: VerifiedPeer, csr: Bytes) {
+        self.queue_renewal(RenewalRequest { asker: Asker::Member(sink), peer, csr });
+        self.answer_next_batch();
     }
 
-    /// Looks this authority itself up: no way leads from a node to itself.
-    fn renew_own(&self) {
-        let identity = self.identity.clone();
-        self.look_up(move |file| {
-            CoreEvent::OwnRenewal(authority::answer(file, identity.as_peer(), &identity.csr(), now()))
-        });
+    /// Queues this authority's own request: no way leads from a node to itself.
+    fn renew_own(&mut self) {
+        let (peer, csr) = (self.identity.as_peer().clone(), self.identity.csr().into());
+        self.queue_renewal(RenewalRequest { asker: Asker::Own, peer, csr });
+        self.answer_next_batch();
     }
 
-    /// Reads the fleet's file where that may block; nothing if this node is not the authority.
-    fn look_up(&self, read: impl FnOnce(&Path) -> CoreEvent + Send + 'static) {
-        let (Some(file), Some(events)) = (self.authority.clone(), self.events.upgrade()) else { return };
+    fn queue_renewal(&mut self, request: RenewalRequest) {
+        let (asker, node) = (request.asker, request.peer.node_id);
+        let queued = self.authority.as_mut().map_or(Ok(()), |authority| authority.queue.push(request));
+        if let Err(why) = queued {
+            self.renewal_ready(RenewalAnswer { asker, node, answer: Err(why) });
+        }
+    }
+
+    /// Has the requests that wait answered where that may block, unless others are being answered.
+    fn answer_next_batch(&mut self) {
+        let (Some(authority), Some(events)) = (&mut self.authority, self.events.upgrade()) else { return };
+        let Some(job) = authority.next_job() else { return };
         let alive = self.alive.clone();
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
-            let _ = events.blocking_send(read(&file));
+            let _ = events.blocking_send(CoreEvent::RenewalsReady(job(now())));
         });
     }
 
-    pub(super) fn own_renewal(&mut self, answer: Result<Credentials, RefuseReason>) {
+    /// Gives everyone of a batch what the fleet's file says.
+    pub(super) fn renewals_ready(&mut self, answers: Vec<RenewalAnswer>) {
+        answers.into_iter().for_each(|answer| self.renewal_ready(answer));
+        if let Some(authority) = &mut self.authority {
+            authority.queue.end_batch();
+        }
+        self.answer_next_batch();
+    }
+
+    fn renewal_ready(&mut self, RenewalAnswer { asker, node, answer }: RenewalAnswer) {
+        if let Err(why) = &answer
+            && self.control_drops.count_from(why.key(), node.short())
+        {
+            warn!(peer = %node.short(), %why, "gives no credentials; counted from here on");
+        }
+        let answer = answer.map_err(RenewalRefusal::refuse_reason);
+        match asker {
+            Asker::Own => self.own_renewal(answer),
+            Asker::Member(sink) => self.give_credentials(sink, answer),
+        }
+    }
+
+    fn own_renewal(&mut self, answer: Result<Credentials, RefuseReason>) {
         match answer {
             Ok(credentials) => self.take_credentials(credentials),
             Err(reason) => {
@@ -68,7 +96,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Gives a member what the fleet's file says.
-    pub(super) fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
+    fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
         let peer = self.endpoint.renewing().find(|(id, ..)| *id == sink).map(|(_, peer, _)| peer.node_id);
         if let Some(peer) = peer {
             let record = |event| AuditRecord::new(event).peer(&peer);
@@ -95,11 +123,17 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Answers every member once more: the fleet's file may have changed.
-    pub(super) fn answer_renewals(&self) {
-        let asked: Vec<_> = self.endpoint.renewing().map(|(s, p, csr)| (s, p.clone(), csr.clone())).collect();
-        for (sink, peer, csr) in asked {
-            self.answer_renewal(sink, peer, csr);
+    pub(super) fn answer_renewals(&mut self) {
+        if self.authority.is_none() {
+            return;
         }
+        let request = |(sink, peer, csr): (SinkId, &VerifiedPeer, &Bytes)| RenewalRequest {
+            asker: Asker::Member(sink),
+            peer: peer.clone(),
+            csr: csr.clone(),
+        };
+        let asked: Vec<_> = self.endpoint.renewing().map(request).collect();
+        asked.into_iter().for_each(|request| self.queue_renewal(request));
         self.renew_own();
     }
 
