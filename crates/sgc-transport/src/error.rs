@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use quinn::{ConnectionError, TransportErrorCode};
-use sgc_trust::CertError;
+use sgc_trust::{AddressPrefix, CertError};
 use sgc_wire::DecodeError;
 
 use crate::framing::CONTROL_FRAME_BYTES_MAX;
@@ -431,6 +431,19 @@ pub enum Refusal {
         /// How many were refused since the last such report.
         unreported: u64,
     },
+    /// Too many connect at once from its address.
+    #[error(
+        "{pending} connections from {prefix} are connecting already; {unreported} more were refused since this was \
+         last said"
+    )]
+    TooManyFromAddress {
+        /// The address.
+        prefix: AddressPrefix,
+        /// How many connect from it.
+        pending: usize,
+        /// How many were refused since the last such report.
+        unreported: u64,
+    },
     /// It refused us, or gave up.
     #[error("{0}")]
     ByPeer(#[source] PeerRefusal),
@@ -460,6 +473,7 @@ impl Refusal {
             Self::Greeting(_) => RefusalKind::BadGreeting,
             Self::TimedOut { .. } => RefusalKind::TimedOut,
             Self::TooMany { .. } => RefusalKind::TooMany,
+            Self::TooManyFromAddress { .. } => RefusalKind::TooManyFromAddress,
             Self::ByPeer(_) => RefusalKind::ByPeer,
             Self::Transport(_) => RefusalKind::Transport,
         }

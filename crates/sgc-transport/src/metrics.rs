@@ -29,6 +29,8 @@ pub enum RefusalKind {
     TimedOut,
     /// Too many were connecting at once.
     TooMany,
+    /// Too many were connecting at once from its address.
+    TooManyFromAddress,
     /// It refused us, or gave up.
     ByPeer,
     /// The transport failed.
@@ -37,7 +39,7 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// Every kind, in the order of the counters.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::NoCertificate,
         Self::OtherCa,
         Self::NotAdmitted,
@@ -50,6 +52,7 @@ impl RefusalKind {
         Self::BadGreeting,
         Self::TimedOut,
         Self::TooMany,
+        Self::TooManyFromAddress,
         Self::ByPeer,
         Self::Transport,
     ];
@@ -69,6 +72,7 @@ impl RefusalKind {
             Self::BadGreeting => "bad_greeting",
             Self::TimedOut => "timed_out",
             Self::TooMany => "too_many",
+            Self::TooManyFromAddress => "too_many_from_address",
             Self::ByPeer => "by_peer",
             Self::Transport => "transport",
         }

@@ -31,6 +31,8 @@ pub struct LinkOptions {
     pub datagram_receive_bytes: usize,
     /// Most handshakes that a listener works on at once.
     pub handshakes_max: usize,
+    /// Most of these from one IPv4 address or one IPv6 network of 64 bits ([`sgc_trust::AddressPrefix`]).
+    pub handshakes_per_address_max: usize,
     /// From how many on a peer first has to prove that it receives at its address (QUIC Retry; a ticket, over DTLS).
     pub handshakes_unvalidated_max: usize,
     /// Key exchange that also stands against quantum computers (X25519MLKEM768). True: nothing else is offered or
@@ -64,6 +66,7 @@ impl Default for LinkOptions {
             datagram_send_bytes: 64 << 10,
             datagram_receive_bytes: 1 << 20,
             handshakes_max: 256,
+            handshakes_per_address_max: 64,
             handshakes_unvalidated_max: 32,
             post_quantum: false,
             offload: true,
@@ -84,6 +87,7 @@ impl fmt::Debug for LinkOptions {
             .field("send_window_bytes", &self.send_window_bytes)
             .field("flows_max", &self.flows_max)
             .field("handshakes_max", &self.handshakes_max)
+            .field("handshakes_per_address_max", &self.handshakes_per_address_max)
             .field("post_quantum", &self.post_quantum)
             .field("offload", &self.offload)
             .field("mtu_discovery", &self.mtu_discovery)

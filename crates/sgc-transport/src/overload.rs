@@ -1,27 +1,103 @@
-//! Refusals for want of capacity come in floods; one report in a while tells as much.
+//! Places for the handshakes of one listener, and how often refusals for want of one are reported.
 
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+use sgc_trust::{AddressPrefix, Crowded, PlaceDecision, PlaceLimits, Places};
+
 use crate::error::Refusal;
+use crate::metrics::TransportMetrics;
+use crate::options::LinkOptions;
 
 /// How often refusals for want of capacity are reported one by one.
 const OVERLOAD_REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Refusals of one listener for want of capacity.
-#[derive(Default)]
-pub(crate) struct Overload {
+/// A handshake that holds a place.
+pub(crate) trait Holder {
+    /// Returns the address of the peer.
+    fn remote(&self) -> SocketAddr;
+
+    /// Returns `true` until the handshake has ended.
+    fn is_pending(&self) -> bool;
+
+    /// Returns `true` if the handshake has cost the peer something: it receives at its address, or said something.
+    fn is_engaged(&self) -> bool;
+}
+
+/// The handshakes under way at one listener, in any transport.
+pub(crate) struct Handshakes<T> {
+    places: Places<T>,
     last_report: Option<Instant>,
     unreported: u64,
 }
 
-impl Overload {
-    /// Notes one, with so many handshakes under way: what is to be reported now, if anything.
-    pub(crate) fn note(&mut self, pending: usize) -> Option<Refusal> {
+/// What a listener does with a newcomer.
+pub(crate) struct Entry<T> {
+    /// The newcomer has a place; else it is to be turned away.
+    pub(crate) is_admitted: bool,
+    /// The handshake that gave way, which the listener ends.
+    pub(crate) evicted: Option<T>,
+    /// A refusal to report: the newcomer's, or that of the handshake that gave way to it.
+    pub(crate) report: Option<(SocketAddr, Refusal)>,
+}
+
+impl<T: Holder> Handshakes<T> {
+    pub(crate) fn new(options: &LinkOptions) -> Self {
+        let limits =
+            PlaceLimits { all: options.handshakes_max, per_prefix: options.handshakes_per_address_max };
+        Self { places: Places::new(limits), last_report: None, unreported: 0 }
+    }
+
+    /// Returns the number of handshakes under way.
+    pub(crate) fn pending(&mut self) -> usize {
+        self.places.retain(Holder::is_pending);
+        self.places.len()
+    }
+
+    /// Iterates over the handshakes under way.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (AddressPrefix, &T)> {
+        self.places.iter().filter(|(_, holder)| holder.is_pending())
+    }
+
+    /// Makes room for a peer at this address, and counts the handshake that gives way to it or the peer itself.
+    pub(crate) fn make_room(
+        &mut self,
+        remote: SocketAddr,
+        now: Instant,
+        metrics: &TransportMetrics,
+    ) -> Entry<T> {
+        self.places.retain(Holder::is_pending);
+        let (evicted, crowded) = match self.places.make_room(remote.ip().into(), now, T::is_engaged) {
+            PlaceDecision::Admit => return Entry { is_admitted: true, evicted: None, report: None },
+            PlaceDecision::Evict(holder, crowded) => (Some(holder), crowded),
+            PlaceDecision::Refuse(crowded) => (None, crowded),
+        };
+        metrics.count_refused(refusal(crowded, 0).kind());
+        let refused = evicted.as_ref().map_or(remote, Holder::remote);
+        let report = self.note(crowded, now).map(|refusal| (refused, refusal));
+        Entry { is_admitted: evicted.is_some(), evicted, report }
+    }
+
+    /// Gives the place that was made to a handshake.
+    pub(crate) fn take(&mut self, now: Instant, holder: T) {
+        self.places.take(holder.remote().ip().into(), now, holder);
+    }
+
+    /// Returns the refusal to report now, if one is due.
+    fn note(&mut self, crowded: Crowded, now: Instant) -> Option<Refusal> {
         self.unreported += 1;
-        let is_due = self.last_report.is_none_or(|t| t.elapsed() >= OVERLOAD_REPORT_INTERVAL);
+        let is_due =
+            self.last_report.is_none_or(|at| now.saturating_duration_since(at) >= OVERLOAD_REPORT_INTERVAL);
         is_due.then(|| {
-            self.last_report = Some(Instant::now());
-            Refusal::TooMany { pending, unreported: std::mem::take(&mut self.unreported) - 1 }
+            self.last_report = Some(now);
+            refusal(crowded, std::mem::take(&mut self.unreported) - 1)
         })
+    }
+}
+
+fn refusal(crowded: Crowded, unreported: u64) -> Refusal {
+    match crowded {
+        Crowded::All { held } => Refusal::TooMany { pending: held, unreported },
+        Crowded::Prefix { prefix, held } => Refusal::TooManyFromAddress { prefix, pending: held, unreported },
     }
 }

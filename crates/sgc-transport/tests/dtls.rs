@@ -172,28 +172,6 @@ async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     assert!(seen.contains("Client certificate") || seen.contains("BEGIN CERTIFICATE"), "{seen}");
 }
 
-/// A hello as a bare DTLS client sends it, each another.
-fn hello(number: u32) -> Vec<u8> {
-    let extensions: &[u8] = &[
-        0, 10, 0, 4, 0, 2, 0, 23, // groups: P-256
-        0, 11, 0, 2, 1, 0, // points: uncompressed
-        0, 13, 0, 4, 0, 2, 4, 3, // signatures: ECDSA P-256
-        0, 23, 0, 0, // extended master secret
-    ];
-    let mut body = vec![0xfe, 0xfd];
-    body.extend((0..8).flat_map(|i| (number.wrapping_mul(2_654_435_761) ^ i).to_be_bytes()));
-    body.extend([0, 0, 0, 2, 0xc0, 0x2b, 1, 0]);
-    body.extend((extensions.len() as u16).to_be_bytes());
-    body.extend(extensions);
-    let len = body.len() as u8;
-    let mut handshake = vec![1, 0, 0, len, 0, 0, 0, 0, 0, 0, 0, len];
-    handshake.extend(body);
-    let mut record = vec![22, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 0];
-    record.extend((handshake.len() as u16).to_be_bytes());
-    record.extend(handshake);
-    record
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_flood_of_hellos_keeps_no_one_out_and_takes_no_room() {
     let fleet = fleet(1);
@@ -296,29 +274,36 @@ async fn a_hello_in_the_name_of_a_peer_does_not_disturb_its_link() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_listener_with_too_much_to_do_says_so() {
     let fleet = fleet(1);
-    let options = LinkOptions { handshakes_max: 1, ..LinkOptions::default() };
+    let options = LinkOptions { handshakes_max: 1, handshakes_unvalidated_max: 0, ..LinkOptions::default() };
     let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
-    let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
-    silent.send_to(&hello(1), server.addr).unwrap();
-    soon(async {
-        while server.metrics.handshakes_pending() == 0 {
-            tokio::time::sleep(Duration::from_millis(1)).await;
+    let mut number = 0;
+    let (error, _holder) = loop {
+        // One that has proven its address holds the place, for a second at least.
+        let holder = UdpSocket::bind("127.0.0.1:0").unwrap();
+        number += 1;
+        prove_and_stall(&holder, server.addr, number);
+        until_true(|| server.metrics.handshakes_pending() == 1).await;
+        if let Err(error) = dial(enroll(&fleet, "arm-1"), &server.url).await {
+            break (error, holder);
         }
-    })
-    .await;
-    let error = dial(enroll(&fleet, "arm-1"), &server.url).await.unwrap_err();
+    };
     assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Overloaded)), "{error}");
-    let refused = server.refusal().await;
+    let refused = loop {
+        if let Err(refused) = soon(server.results.recv()).await.unwrap() {
+            break refused;
+        }
+    };
     assert!(matches!(refused.reason, Refusal::TooMany { pending: 1, .. }), "{refused}");
-    // Who says no more makes room.
+    // A peer that says no more makes room.
     soon(async {
         while server.metrics.handshakes_pending() > 0 {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     })
     .await;
+    let accepted = server.metrics.accepted();
     dial(enroll(&fleet, "arm-1"), &server.url).await.unwrap();
-    server.link().await;
+    until_true(|| server.metrics.accepted() > accepted).await;
 }
 
 /// Waits until something has happened.

@@ -154,7 +154,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
                 match soon(server.results.recv()).await.unwrap() {
                     Ok(_link) => break,
                     Err(refused) => {
-                        assert!(matches!(refused.reason, Refusal::TooMany { .. }), "{refused}");
+                        assert!(matches!(refused.reason, Refusal::TooManyFromAddress { .. }), "{refused}");
                     }
                 }
             }
@@ -163,7 +163,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
     }
     // Each is told or counted, and none is kept beyond the places there are.
     assert!(server.metrics.handshakes_pending() <= PLACES as u64 + 1);
-    assert!(server.metrics.refused(RefusalKind::TooMany) >= 1000 - 2 * PLACES as u64);
+    assert!(server.metrics.refused(RefusalKind::TooManyFromAddress) >= 1000 - 2 * PLACES as u64);
     let mut ended = 0;
     for tcp in &mut silent[..1000 - 2 * PLACES] {
         // Which way it ends is the kernel's.
@@ -181,17 +181,20 @@ async fn a_listener_that_is_full_says_so() {
         let options = LinkOptions { handshakes_max: 2, ..LinkOptions::default() };
         let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options);
         let mut begun = Vec::new();
-        for _ in 0..2 {
+        let begin = async || {
             let mut tcp = TcpStream::connect(server.addr).await.unwrap();
             let start: &[u8] = if scheme == "ws" { b"GET /sgc" } else { &[22, 3, 1] };
             tcp.write_all(start).await.unwrap();
-            begun.push(tcp);
+            tcp
+        };
+        for _ in 0..2 {
+            begun.push(begin().await);
         }
         let error = loop {
-            // The two may not have been heard yet, and the first of them would give way.
+            // The two may not have been heard yet, or are old, and the first of them gives way.
             match dial(Arc::clone(&arm), &server.url).await {
                 Err(error) => break error,
-                Ok(_) => begun.push(TcpStream::connect(server.addr).await.unwrap()),
+                Ok(_) => begun.push(begin().await),
             }
         };
         let LinkError::RefusedByPeer(why) = &error else { panic!("{error}") };

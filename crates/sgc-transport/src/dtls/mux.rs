@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 use aws_lc_rs::{constant_time, hmac, rand};
 use quinn::udp::{EcnCodepoint, RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
-use sgc_trust::VerifiedPeer;
+use sgc_trust::{AddressPrefix, VerifiedPeer};
 use tokio::sync::{Notify, mpsc, watch};
 
 use super::association::{Association, End, Setup, Sink, Stage};
@@ -29,10 +29,10 @@ use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, LinkError, PeerRefusal, Refusal};
 use crate::metrics::{Pending, TransportMetrics};
 use crate::options::LinkOptions;
-use crate::overload::Overload;
+use crate::overload::{Entry, Handshakes, Holder};
 
-/// Most unproven handshakes from one IP address before the next has to answer a challenge.
-const UNPROVEN_PER_IP_MAX: usize = 8;
+/// Most unproven handshakes from one [`AddressPrefix`] before the next has to answer a challenge.
+const UNPROVEN_PER_ADDRESS_MAX: usize = 8;
 /// How long a handshake that has not proven its address may be silent.
 const UNPROVEN_PATIENCE: Duration = Duration::from_secs(3);
 /// How long a ticket holds, at least; at most twice that.
@@ -73,6 +73,8 @@ pub(crate) struct Mux {
     reset_key: hmac::Key,
     io: Mutex<Arc<dyn AsyncUdpSocket>>,
     tables: Mutex<Tables>,
+    /// The places of a listener's handshakes. Locked before the state of a peer, which is locked before `tables`.
+    places: Mutex<Handshakes<Slot>>,
     wake: Arc<Notify>,
     reports: mpsc::Sender<(SocketAddr, Refusal)>,
 }
@@ -87,7 +89,6 @@ struct Tables {
     pending: HashMap<SocketAddr, Arc<Peer>>,
     /// Established associations, by where their peers are.
     routes: HashMap<SocketAddr, Arc<Peer>>,
-    overload: Overload,
     resets_since: Option<Instant>,
     resets: u32,
 }
@@ -99,6 +100,26 @@ pub(crate) struct Peer {
     is_proven: AtomicBool,
     state: Mutex<PeerState>,
     progress: watch::Sender<Progress>,
+}
+
+/// A handshake at a listener.
+struct Slot {
+    remote: SocketAddr,
+    peer: Arc<Peer>,
+}
+
+impl Holder for Slot {
+    fn remote(&self) -> SocketAddr {
+        self.remote
+    }
+
+    fn is_pending(&self) -> bool {
+        matches!(*self.peer.progress.borrow(), Progress::Connecting)
+    }
+
+    fn is_engaged(&self) -> bool {
+        self.peer.is_proven.load(Relaxed)
+    }
 }
 
 struct PeerState {
@@ -146,6 +167,7 @@ impl Mux {
         let reset_key = hmac::Key::new(hmac::HMAC_SHA256, &reset_key);
         let derived = hmac::sign(&reset_key, &[RESET_DOMAIN, &port.to_be_bytes()].concat());
         let wake = Arc::new(Notify::new());
+        let places = Mutex::new(Handshakes::new(&options));
         let mux = Arc::new(Self {
             credentials,
             options,
@@ -156,6 +178,7 @@ impl Mux {
             reset_key: hmac::Key::new(hmac::HMAC_SHA256, derived.as_ref()),
             io: Mutex::new(io),
             tables: Mutex::default(),
+            places,
             wake: Arc::clone(&wake),
             reports,
         });
@@ -338,37 +361,42 @@ impl Mux {
             return self.feed(&peer, records, meta, now, sink, data);
         }
         let Some(echo) = front::client_hello(records).filter(|_| !self.is_dialer) else { return };
-        let (total, unproven, from_ip) = {
-            let tables = lock(&self.tables);
-            let unproven = tables.pending.iter().filter(|(_, peer)| !peer.is_proven.load(Relaxed));
-            let (mut count, mut from_ip) = (0, 0);
-            for (address, _) in unproven {
+        let remote = canonical(remote);
+        let (unproven, from_address) = {
+            let places = lock(&self.places);
+            let (mut count, mut from_address) = (0, 0);
+            for (prefix, _) in places.iter().filter(|(_, slot)| !slot.is_engaged()) {
                 count += 1;
-                from_ip += usize::from(address.ip() == remote.ip());
+                from_address += usize::from(prefix == AddressPrefix::from(remote.ip()));
             }
-            (tables.pending.len(), count, from_ip)
+            (count, from_address)
         };
         if !is_proven
-            && (unproven >= self.options.handshakes_unvalidated_max || from_ip >= UNPROVEN_PER_IP_MAX)
+            && (unproven >= self.options.handshakes_unvalidated_max
+                || from_address >= UNPROVEN_PER_ADDRESS_MAX)
         {
-            if let Some(ticket) = self.ticket(remote, now, 0) {
+            if let Some(ticket) = self.ticket(meta.addr, now, 0) {
                 self.say(&front::challenge(&ticket, &echo), meta);
             }
             return;
         }
-        if total >= self.options.handshakes_max {
+        let Entry { is_admitted, evicted, report } = lock(&self.places).make_room(remote, now, &self.metrics);
+        if let Some(report) = report {
+            // A listener that does not keep up has the counters.
+            let _ = self.reports.try_send(report);
+        }
+        if let Some(Slot { peer, .. }) = evicted {
+            let mut state = lock(&peer.state);
+            state.association.end(End::Released);
+            self.settle(&peer, &mut state);
+        }
+        if !is_admitted {
             self.say(&front::busy(&echo), meta);
-            let refusal = Refusal::TooMany { pending: total, unreported: 0 };
-            self.metrics.count_refused(refusal.kind());
-            let report = lock(&self.tables).overload.note(total);
-            if let Some(report) = report {
-                // A listener that does not keep up has the counters.
-                let _ = self.reports.try_send((remote, report));
-            }
             return;
         }
-        match self.open(remote, meta.dst_ip, is_proven) {
+        match self.open(meta.addr, meta.dst_ip, is_proven) {
             Some(peer) => {
+                lock(&self.places).take(now, Slot { remote, peer: Arc::clone(&peer) });
                 self.wake.notify_one();
                 self.feed(&peer, records, meta, now, sink, data);
             }

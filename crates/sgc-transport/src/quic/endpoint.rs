@@ -5,15 +5,16 @@
 //! server has looked at its certificate.
 
 use std::net::SocketAddr;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use quinn::crypto::rustls::HandshakeData;
 use quinn::{AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use rustls::NamedGroup;
 use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
-use tokio::task::JoinSet;
+use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
 use super::config::Flavor;
@@ -28,7 +29,7 @@ use crate::framing::{Greeting, Pieces};
 use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::overload::Overload;
+use crate::overload::{Entry, Handshakes, Holder};
 use crate::prompt::PromptRuntime;
 use crate::race;
 use crate::socket;
@@ -46,7 +47,29 @@ pub(crate) struct QuicListener {
     local: SocketAddr,
     acceptor: Arc<Acceptor>,
     handshakes: JoinSet<(SocketAddr, Result<QuicLink, Refusal>)>,
-    overload: Overload,
+    places: Handshakes<Slot>,
+}
+
+/// A handshake under way.
+struct Slot {
+    remote: SocketAddr,
+    task: AbortHandle,
+    /// The peer is known to receive at its address.
+    is_validated: Arc<AtomicBool>,
+}
+
+impl Holder for Slot {
+    fn remote(&self) -> SocketAddr {
+        self.remote
+    }
+
+    fn is_pending(&self) -> bool {
+        !self.task.is_finished()
+    }
+
+    fn is_engaged(&self) -> bool {
+        self.is_validated.load(Relaxed)
+    }
 }
 
 /// What every incoming handshake needs.
@@ -85,8 +108,9 @@ impl QuicListener {
         let endpoint_config = config::endpoint(flavor, credentials.identity().reset_key(), local.port());
         let runtime = Arc::new(PromptRuntime);
         let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
+        let places = Handshakes::new(&options);
         let acceptor = Arc::new(Acceptor { flavor, credentials, options, metrics, dtls });
-        Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), overload: Overload::default() })
+        Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), places })
     }
 
     pub(crate) fn local_addr(&self) -> SocketAddr {
@@ -99,13 +123,13 @@ impl QuicListener {
                 Some(done) = self.handshakes.join_next() => match done {
                     Ok((_, Ok(link))) => return Some(Ok(link)),
                     Ok((remote, Err(refusal))) => return Some(Err((remote, refusal))),
+                    Err(error) if error.is_cancelled() => {}
                     Err(error) => tracing::error!(%error, "a handshake ended abnormally"),
                 },
                 incoming = self.endpoint.accept() => {
                     let incoming = incoming?;
-                    let remote = canonical(incoming.remote_address());
-                    if let Some(refusal) = self.admit(incoming) {
-                        return Some(Err((remote, refusal)));
+                    if let Some(refused) = self.admit(incoming) {
+                        return Some(Err(refused));
                     }
                 }
             }
@@ -117,35 +141,45 @@ impl QuicListener {
         shut(&self.endpoint, reason).await;
     }
 
-    fn admit(&mut self, incoming: Incoming) -> Option<Refusal> {
-        let pending = self.handshakes.len();
+    /// Starts the handshake of a peer that has a place, and returns a refusal that is to be reported.
+    fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
-        if pending >= handshakes_max {
-            incoming.refuse();
-            let refusal = Refusal::TooMany { pending, unreported: 0 };
-            self.acceptor.metrics.count_refused(refusal.kind());
-            return self.overload.note(pending);
-        }
-        if pending >= handshakes_unvalidated_max && incoming.may_retry() {
+        let pending = self.places.pending();
+        // Where all places are taken, a peer that cannot be asked for proof displaces nobody.
+        if pending >= handshakes_unvalidated_max.min(handshakes_max) && incoming.may_retry() {
             // Cannot fail after `may_retry`.
             let _ = incoming.retry();
             return None;
         }
+        let (remote, now) = (canonical(incoming.remote_address()), Instant::now());
+        let Entry { is_admitted, evicted, report } =
+            self.places.make_room(remote, now, &self.acceptor.metrics);
+        if let Some(slot) = evicted {
+            // Quinn closes the connection when its last handle goes.
+            slot.task.abort();
+        }
+        if !is_admitted {
+            incoming.refuse();
+            return report;
+        }
         let acceptor = Arc::clone(&self.acceptor);
         let pending = acceptor.metrics.pending();
-        self.handshakes.spawn(async move {
+        let is_validated = Arc::new(AtomicBool::new(incoming.remote_address_validated()));
+        let validated = Arc::clone(&is_validated);
+        let task = self.handshakes.spawn(async move {
             let _pending = pending;
-            let remote = canonical(incoming.remote_address());
-            (remote, acceptor.handshake(incoming).await)
+            (remote, acceptor.handshake(incoming, &validated).await)
         });
-        None
+        self.places.take(now, Slot { remote, task, is_validated });
+        report
     }
 }
 
 impl Acceptor {
-    async fn handshake(&self, incoming: Incoming) -> Result<QuicLink, Refusal> {
+    async fn handshake(&self, incoming: Incoming, validated: &AtomicBool) -> Result<QuicLink, Refusal> {
         let after = self.options.handshake_timeout;
-        let result = timeout(after, self.link(incoming)).await.unwrap_or(Err(Refusal::TimedOut { after }));
+        let result = timeout(after, self.link(incoming, validated)).await;
+        let result = result.unwrap_or(Err(Refusal::TimedOut { after }));
         match &result {
             Ok(_) => self.metrics.count_accepted(),
             Err(refusal) => self.metrics.count_refused(refusal.kind()),
@@ -153,10 +187,11 @@ impl Acceptor {
         result
     }
 
-    async fn link(&self, incoming: Incoming) -> Result<QuicLink, Refusal> {
+    async fn link(&self, incoming: Incoming, validated: &AtomicBool) -> Result<QuicLink, Refusal> {
         let (server, findings, gate) = config::server(self.flavor, &self.credentials, &self.options);
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
+        validated.store(true, Relaxed);
         let fate = Fate::new(self.options.idle_timeout);
         let claim = match &self.dtls {
             None => None,

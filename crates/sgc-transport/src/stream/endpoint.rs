@@ -2,12 +2,11 @@
 //!
 //! A link is handed out only after both certificates were verified and the greetings were exchanged, as over QUIC.
 
-use std::collections::VecDeque;
 use std::io::{self, Write as _};
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::{AbortHandle, JoinSet};
@@ -21,7 +20,7 @@ use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::overload::Overload;
+use crate::overload::{Entry, Handshakes, Holder};
 use crate::prompt;
 use crate::race;
 use crate::url::{LinkUrl, ListenAddr, Scheme};
@@ -41,8 +40,7 @@ pub(crate) struct StreamListener {
     local: SocketAddr,
     acceptor: Arc<Acceptor>,
     handshakes: JoinSet<(SocketAddr, Result<StreamLink, Refusal>)>,
-    slots: VecDeque<Slot>,
-    overload: Overload,
+    places: Handshakes<Slot>,
 }
 
 /// What every incoming handshake needs.
@@ -57,9 +55,24 @@ struct Acceptor {
 
 /// A handshake under way.
 struct Slot {
+    remote: SocketAddr,
     task: AbortHandle,
     /// The peer has said something.
     has_spoken: Arc<AtomicBool>,
+}
+
+impl Holder for Slot {
+    fn remote(&self) -> SocketAddr {
+        self.remote
+    }
+
+    fn is_pending(&self) -> bool {
+        !self.task.is_finished()
+    }
+
+    fn is_engaged(&self) -> bool {
+        self.has_spoken.load(Relaxed)
+    }
 }
 
 impl StreamListener {
@@ -72,10 +85,10 @@ impl StreamListener {
         let tcp = listen(addr.addr)?;
         let local = tcp.local_addr()?;
         let (scheme, path) = (addr.scheme, addr.path().to_owned());
+        let places = Handshakes::new(&options);
         let acceptor =
             Arc::new(Acceptor { scheme, path, credentials, options, metrics, links: Links::default() });
-        let (handshakes, overload) = (JoinSet::new(), Overload::default());
-        Ok(Self { tcp, local, acceptor, handshakes, slots: VecDeque::new(), overload })
+        Ok(Self { tcp, local, acceptor, handshakes: JoinSet::new(), places })
     }
 
     pub(crate) fn local_addr(&self) -> SocketAddr {
@@ -94,8 +107,8 @@ impl StreamListener {
                 incoming = self.tcp.accept() => match incoming {
                     Ok((tcp, remote)) => {
                         let remote = canonical(remote);
-                        if let Some(refusal) = self.admit(tcp, remote) {
-                            return Err((remote, refusal));
+                        if let Some(refused) = self.admit(tcp, remote) {
+                            return Err(refused);
                         }
                     }
                     Err(error) => {
@@ -112,23 +125,18 @@ impl StreamListener {
         self.acceptor.links.close(reason).await;
     }
 
-    fn admit(&mut self, tcp: TcpStream, remote: SocketAddr) -> Option<Refusal> {
-        self.slots.retain(|slot| !slot.task.is_finished());
-        let pending = self.slots.len();
-        let mut refusal = None;
-        if pending >= self.acceptor.options.handshakes_max {
-            self.acceptor.metrics.count_refused(Refusal::TooMany { pending, unreported: 0 }.kind());
-            refusal = self.overload.note(pending);
-            // Whoever has said nothing yet gives way, the oldest first; else this one does. So connections that are opened
-            // and left alone keep nobody out.
-            let silent = self.slots.iter().position(|slot| !slot.has_spoken.load(Relaxed));
-            match silent.and_then(|at| self.slots.remove(at)) {
-                Some(slot) => slot.task.abort(),
-                None => {
-                    self.acceptor.turn_away(tcp);
-                    return refusal;
-                }
-            }
+    /// Starts the handshake of a peer that has a place, and returns a refusal that is to be reported. Connections that
+    /// are opened and left alone keep nobody out: they are not engaged, and give way.
+    fn admit(&mut self, tcp: TcpStream, remote: SocketAddr) -> Option<(SocketAddr, Refusal)> {
+        let now = Instant::now();
+        let Entry { is_admitted, evicted, report } =
+            self.places.make_room(remote, now, &self.acceptor.metrics);
+        if let Some(slot) = evicted {
+            slot.task.abort();
+        }
+        if !is_admitted {
+            self.acceptor.turn_away(tcp);
+            return report;
         }
         let acceptor = Arc::clone(&self.acceptor);
         let has_spoken = Arc::<AtomicBool>::default();
@@ -137,8 +145,8 @@ impl StreamListener {
             let _pending = pending;
             (remote, acceptor.handshake(tcp, remote, &spoken).await)
         });
-        self.slots.push_back(Slot { task, has_spoken });
-        refusal
+        self.places.take(now, Slot { remote, task, has_spoken });
+        report
     }
 }
 

@@ -258,3 +258,38 @@ pub async fn greet(connection: Connection, server: &mut Server) -> (Connection, 
     assert_eq!(answer[..], frame(&GREETING));
     (connection, tx, server.link().await)
 }
+
+/// A hello as a bare DTLS client sends it, each another.
+pub fn hello(number: u32) -> Vec<u8> {
+    let extensions: &[u8] = &[
+        0, 10, 0, 4, 0, 2, 0, 23, // groups: P-256
+        0, 11, 0, 2, 1, 0, // points: uncompressed
+        0, 13, 0, 4, 0, 2, 4, 3, // signatures: ECDSA P-256
+        0, 23, 0, 0, // extended master secret
+    ];
+    let mut body = vec![0xfe, 0xfd];
+    body.extend((0..8).flat_map(|i| (number.wrapping_mul(2_654_435_761) ^ i).to_be_bytes()));
+    body.extend([0, 0, 0, 2, 0xc0, 0x2b, 1, 0]);
+    body.extend((extensions.len() as u16).to_be_bytes());
+    body.extend(extensions);
+    let len = body.len() as u8;
+    let mut handshake = vec![1, 0, 0, len, 0, 0, 0, 0, 0, 0, 0, len];
+    handshake.extend(body);
+    let mut record = vec![22, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, 0];
+    record.extend((handshake.len() as u16).to_be_bytes());
+    record.extend(handshake);
+    record
+}
+
+/// Begins a DTLS handshake from this socket, proves its address by the ticket that it is given, and says no more.
+pub fn prove_and_stall(socket: &std::net::UdpSocket, listener: SocketAddr, number: u32) {
+    const CHALLENGE: u8 = 0xc2;
+    const TICKET: u8 = 0xc3;
+    socket.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    socket.send_to(&hello(number), listener).unwrap();
+    let mut challenge = [0; 2048];
+    let bytes = socket.recv(&mut challenge).unwrap();
+    assert!(bytes > 17 && challenge[0] == CHALLENGE, "no challenge: {:?}", &challenge[..bytes]);
+    let answer = [&[TICKET], &challenge[1..17], &hello(number)[..]].concat();
+    socket.send_to(&answer, listener).unwrap();
+}

@@ -1,0 +1,136 @@
+//! Strangers that begin handshakes and never finish them, from few addresses and over every transport.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
+#[macro_use]
+mod support;
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
+use std::time::Duration;
+
+use quinn::Endpoint;
+use quinn::crypto::rustls::QuicClientConfig;
+use sgc_transport::*;
+use sgc_trust::Identity;
+use support::*;
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::{TcpSocket, TcpStream};
+
+/// Places of the listeners below.
+const PLACES: usize = 12;
+/// Of these, for one address.
+const PLACES_PER_ADDRESS: usize = 4;
+/// More handshakes than there are places.
+const FLOOD: usize = 20;
+
+/// A handshake that its peer keeps open.
+#[allow(dead_code, reason = "they are held, not used")]
+enum Stalled {
+    Tcp(TcpStream),
+    Udp(UdpSocket),
+    Quic(Endpoint, Option<quinn::Connection>),
+}
+
+/// The loopback address of a host that attacks. Honest peers come from 127.0.0.1.
+fn attacker(host: u8) -> SocketAddr {
+    SocketAddr::new(IpAddr::V4(Ipv4Addr::new(127, 0, 0, 1 + host)), 0)
+}
+
+/// Begins a handshake from this address, as far as makes it count as engaged, and leaves it there.
+async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAddr, number: u32) -> Stalled {
+    match scheme {
+        "quic" | "udp" => {
+            let alpn = if scheme == "udp" { "sgc-udp/1" } else { "sgc/1" };
+            let tls = QuicClientConfig::try_from(bare_tls(Some(member), alpn, None)).unwrap();
+            let config = quinn::ClientConfig::new(std::sync::Arc::new(tls));
+            let endpoint = Endpoint::client(from).unwrap();
+            let connecting = endpoint.connect_with(config, server.addr, "x.invalid").unwrap();
+            // A refusal is an answer, too.
+            let connection = soon(connecting).await.ok();
+            Stalled::Quic(endpoint, connection)
+        }
+        "dtls" => {
+            let socket = UdpSocket::bind(from).unwrap();
+            prove_and_stall(&socket, server.addr, number);
+            Stalled::Udp(socket)
+        }
+        _ => {
+            let socket = TcpSocket::new_v4().unwrap();
+            socket.bind(from).unwrap();
+            let mut tcp = soon(socket.connect(server.addr)).await.unwrap();
+            let start: &[u8] = if scheme == "ws" { b"GET /sgc" } else { &[22, 3, 1] };
+            // It may be turned away already.
+            let _ = tcp.write_all(start).await;
+            Stalled::Tcp(tcp)
+        }
+    }
+}
+
+fn crowded_listener(scheme: &str, fleet: &sgc_trust::Fleet) -> Server {
+    let options = LinkOptions {
+        handshakes_max: PLACES,
+        handshakes_per_address_max: PLACES_PER_ADDRESS,
+        // DTLS gives tickets from here on.
+        handshakes_unvalidated_max: if scheme == "dtls" { 0 } else { 32 },
+        handshake_timeout: Duration::from_secs(20),
+        ..LinkOptions::default()
+    };
+    let mut server = Server::start_on(scheme, enroll(fleet, "router"), options);
+    // Refusals are for the counters here.
+    let mut results = std::mem::replace(&mut server.results, tokio::sync::mpsc::channel(1).1);
+    tokio::spawn(async move { while results.recv().await.is_some() {} });
+    server
+}
+
+async fn wait_for_pending(server: &Server, least: u64) {
+    soon(async {
+        while server.metrics.handshakes_pending() < least {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
+}
+
+/// Whatever one host does, it holds its share of the places and no more, and others connect.
+async fn one_address_that_stalls_keeps_nobody_else_out(scheme: &str) {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let server = crowded_listener(scheme, &fleet);
+    let mut held = Vec::new();
+    for number in 0..FLOOD as u32 {
+        held.push(stall(scheme, &server, &arm, attacker(1), number).await);
+    }
+    wait_for_pending(&server, PLACES_PER_ADDRESS as u64).await;
+    assert!(server.metrics.handshakes_pending() <= PLACES_PER_ADDRESS as u64);
+    let turned_away = (FLOOD - PLACES_PER_ADDRESS) as u64;
+    soon(async {
+        while server.metrics.refused(RefusalKind::TooManyFromAddress) < turned_away {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
+    assert_eq!(server.metrics.refused(RefusalKind::TooMany), 0);
+    dial(arm, &server.url).await.unwrap();
+}
+
+/// Some hosts that take every place make room, since each of them holds more than the newcomer would.
+async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str) {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let server = crowded_listener(scheme, &fleet);
+    let mut held = Vec::new();
+    for host in 1..=3 {
+        for number in 0..PLACES_PER_ADDRESS as u32 {
+            held.push(stall(scheme, &server, &arm, attacker(host), number + 100 * u32::from(host)).await);
+        }
+    }
+    wait_for_pending(&server, PLACES as u64).await;
+    dial(arm, &server.url).await.unwrap();
+    assert!(server.metrics.refused(RefusalKind::TooMany) >= 1, "one of theirs gave way");
+}
+
+each_transport! {
+    [
+        one_address_that_stalls_keeps_nobody_else_out
+        a_few_addresses_that_take_all_places_make_room_for_another
+    ]: quic dtls udp tls tcp ws wss
+}
