@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
-use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, renewal_blind};
+use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, next_seq, renewal_blind};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, Control, Credentials, DescribedType, Metadata, Name,
     NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
@@ -22,6 +22,10 @@ use crate::types::{TypeAsker, types_name};
 
 /// How often it is looked for certificates that have ended, which happens without anything else.
 const ENFORCE_EVERY: Duration = Duration::from_secs(20);
+
+/// Advertisements and withdrawals after which all names are advertised together again: routers keep 512 of an owner
+/// (docs/spec/routing.md), and each takes memory there for as long as it speaks for one name.
+const ADVERTS_APART_MAX: usize = 64;
 
 /// Bounds and timers of an endpoint.
 #[derive(Clone, Debug)]
@@ -278,6 +282,8 @@ pub struct Endpoint {
     pub(crate) withdrawn: BTreeSet<Blind>,
     advert_seq: u64,
     pub(crate) advert_pace: AdvertPace,
+    /// Advertisements and withdrawals since all names were advertised together.
+    adverts_apart: usize,
     pub(crate) renew_at: Option<Instant>,
     /// When to look for certificates that have ended.
     pub(crate) enforce_at: Option<Instant>,
@@ -316,6 +322,7 @@ impl Endpoint {
             withdrawn: BTreeSet::new(),
             advert_seq: 0,
             advert_pace: AdvertPace::default(),
+            adverts_apart: 0,
             renew_at: None,
             enforce_at: None,
             outputs: VecDeque::new(),
@@ -441,6 +448,7 @@ impl Endpoint {
     }
 
     pub(crate) fn advertise_all(&mut self) {
+        self.adverts_apart = 0;
         let types = self.describes.then_some(&self.types_name);
         let fixed = self.catalogue_names.iter().chain(&self.renewal_name).chain(types).map(|(_, b)| *b);
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
@@ -457,12 +465,16 @@ impl Endpoint {
         if self.advert_deadline().is_some_and(|at| at > self.now.instant) {
             return;
         }
+        let is_due = !self.withdrawn.is_empty() || !self.unadvertised.is_empty();
+        if is_due && self.adverts_apart >= ADVERTS_APART_MAX {
+            self.advertise_all();
+        }
         for withdraw in [true, false] {
             let due = std::mem::take(if withdraw { &mut self.withdrawn } else { &mut self.unadvertised });
             let due: Vec<_> = due.into_iter().collect();
             for blinds in due.chunks(ADVERT_NAMES_MAX) {
                 // The clock keeps sequence numbers growing over restarts.
-                self.advert_seq = self.now.unix.0.max(self.advert_seq + 1);
+                self.advert_seq = next_seq(self.advert_seq, self.now.unix);
                 let body = AdvertBody {
                     chain: self.config.identity.chain_bytes(),
                     seq: self.advert_seq,
@@ -474,6 +486,7 @@ impl Endpoint {
                 let signed = self.config.identity.sign_advert(&body);
                 self.outputs.push_back(Output::Send(Control::Advert { cost: 0, signed }));
                 self.advert_pace.sent(self.now.instant);
+                self.adverts_apart += 1;
                 if !withdraw {
                     self.renew_at.get_or_insert(self.now.instant + self.config.limits.lease / 3);
                     self.enforce_at.get_or_insert(self.now.instant + ENFORCE_EVERY);

@@ -58,8 +58,8 @@ pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NO
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};
 pub use signed::{
-    CLOCK_SKEW_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState, signed_digest,
-    verify_advert, verify_answer, verify_join, verify_link_state,
+    CLOCK_SKEW_MAX, SEQ_AHEAD_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState, next_seq,
+    signed_digest, verify_advert, verify_answer, verify_join, verify_link_state,
 };
 pub use suite::{ParseSuiteError, Suite};
 pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};

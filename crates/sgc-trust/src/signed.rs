@@ -17,6 +17,9 @@ use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, nam
 
 /// How far a signer's clock may be from the verifier's.
 pub const CLOCK_SKEW_MAX: Duration = Duration::from_secs(10 * 60);
+/// How far a sequence number, which counts milliseconds, may be ahead of the time of signing: ten years, more than any clock
+/// that was once wrong. Without a bound, one number would leave its node no greater one.
+pub const SEQ_AHEAD_MAX: Duration = Duration::from_secs(10 * 365 * 86_400);
 
 const ADVERT: &str = "sgc advert v1";
 const JOIN: &str = "sgc join v1";
@@ -42,6 +45,14 @@ pub enum SignedError {
         signed: UnixMillis,
         /// The verifier's time.
         now: UnixMillis,
+    },
+    /// The sequence number is ahead of the time of signing by more than [`SEQ_AHEAD_MAX`].
+    #[error("sequence number {seq} is too far ahead of {signed}, when it was signed")]
+    Sequence {
+        /// The sequence number.
+        seq: u64,
+        /// Time in the body.
+        signed: UnixMillis,
     },
 }
 
@@ -130,7 +141,7 @@ impl Identity {
     }
 }
 
-/// Verifies an advertisement: chain, time, signature; and derives the names it may claim.
+/// Verifies an advertisement: chain, time, signature, sequence number; and derives the names it may claim.
 pub fn verify_advert(
     anchors: &TrustAnchors,
     signed: &Signed,
@@ -139,6 +150,7 @@ pub fn verify_advert(
     let body = AdvertBody::from_slice(&signed.body)?;
     let owner = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     owner.verify_signature(ADVERT, &signed.body, &signed.signature)?;
+    verify_seq(body.seq, body.issued_at)?;
     let names = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
     Ok(VerifiedAdvert { owner, body, names })
 }
@@ -155,7 +167,7 @@ pub fn verify_join(
     Ok(VerifiedJoin { peer, body })
 }
 
-/// Verifies a link state: chain, time, signature. Whether the node may carry others' names is for the caller to see.
+/// Verifies a link state: chain, time, signature, sequence number. Whether the node may carry others' names is for the caller to see.
 pub fn verify_link_state(
     anchors: &TrustAnchors,
     signed: &Signed,
@@ -164,6 +176,7 @@ pub fn verify_link_state(
     let body = LinkStateBody::from_slice(&signed.body)?;
     let node = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     node.verify_signature(LINK_STATE, &signed.body, &signed.signature)?;
+    verify_seq(body.seq, body.issued_at)?;
     Ok(VerifiedLinkState { node, body })
 }
 
@@ -178,6 +191,21 @@ pub fn verify_answer(owner: &VerifiedPeer, signed: &Signed) -> Result<AnswerBody
     let body = AnswerBody::from_slice(&signed.body)?;
     owner.verify_signature(ANSWER, &signed.body, &signed.signature)?;
     Ok(body)
+}
+
+/// Returns the sequence number that follows `last`: the time in milliseconds, so that numbers grow over restarts, or the next
+/// one. A number beyond [`SEQ_AHEAD_MAX`], which nobody believes, is not continued.
+pub fn next_seq(last: u64, now: UnixMillis) -> u64 {
+    let next = now.0.max(last.saturating_add(1));
+    if verify_seq(next, now).is_ok() { next } else { now.0 }
+}
+
+fn verify_seq(seq: u64, signed: UnixMillis) -> Result<(), SignedError> {
+    let ahead = seq.saturating_sub(signed.0);
+    if ahead > SEQ_AHEAD_MAX.as_millis() as u64 {
+        return Err(SignedError::Sequence { seq, signed });
+    }
+    Ok(())
 }
 
 fn verify_chain(
