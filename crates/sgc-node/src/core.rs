@@ -35,6 +35,7 @@ use tracing::debug;
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::authority::{Authority, RenewalAnswer};
 use crate::calls::Calls;
+use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
 use crate::core::types::{TypeOutcome, Types};
@@ -84,8 +85,8 @@ pub(crate) enum CoreEvent {
         url: Option<String>,
         /// Where its control frames go.
         control: ControlTx,
-        /// Its number and the data path, or nothing if the node is stopping.
-        reply: oneshot::Sender<Option<(LinkId, Arc<DataPlane>)>>,
+        /// Its place here, or nothing if the node is stopping.
+        reply: oneshot::Sender<Option<LinkPlace>>,
     },
     /// A link ended.
     LinkDown {
@@ -98,6 +99,13 @@ pub(crate) enum CoreEvent {
         link: LinkId,
         /// What.
         frame: Control,
+        /// What it takes of the inbox.
+        room: FrameRoom,
+    },
+    /// A link has taken all control frames before a flush.
+    Flushed {
+        /// Which.
+        link: LinkId,
     },
     /// A malformed control frame came.
     Malformed {
@@ -175,6 +183,16 @@ pub(crate) enum CoreEvent {
     Stop(oneshot::Sender<Vec<AnyLink>>),
 }
 
+/// The place of a link at this node.
+pub(crate) struct LinkPlace {
+    /// Its number.
+    pub(crate) id: LinkId,
+    /// Where its packets go.
+    pub(crate) data: Arc<DataPlane>,
+    /// What its control frames may take of the inbox.
+    pub(crate) inbox: InboxShare,
+}
+
 /// This node's end of a service on the local network.
 pub(crate) enum ServiceEnd {
     /// It calls local servers.
@@ -201,6 +219,7 @@ pub(crate) struct Core<N: RosNetwork> {
     routes: Option<Routes<ChaCha20Rng>>,
     network: Option<Arc<N>>,
     data: Arc<DataPlane>,
+    inbox: Inbox,
     links: BTreeMap<LinkId, LinkEntry>,
     /// When to look at them.
     look_due: Option<Instant>,
@@ -324,6 +343,7 @@ impl<N: RosNetwork> Core<N> {
             routes: parts.routes,
             network: parts.network,
             data: Arc::new(DataPlane::new(parts.rates)),
+            inbox: Inbox::default(),
             links: BTreeMap::new(),
             look_due: None,
             patience: parts.patience,
@@ -424,7 +444,8 @@ impl<N: RosNetwork> Core<N> {
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 let (flows, heart) = (HashMap::new(), self.heart_of(&link));
                 self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, heart });
-                if reply.send(Some((id, self.data.clone()))).is_err() {
+                let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
+                if reply.send(Some(place)).is_err() {
                     debug!(%remote, "the link's task is gone");
                 }
                 self.router.handle_link_up(now(), id, neighbour);
@@ -443,7 +464,11 @@ impl<N: RosNetwork> Core<N> {
                     entry.flows.values().for_each(|f| f.close());
                 }
             }
-            CoreEvent::Frame { link, frame } => self.router.handle_frame(now(), link, frame),
+            CoreEvent::Frame { link, frame, room } => {
+                self.router.handle_frame(now(), link, frame);
+                drop(room);
+            }
+            CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
                 self.control_drops.count_from("malformed_control", link);
             }

@@ -13,11 +13,12 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
 use sgc_wire::{Control, LaneToken, Name, NodeId};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
+use crate::control_queue::ControlQueue;
 use crate::finding::{BACKOFF_MAX, wait};
 use crate::links::Inflow;
 
@@ -79,7 +80,7 @@ pub(crate) type Dial = (Arc<Dialer>, LinkUrl);
 /// The lanes of one link.
 pub(crate) struct Lanes {
     link: AnyLink,
-    frames: mpsc::Sender<Control>,
+    frames: ControlQueue,
     /// Nothing if the peer dialled the link.
     dial: Option<Dial>,
     door: LaneDoor,
@@ -121,12 +122,7 @@ enum LaneFailure {
 
 impl Lanes {
     /// Of a link without any so far; `dial` if this node dialled it.
-    pub(crate) fn new(
-        link: AnyLink,
-        frames: mpsc::Sender<Control>,
-        dial: Option<Dial>,
-        door: LaneDoor,
-    ) -> Arc<Self> {
+    pub(crate) fn new(link: AnyLink, frames: ControlQueue, dial: Option<Dial>, door: LaneDoor) -> Arc<Self> {
         Arc::new(Self {
             link,
             frames,
@@ -184,7 +180,7 @@ impl Lanes {
             lane.wanted_here = true;
         }
         drop(table);
-        if self.dial.is_none() && self.frames.try_send(Control::LaneWanted { name }).is_err() {
+        if self.dial.is_none() && !self.frames.push(Control::LaneWanted { name }) {
             debug!(name = %name.short(), "the peer takes no control frames; no lane is asked for");
         }
     }
@@ -202,7 +198,10 @@ impl Lanes {
                 }
                 drop(table);
                 let answer = Control::LaneAnswer { token: *token, accepted };
-                self.frames.try_send(answer).map_err(|_| "it does not take control frames".to_owned())
+                match self.frames.push(answer) {
+                    true => Ok(()),
+                    false => Err("it does not take control frames".to_owned()),
+                }
             }
             (Control::LaneAnswer { token, accepted }, Some(_)) => {
                 // One that nobody waits for came too late.
@@ -288,7 +287,7 @@ impl Lanes {
         let (answer, answered) = oneshot::channel();
         self.table().answers.insert(token, answer);
         let asked = async {
-            self.frames.send(Control::LaneOffer { token, name }).await.ok()?;
+            self.frames.push_later(Control::LaneOffer { token, name }).await.then_some(())?;
             answered.await.ok()
         };
         let accepted = timeout(ANSWER_MAX, asked).await;

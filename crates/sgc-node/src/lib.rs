@@ -16,6 +16,7 @@ mod authority;
 pub mod benchmarks;
 mod calls;
 pub mod config;
+mod control_queue;
 mod conversion;
 mod core;
 mod credentials;

@@ -20,7 +20,8 @@ use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
 use crate::audit::{Audit, AuditEvent, AuditRecord};
-use crate::core::CoreEvent;
+use crate::control_queue::{ControlQueue, InboxShare, Outgoing};
+use crate::core::{CoreEvent, LinkPlace};
 use crate::dataplane::DataPlane;
 use crate::finding::{Aim, BACKOFF_MAX, Claim, Claims, Climb, Dialled, Holder, Line, is_over_udp, wait};
 use crate::heart::Activity;
@@ -30,8 +31,6 @@ use crate::peer_rate::PeerRate;
 use crate::roaming::{self, Move, Origin, source_towards};
 use crate::stats::DataDrop;
 
-/// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
-const CONTROL_FRAMES_MAX: usize = 8192;
 /// How long a link that replaces another may take until the other goes.
 const SETTLE_MAX: Duration = Duration::from_secs(5);
 /// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
@@ -45,7 +44,7 @@ const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
 /// Sends frames of the control task over a link, in order.
 pub(crate) struct ControlTx {
-    frames: mpsc::Sender<Control>,
+    frames: ControlQueue,
     labels: LabelBook,
     activity: Arc<Activity>,
     lanes: Arc<Lanes>,
@@ -55,7 +54,7 @@ impl ControlTx {
     /// The label of a name on this link, if it has one; a new one is told to the peer.
     pub(crate) fn label(&mut self, name: Name) -> Option<NameLabel> {
         let frames = &self.frames;
-        self.labels.label(name, |label| frames.try_send(Control::Label { label, name }).is_ok())
+        self.labels.label(name, |label| frames.push(Control::Label { label, name }))
     }
 
     /// Whether packets go over the link.
@@ -75,7 +74,12 @@ impl ControlTx {
 
     /// Queues a frame; false if the peer is too far behind.
     pub(crate) fn send(&self, frame: Control) -> bool {
-        self.frames.try_send(frame).is_ok()
+        self.frames.push(frame)
+    }
+
+    /// Has the control task told when the link has taken what is queued; false if the peer is too far behind.
+    pub(crate) fn flush(&self) -> bool {
+        self.frames.flush()
     }
 }
 
@@ -308,7 +312,7 @@ impl Served {
         door: LaneDoor,
         core: &mpsc::Sender<CoreEvent>,
     ) -> Self {
-        let (frames, outgoing) = mpsc::channel(CONTROL_FRAMES_MAX);
+        let (frames, outgoing) = ControlQueue::new();
         let (reply, id) = oneshot::channel();
         let (count, heard) = watch::channel(0);
         let progress = Arc::<Progress>::default();
@@ -320,12 +324,13 @@ impl Served {
         let control = ControlTx { frames: frames.clone(), labels, activity: activity_tx, lanes: lanes_tx };
         let up = CoreEvent::LinkUp { link: link.clone(), url, control, reply };
         let id = match (core.send(up).await, id.await) {
-            (Ok(()), Ok(Some((id, data)))) => {
+            (Ok(()), Ok(Some(LinkPlace { id, data, inbox }))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
                 let inflow = Inflow::new(&link, id, data, activity);
                 lanes.start(inflow.clone());
                 let (core, lanes) = (core.clone(), lanes.clone());
-                let reader = ControlRx { link: link.clone(), id, frames, progress, lanes, count, core };
+                let reader =
+                    ControlRx { link: link.clone(), id, frames, progress, lanes, count, core, inbox };
                 spawn_tasks(inflow, outgoing, reader);
                 Some(id)
             }
@@ -379,17 +384,31 @@ impl Served {
     }
 }
 
-fn spawn_tasks(inflow: Inflow, outgoing: mpsc::Receiver<Control>, reader: ControlRx) {
-    tokio::spawn(send_control(inflow.link.clone(), outgoing));
+fn spawn_tasks(inflow: Inflow, outgoing: mpsc::Receiver<Outgoing>, reader: ControlRx) {
+    tokio::spawn(send_control(inflow.link.clone(), inflow.id, outgoing, reader.core.clone()));
     tokio::spawn(reader.run());
     inflow.spawn();
 }
 
-async fn send_control(link: AnyLink, mut outgoing: mpsc::Receiver<Control>) {
-    while let Some(frame) = outgoing.recv().await {
-        if let Err(error) = link.send_control(frame.to_bytes()).await {
-            debug!(%error, "control frame not sent");
-            return;
+async fn send_control(
+    link: AnyLink,
+    id: LinkId,
+    mut outgoing: mpsc::Receiver<Outgoing>,
+    core: mpsc::Sender<CoreEvent>,
+) {
+    while let Some(next) = outgoing.recv().await {
+        match next {
+            Outgoing::Frame(frame) => {
+                if let Err(error) = link.send_control(frame.to_bytes()).await {
+                    debug!(%error, "control frame not sent");
+                    return;
+                }
+            }
+            Outgoing::Flush => {
+                if core.send(CoreEvent::Flushed { link: id }).await.is_err() {
+                    return;
+                }
+            }
         }
     }
 }
@@ -399,18 +418,20 @@ struct ControlRx {
     link: AnyLink,
     id: LinkId,
     /// For acknowledgements.
-    frames: mpsc::Sender<Control>,
+    frames: ControlQueue,
     progress: Arc<Progress>,
     lanes: Arc<Lanes>,
     /// How many frames came.
     count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
+    /// What may wait for the control task.
+    inbox: InboxShare,
 }
 
 impl ControlRx {
     async fn run(self) {
         while let Ok(bytes) = self.link.recv_control().await {
-            match self.take(Control::from_slice(&bytes)).await {
+            match self.take(bytes.len(), Control::from_slice(&bytes)).await {
                 Ok(true) => self.count.send_modify(|n| *n += 1),
                 Ok(false) => return,
                 Err(error) => {
@@ -425,7 +446,7 @@ impl ControlRx {
 
     /// False if the peer is too far behind, and has no link any more.
     fn answer(&self, frame: Control) -> bool {
-        let is_sent = self.frames.try_send(frame).is_ok();
+        let is_sent = self.frames.push(frame);
         if !is_sent {
             warn!(link = self.id.0, remote = %self.link.remote(), "the peer does not take control frames; the link is closed");
             self.link.close(CloseReason::Overloaded);
@@ -434,7 +455,7 @@ impl ControlRx {
     }
 
     /// False if no more is to be taken in; the error is the peer's.
-    async fn take(&self, frame: Result<Control, DecodeError>) -> Result<bool, String> {
+    async fn take(&self, bytes: usize, frame: Result<Control, DecodeError>) -> Result<bool, String> {
         let frame = frame.map_err(|error| error.to_string())?;
         // What stands in the place of the greeting is the router's to judge.
         let is_greeted = *self.count.borrow() > 0;
@@ -457,7 +478,10 @@ impl ControlRx {
             {
                 self.lanes.handle(&frame).map(|()| true)
             }
-            frame => Ok(self.core.send(CoreEvent::Frame { link: self.id, frame }).await.is_ok()),
+            frame => {
+                let Some(room) = self.inbox.take(bytes).await else { return Ok(false) };
+                Ok(self.core.send(CoreEvent::Frame { link: self.id, frame, room }).await.is_ok())
+            }
         }
     }
 }
@@ -611,6 +635,7 @@ mod tests {
     use sgc_wire::{Hello, Label};
 
     use super::*;
+    use crate::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
     use crate::core::now;
     use crate::finding::{Board, Dns, WayBook, keep_at};
     use crate::roaming::Network;
@@ -650,15 +675,16 @@ mod tests {
                             assert!(control.send(Control::Hello(hello)));
                         }
                         links.push((link, control));
-                        assert!(reply.send(Some((id, Arc::default()))).is_ok());
+                        let place = LinkPlace { id, data: Arc::default(), inbox: Inbox::default().share() };
+                        assert!(reply.send(Some(place)).is_ok());
                     }
                     CoreEvent::LinkDown { id } => tell.send(Told::Down(id)).await.unwrap(),
-                    CoreEvent::Frame { link, frame: Control::Hello(_) }
+                    CoreEvent::Frame { link, frame: Control::Hello(_), .. }
                         if link.0 > 1 && closes.load(Relaxed) =>
                     {
                         links[link.0 as usize - 1].0.close(CloseReason::Overloaded);
                     }
-                    CoreEvent::Frame { link, frame: Control::Goodbye } => {
+                    CoreEvent::Frame { link, frame: Control::Goodbye, .. } => {
                         links[link.0 as usize - 1].0.close(CloseReason::Goodbye);
                     }
                     _ => {}
@@ -823,6 +849,90 @@ mod tests {
             LinkError::Closed { by_peer: true, reason } => reason,
             end => panic!("{end}"),
         }
+    }
+
+    #[tokio::test]
+    async fn control_frames_beyond_a_links_share_of_the_inbox_wait_at_that_link() {
+        const FRAME_BYTES: usize = 100_000;
+        let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+        let addr = "quic://127.0.0.1:0".parse().unwrap();
+        let router = CredentialStore::new(enroll(&fleet, "router"));
+        let listener = Listener::bind(&addr, router.clone(), LinkOptions::default(), Arc::default()).unwrap();
+        let url = listener.local().to_string().parse().unwrap();
+        let (core, mut events) = mpsc::channel(4096);
+        let (_stop, stopped) = oneshot::channel();
+        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        let inbox = Inbox::default();
+        // The frames of a link that wait for a control task that takes none.
+        let mut held = Vec::new();
+        let mut links = Vec::new();
+        for (id, name, count) in [(1, "flooder", 40), (2, "other", 1)] {
+            let dialer = Dialer::new(
+                CredentialStore::new(enroll(&fleet, name)),
+                LinkOptions::default(),
+                Arc::default(),
+            );
+            let link = soon(dialer.dial(&url)).await.unwrap();
+            let CoreEvent::LinkUp { reply, .. } = soon(events.recv()).await.unwrap() else { panic!() };
+            let place = LinkPlace { id: LinkId(id), data: Arc::default(), inbox: inbox.share() };
+            assert!(reply.send(Some(place)).is_ok());
+            links.push(link.clone());
+            let flood = tokio::spawn(async move {
+                for _ in 0..count {
+                    let names = vec![Name([1; 32]); FRAME_BYTES / 32];
+                    if link.send_control(Control::Interest { names }.to_bytes()).await.is_err() {
+                        return;
+                    }
+                }
+            });
+            let at_least = if id == 1 { LINK_INBOX_BYTES_MAX / (FRAME_BYTES + 1000) } else { 1 };
+            while held.iter().filter(|(link, _)| *link == LinkId(id)).count() < at_least {
+                match soon(events.recv()).await.unwrap() {
+                    CoreEvent::Frame { link, room, .. } => held.push((link, room)),
+                    _ => panic!("only frames come"),
+                }
+            }
+            if id == 2 {
+                soon(flood).await.unwrap();
+            }
+        }
+        let of_flooder = held.iter().filter(|(link, _)| *link == LinkId(1)).count();
+        assert!(of_flooder * FRAME_BYTES <= LINK_INBOX_BYTES_MAX, "{of_flooder} frames wait");
+        // What is handled makes room for what waits.
+        held.clear();
+        let CoreEvent::Frame { link, .. } = soon(events.recv()).await.unwrap() else { panic!() };
+        assert_eq!(link, LinkId(1));
+    }
+
+    #[tokio::test]
+    async fn a_flush_is_told_once_the_link_has_taken_what_was_queued() {
+        let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+        let addr = "quic://127.0.0.1:0".parse().unwrap();
+        let router = CredentialStore::new(enroll(&fleet, "router"));
+        let listener = Listener::bind(&addr, router.clone(), LinkOptions::default(), Arc::default()).unwrap();
+        let url = listener.local().to_string().parse().unwrap();
+        let (core, mut events) = mpsc::channel(64);
+        let (_stop, stopped) = oneshot::channel();
+        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        let dialer =
+            Dialer::new(CredentialStore::new(enroll(&fleet, "arm")), LinkOptions::default(), Arc::default());
+        let link = soon(dialer.dial(&url)).await.unwrap();
+        let CoreEvent::LinkUp { reply, control, .. } = soon(events.recv()).await.unwrap() else { panic!() };
+        let place = LinkPlace { id: LinkId(7), data: Arc::default(), inbox: Inbox::default().share() };
+        assert!(reply.send(Some(place)).is_ok());
+        // More than what may be under way unread.
+        let many = 2000;
+        for _ in 0..many {
+            assert!(control.send(Control::Interest { names: vec![Name([1; 32]); 1000] }));
+        }
+        assert!(control.flush());
+        let unread = timeout(Duration::from_millis(500), events.recv()).await;
+        assert!(unread.is_err(), "nothing was read, so the link cannot have taken it all");
+        for _ in 0..many {
+            soon(link.recv_control()).await.unwrap();
+        }
+        let event = soon(events.recv()).await.unwrap();
+        assert!(matches!(event, CoreEvent::Flushed { link: LinkId(7) }));
     }
 
     #[tokio::test]

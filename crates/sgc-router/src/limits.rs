@@ -24,7 +24,12 @@ pub struct Limits {
     pub branches_per_name_max: usize,
     /// Names that one link may ask for.
     pub interests_per_link_max: usize,
-    /// Withdrawn names remembered against replay, and as many that were asked for lately.
+    /// Advertisements and withdrawals of one owner that are in force; beyond it the oldest are void.
+    pub adverts_per_owner_max: usize,
+    /// Bytes of them.
+    pub advert_bytes_per_owner_max: usize,
+    /// Withdrawn names remembered against replay, and as many that were asked for lately. Beyond it the owner with the most
+    /// loses its oldest withdrawal, and with it whatever it advertised before.
     pub tombstones_max: usize,
     /// How long an owner may take to answer a join, and a sink to find the better way that it was told of.
     pub answer_wait: Duration,
@@ -37,9 +42,12 @@ pub struct Limits {
     pub joins_burst: u32,
     /// Names that a neighbour may ask for at once; refilled by an eighth of it a second.
     pub queries_burst: u32,
-    /// Advertisements and link states that a node may sign at once, each of which goes to all routers; refilled by an
-    /// eighth of it a second.
+    /// Advertisements and link states of a node that are passed on at once, each to all routers; refilled by an eighth of it
+    /// a second. What is beyond it waits, and only the newest of it goes on.
     pub announcements_burst: u32,
+    /// Announcements that had to be verified and were no news, or more than their signer may have passed on, which a
+    /// neighbour may bring at once; refilled by an eighth of it a second. A router may bring sixteen times as many.
+    pub stale_burst: u32,
     /// Things that do not verify which a node may bring before its link is closed; one is forgiven a second.
     pub forgeries_max: u32,
 }
@@ -54,6 +62,8 @@ impl Default for Limits {
             branches_per_peer_max: 65_536,
             branches_per_name_max: 4096,
             interests_per_link_max: 65_536,
+            adverts_per_owner_max: 512,
+            advert_bytes_per_owner_max: 4 << 20,
             tombstones_max: 100_000,
             answer_wait: Duration::from_secs(10),
             lease_max: Duration::from_secs(600),
@@ -61,6 +71,7 @@ impl Default for Limits {
             joins_burst: 1024,
             queries_burst: 65_536,
             announcements_burst: 256,
+            stale_burst: 256,
             forgeries_max: 64,
         }
     }
@@ -72,6 +83,7 @@ pub(crate) struct Allowance {
     joins: Budget,
     queries: Budget,
     announcements: Budget,
+    stale: Budget,
     forgeries: Budget,
     /// Branches that it has here.
     pub(crate) branches: usize,
@@ -83,6 +95,7 @@ impl Allowance {
             joins: Budget::new(limits.joins_burst, limits.joins_burst / 8),
             queries: Budget::new(limits.queries_burst, limits.queries_burst / 8),
             announcements: Budget::new(limits.announcements_burst, limits.announcements_burst / 8),
+            stale: Budget::new(limits.stale_burst, limits.stale_burst / 8),
             forgeries: Budget::new(limits.forgeries_max, 1),
             branches: 0,
         }
@@ -98,9 +111,19 @@ impl Allowance {
         self.queries.take(now, names.max(1).try_into().unwrap_or(u32::MAX), 1)
     }
 
-    /// Takes something that it signed for all; false if that is too much.
+    /// Takes something that it signed for all; false if that is too much to pass on now.
     pub(crate) fn may_announce(&mut self, now: Instant) -> bool {
         self.announcements.take(now, 1, 1)
+    }
+
+    /// Returns true if it may bring another announcement that has to be verified and may turn out to be no news.
+    pub(crate) fn may_bring(&self, now: Instant, is_router: bool) -> bool {
+        self.stale.has_room(now, 1, if is_router { ROUTER_FACTOR } else { 1 })
+    }
+
+    /// Takes an announcement that was verified in vain.
+    pub(crate) fn brought_stale(&mut self, now: Instant, is_router: bool) {
+        self.stale.take(now, 1, if is_router { ROUTER_FACTOR } else { 1 });
     }
 
     /// Takes one from what it may get wrong; false if there is none left.
@@ -110,7 +133,7 @@ impl Allowance {
 
     /// True if nothing is used, so that forgetting it gives nothing back.
     pub(crate) fn is_whole(&self, now: Instant) -> bool {
-        let budgets = [&self.joins, &self.queries, &self.announcements, &self.forgeries];
+        let budgets = [&self.joins, &self.queries, &self.announcements, &self.stale, &self.forgeries];
         self.branches == 0 && budgets.iter().all(|b| b.used_at(now, 1) <= 0.0)
     }
 }
@@ -135,10 +158,14 @@ impl Budget {
         (self.used - elapsed.as_secs_f64() * f64::from(self.rate) * f64::from(factor)).max(0.0)
     }
 
+    fn has_room(&self, now: Instant, tokens: u32, factor: u32) -> bool {
+        self.used_at(now, factor) + f64::from(tokens) <= f64::from(self.burst) * f64::from(factor)
+    }
+
     fn take(&mut self, now: Instant, tokens: u32, factor: u32) -> bool {
+        let room = self.has_room(now, tokens, factor);
         self.used = self.used_at(now, factor);
         self.at = Some(now);
-        let room = self.used + f64::from(tokens) <= f64::from(self.burst) * f64::from(factor);
         if room {
             self.used += f64::from(tokens);
         }

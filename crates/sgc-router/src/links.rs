@@ -8,6 +8,7 @@ use sgc_trust::{CertId, VerifiedPeer};
 use sgc_wire::{Hello, Name, NodeId, Now, SinkId, UnixMillis};
 
 use crate::names::RecordId;
+use crate::tell::Telling;
 
 /// What every link costs besides its round trip: among ways that are as quick, the one with fewer links is better.
 const COST_OF_LINK: u32 = 1000;
@@ -68,6 +69,8 @@ pub(crate) struct LinkState {
     pub(crate) follows: BTreeMap<NodeId, Instant>,
     /// Names that are known over it.
     pub(crate) names: usize,
+    /// How far it has been told what was known when it greeted.
+    pub(crate) telling: Option<Telling>,
 }
 
 impl LinkState {
@@ -97,6 +100,7 @@ impl LinkState {
             asks: BTreeMap::new(),
             follows: BTreeMap::new(),
             names: 0,
+            telling: None,
         }
     }
 

@@ -13,6 +13,7 @@ use smallvec::SmallVec;
 
 use crate::links::{COST_SUSPECT, LinkState};
 use crate::mapping::{Ask, Known};
+use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::topology::cost_differs;
 
@@ -23,17 +24,24 @@ const QUERY_LEASE: Duration = Duration::from_secs(60);
 /// The same question goes on at most that often.
 const QUERY_AGAIN: Duration = Duration::from_secs(5);
 
+/// What a record takes beside what was signed, bytes, about.
+const RECORD_BYTES: usize = 512;
+/// What each of its names takes.
+const NAME_BYTES: usize = 128;
+
 /// Number of a [`Record`]; never used again while the process lives.
 pub(crate) type RecordId = u64;
 
-/// A verified advertisement.
+/// A verified advertisement or withdrawal.
 #[derive(Debug)]
 pub(crate) struct Record {
     pub(crate) owner: VerifiedPeer,
     pub(crate) seq: u64,
+    withdraw: bool,
     names: Box<[Name]>,
     signed: Signed,
     digest: [u8; 32],
+    /// When its lease is over; of a withdrawal, when nothing that it withdrew verifies any more.
     expires: Instant,
     /// Names that no newer one speaks for.
     live: usize,
@@ -43,11 +51,22 @@ pub(crate) struct Record {
     asked: Option<Instant>,
 }
 
-#[derive(Debug)]
-struct Tombstone {
-    seq: u64,
-    until: Instant,
-    withdrawal: Signed,
+impl Record {
+    /// What it takes of its owner's share of memory.
+    fn bytes(&self) -> usize {
+        RECORD_BYTES + self.signed.body.len() + self.signed.signature.len() + self.names.len() * NAME_BYTES
+    }
+}
+
+/// Why a record counts no longer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Gone {
+    /// Newer ones speak for its names.
+    Superseded,
+    /// Its lease is over, it is not believed any more, or it had to make room.
+    Ended,
+    /// This node does not want its names; it may come again.
+    Unwanted,
 }
 
 /// The way to a name, at a node that goes by what it is told.
@@ -58,13 +77,37 @@ struct Heard {
     selected: Option<LinkId>,
 }
 
-/// What one owner advertises.
+/// What one owner advertises and withdrew.
 #[derive(Debug, Default)]
 struct OfOwner {
-    /// Its records, by sequence number.
+    /// Its advertisements, by sequence number.
     records: BTreeSet<(u64, RecordId)>,
-    /// Names that they speak for.
+    /// Its withdrawals, by sequence number.
+    withdrawals: BTreeSet<(u64, RecordId)>,
+    /// Names that advertisements speak for.
     names: usize,
+    /// Names that withdrawals speak for.
+    withdrawn: usize,
+    /// Memory that both take.
+    bytes: usize,
+}
+
+impl OfOwner {
+    fn of_kind(&mut self, withdraw: bool) -> (&mut BTreeSet<(u64, RecordId)>, &mut usize) {
+        match withdraw {
+            true => (&mut self.withdrawals, &mut self.withdrawn),
+            false => (&mut self.records, &mut self.names),
+        }
+    }
+
+    /// The first to make room: a withdrawal, since the memory keeps the number of that.
+    fn oldest(&self) -> Option<RecordId> {
+        self.withdrawals.first().or(self.records.first()).map(|(_, id)| *id)
+    }
+
+    fn newest(&self) -> Option<(u64, RecordId)> {
+        self.records.last().max(self.withdrawals.last()).copied()
+    }
 }
 
 /// A question that was passed on, or began here.
@@ -79,14 +122,20 @@ struct Question {
 /// Everything that is known of names.
 #[derive(Debug, Default)]
 pub(crate) struct Names {
-    names: BTreeMap<Name, RecordId>,
+    /// The newest word on each name: an advertisement or a withdrawal.
+    words: BTreeMap<Name, RecordId>,
     records: BTreeMap<RecordId, Record>,
     expiries: BTreeSet<(Instant, RecordId)>,
     seen: BTreeMap<[u8; 32], RecordId>,
     owners: BTreeMap<NodeId, OfOwner>,
     next_id: RecordId,
-    tombstones: BTreeMap<Name, Tombstone>,
-    forgets: BTreeSet<(Instant, Name)>,
+    /// Records that are in force no longer.
+    memory: Memory,
+    /// Names that withdrawals speak for, in all and by owner, the one with the most last.
+    withdrawn: usize,
+    most_withdrawn: BTreeSet<(usize, NodeId)>,
+    /// Records that wait for the allowance of their owner to be passed on.
+    waiting: BTreeMap<NodeId, BTreeSet<RecordId>>,
     heard: BTreeMap<Name, Heard>,
     /// Who wants to hear of a name: proxies, and this node's own endpoint.
     watchers: BTreeMap<Name, BTreeSet<LinkId>>,
@@ -102,37 +151,85 @@ pub(crate) struct Names {
 
 impl Names {
     pub(crate) fn record(&self, name: &Name) -> Option<&Record> {
-        self.records.get(self.names.get(name)?)
+        self.records.get(&self.id(name)?)
     }
 
-    /// Names in any state.
+    /// The advertisement that speaks for a name.
+    fn id(&self, name: &Name) -> Option<RecordId> {
+        let id = self.words.get(name)?;
+        self.records.get(id).filter(|record| !record.withdraw).map(|_| *id)
+    }
+
+    /// Names that are advertised.
+    fn live(&self) -> usize {
+        self.words.len() - self.withdrawn
+    }
+
+    /// Names that are advertised, asked for or heard of.
     pub(crate) fn known(&self) -> usize {
         let others = self.watchers.keys().chain(self.heard.keys());
-        let unknown: BTreeSet<_> = others.filter(|n| !self.names.contains_key(*n)).collect();
-        self.names.len() + unknown.len()
+        let unknown: BTreeSet<_> = others.filter(|n| self.id(n).is_none()).collect();
+        self.live() + unknown.len()
     }
 
     pub(crate) fn tombstones(&self) -> usize {
-        self.tombstones.len()
+        self.withdrawn
     }
 
     pub(crate) fn deadlines(&self) -> impl Iterator<Item = Instant> {
         let expiry = self.expiries.first().map(|(at, _)| *at);
-        let forget = self.forgets.first().map(|(at, _)| *at);
         let ask = self.ask_at.first().map(|(at, _)| *at);
-        [expiry, forget, ask, self.prune_at].into_iter().flatten()
+        [expiry, ask, self.memory.deadline(), self.prune_at].into_iter().flatten()
+    }
+
+    /// The number of the next record.
+    pub(crate) fn next_id(&self) -> RecordId {
+        self.next_id
     }
 
     /// The newest sequence number known of a name, withdrawn or not.
     fn known_seq(&self, name: &Name) -> Option<u64> {
-        let live = self.record(name).map(|r| r.seq);
-        live.max(self.tombstones.get(name).map(|t| t.seq))
+        self.records.get(self.words.get(name)?).map(|record| record.seq)
     }
 
-    fn remove_tombstone(&mut self, name: &Name) {
-        if let Some(tombstone) = self.tombstones.remove(name) {
-            self.forgets.remove(&(tombstone.until, *name));
+    /// What an owner said last, in force or not, and its number.
+    fn newest(&self, owner: &NodeId) -> Option<(u64, &Signed)> {
+        let in_force = self.owners.get(owner).and_then(OfOwner::newest);
+        let in_force = in_force.and_then(|(seq, id)| Some((seq, &self.records.get(&id)?.signed)));
+        in_force.into_iter().chain(self.memory.newest(owner)).max_by_key(|(seq, _)| *seq)
+    }
+
+    /// A node's link state ended, and named this floor.
+    pub(crate) fn run_ended(&mut self, now: Instant, node: &NodeId, floor: u64, max: usize) {
+        self.memory.run_ended(now, node, floor, max);
+    }
+
+    // ---- Records that wait to be passed on.
+
+    pub(crate) fn wait(&mut self, owner: &NodeId, id: RecordId) {
+        if self.records.contains_key(&id) {
+            self.waiting.entry(*owner).or_default().insert(id);
         }
+    }
+
+    pub(crate) fn waits_no_more(&mut self, owner: &NodeId, id: RecordId) {
+        if let Some(waiting) = self.waiting.get_mut(owner) {
+            waiting.remove(&id);
+            if waiting.is_empty() {
+                self.waiting.remove(owner);
+            }
+        }
+    }
+
+    /// The owners of those that wait.
+    pub(crate) fn waiting(&self) -> Vec<NodeId> {
+        self.waiting.keys().copied().collect()
+    }
+
+    /// The record of an owner that has waited for longest, and the link that it came over.
+    pub(crate) fn first_waiting(&self, owner: &NodeId) -> Option<(RecordId, LinkId)> {
+        let id = self.waiting.get(owner)?.first()?;
+        self.records.get(id).map(|record| (*id, record.from))
     }
 
     fn stop_asking(&mut self, name: &Name) {
@@ -195,7 +292,7 @@ impl Router {
 
     pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: Signed) {
         let Some(state) = self.links.get(&link) else { return };
-        let (neighbour, from_router) = (state.node, state.is_transit());
+        let (neighbour, from_router, is_local) = (state.node, state.is_transit(), link == LinkId::LOCAL);
         let digest = signed_digest(&signed);
         if let Some((id, known)) =
             self.names.seen.get(&digest).and_then(|id| Some((*id, self.names.records.get(id)?)))
@@ -206,55 +303,63 @@ impl Router {
             }
             return self.hear(link, cost, id);
         }
+        if let Some((owner, seq)) = self.names.memory.known(&digest) {
+            return self.stale_advert(link, &owner, seq);
+        }
+        if !self.may_bring(link) {
+            return;
+        }
         let advert = match verify_advert(&self.config.anchors, &signed, now.unix) {
             Ok(advert) => advert,
             Err(why) => return self.not_verified(now, link, "advertisement", why),
         };
         let owner = advert.owner.node_id;
-        if owner == self.config.node && link != LinkId::LOCAL {
+        let (seq, withdraw) = (advert.body.seq, advert.body.withdraw);
+        if owner == self.config.node && !is_local {
+            if self.names.newest(&owner).is_some_and(|(newest, _)| seq <= newest) {
+                self.charge_stale(link);
+                return self.stale_advert(link, &owner, seq);
+            }
             // What this node itself said, perhaps in a run whose clock was ahead: its endpoint has to go on from there.
             return self.send(LinkId::LOCAL, Control::Advert { cost, signed });
         }
         if !from_router && owner != neighbour {
+            self.charge_stale(link);
             return self.drop_frame(link, DropReason::NotOwner { owner });
         }
-        let (seq, withdraw) = (advert.body.seq, advert.body.withdraw);
-        if let Some(floor) = self.topology.node(&owner).map(|n| n.floor).filter(|floor| seq < *floor) {
-            return self.drop_frame(link, DropReason::Stale { seq, known: floor });
+        let run = self.topology.node(&owner).map(|n| n.floor);
+        let run = run.unwrap_or_else(|| self.names.memory.run_floor(&owner));
+        let floor = run.max(self.names.memory.floor(&owner));
+        let is_news = |n: &Name| self.names.known_seq(n).is_none_or(|known| seq > known);
+        // This node's own word is always the newest.
+        let mut news: Vec<_> =
+            advert.names.iter().copied().filter(|n| is_local || seq >= floor && is_news(n)).collect();
+        if news.is_empty() {
+            self.charge_stale(link);
+            return self.stale_advert(link, &owner, seq);
         }
-        if link != LinkId::LOCAL && !self.allowance(&owner).may_announce(now.instant) {
-            return self.drop_frame(link, DropReason::Limit { what: "announcements of a node per second" });
-        }
-        let known = advert.names.iter().filter_map(|n| self.names.known_seq(n)).max();
-        let news: Vec<_> = advert
-            .names
-            .iter()
-            .copied()
-            .filter(|n| self.names.known_seq(n).is_none_or(|known| seq > known))
+        if !self.config.transit && !is_local {
             // What nobody here wants, a node that carries nothing need not know.
-            .filter(|n| self.config.transit || link == LinkId::LOCAL || self.names.watchers.contains_key(n))
-            .collect();
-        if let Some(known) = known.filter(|known| *known >= seq && news.is_empty()) {
-            if owner == neighbour && seq < known {
-                self.tell_newer(link, &advert.names);
+            news.retain(|n| self.names.watchers.contains_key(n));
+            if news.is_empty() {
+                return self.charge_stale(link);
             }
-            return self.drop_frame(link, DropReason::Stale { seq, known });
         }
-        if withdraw {
-            return self.withdraw(now, link, seq, &owner, &news, signed);
-        }
-        if let Some(what) = self.names_over_limit(link, &owner, &news) {
+        if let Some(what) = self.over_limit(link, &owner, &news, withdraw) {
+            self.charge_stale(link);
             return self.drop_frame(link, DropReason::Limit { what });
         }
-        let expires = match self.lease_end(now, advert.body.lease_ms, &advert.owner) {
-            Ok(expires) => expires,
-            Err(why) => return self.not_verified(now, link, "advertisement", why),
+        let expires = match (withdraw, self.lease_end(now, advert.body.lease_ms, &advert.owner)) {
+            (true, _) => now.instant + 2 * CLOCK_SKEW_MAX,
+            (false, Ok(expires)) => expires,
+            (false, Err(why)) => return self.not_verified(now, link, "advertisement", why),
         };
         let open = |n| self.names.passed_on.get(n).is_some_and(|q| q.open);
         let asked = news.iter().any(|n| self.names.asking.contains_key(n) || open(n));
         let record = Record {
             owner: advert.owner,
             seq,
+            withdraw,
             names: advert.names.into(),
             signed: signed.clone(),
             digest,
@@ -262,46 +367,85 @@ impl Router {
             live: 0,
             from: link,
             // Owners tell of changes without being asked.
-            asked: (asked && from_router).then_some(now.instant),
+            asked: (asked && from_router && !withdraw).then_some(now.instant),
         };
+        if withdraw {
+            return self.withdraw(link, &owner, record, &news);
+        }
         let id = self.insert(record, &news);
         // A node that only listens may hear of names that it knew already from another neighbour.
         self.hear(link, cost, id);
-        let frames = [Control::Advert { cost: 0, signed }];
-        self.tell_routers(link, &owner, &news, &frames);
+        self.pass_on_or_wait(link, &owner, id);
+        news.extend(self.make_room(&owner));
         self.routes_changed(&news);
     }
 
-    /// An owner says what is older than what it said before: it should hear of that.
-    fn tell_newer(&mut self, link: LinkId, names: &[Name]) {
-        let newest = names.iter().filter_map(|name| {
-            let live = self.names.record(name).map(|r| (r.seq, &r.signed));
-            let withdrawn = self.names.tombstones.get(name).map(|t| (t.seq, &t.withdrawal));
-            live.into_iter().chain(withdrawn).max_by_key(|(seq, _)| *seq)
-        });
-        if let Some((_, signed)) = newest.max_by_key(|(seq, _)| *seq) {
+    /// An owner said something newer before; if it says this itself, it should hear of that.
+    fn stale_advert(&mut self, link: LinkId, owner: &NodeId, seq: u64) {
+        let newest = self.names.newest(owner).filter(|(newest, _)| *newest > seq);
+        let known = newest.map_or(seq, |(newest, _)| newest);
+        if let Some((_, signed)) = newest
+            && self.links.get(&link).is_some_and(|state| state.node == *owner)
+        {
             let signed = signed.clone();
             self.send(link, Control::Advert { cost: 0, signed });
         }
+        self.drop_frame(link, DropReason::Stale { seq, known });
     }
 
     /// The bound that these names would exceed.
-    fn names_over_limit(&self, link: LinkId, owner: &NodeId, news: &[Name]) -> Option<&'static str> {
+    fn over_limit(
+        &self,
+        link: LinkId,
+        owner: &NodeId,
+        news: &[Name],
+        withdraw: bool,
+    ) -> Option<&'static str> {
         let (names, limits) = (&self.names, &self.config.limits);
-        let more = news.iter().filter(|n| !names.names.contains_key(*n)).count();
+        if link == LinkId::LOCAL {
+            return None;
+        }
+        if !names.owners.contains_key(owner) && names.owners.len() >= limits.nodes_max {
+            return Some("owners");
+        }
+        let more = news.iter().filter(|n| names.id(n).is_none()).count();
         let of_owner = names.owners.get(owner).map_or(0, |o| o.names);
         let over_link = self.links.get(&link).map_or(0, |l| l.names);
-        if link == LinkId::LOCAL || more == 0 {
+        if withdraw || more == 0 {
             None
         } else if of_owner + more > limits.names_per_owner_max {
             Some("names of an owner")
         } else if over_link + more > limits.names_per_router_max {
             Some("names over a link")
-        } else if names.names.len() + more > limits.names_max {
+        } else if names.live() + more > limits.names_max {
             Some("names")
         } else {
             None
         }
+    }
+
+    /// Voids the oldest of what an owner advertised and withdrew if that is too much, and the oldest withdrawals of the owner
+    /// with the most if there are too many in all; returns the names that are not advertised any more.
+    fn make_room(&mut self, owner: &NodeId) -> Vec<Name> {
+        let mut gone = Vec::new();
+        let limits = &self.config.limits;
+        let (most, bytes_max) = (limits.adverts_per_owner_max, limits.advert_bytes_per_owner_max);
+        let tombstones_max = limits.tombstones_max;
+        while *owner != self.config.node
+            && let Some(of_owner) = self.names.owners.get(owner)
+            && (of_owner.records.len() + of_owner.withdrawals.len() > most || of_owner.bytes > bytes_max)
+            && let Some(oldest) = of_owner.oldest()
+        {
+            gone.extend(self.forget_record(oldest, Gone::Ended));
+        }
+        while self.names.withdrawn > tombstones_max
+            && let Some((_, owner)) = self.names.most_withdrawn.last().copied()
+            && let Some((_, oldest)) =
+                self.names.owners.get(&owner).and_then(|o| o.withdrawals.first()).copied()
+        {
+            self.forget_record(oldest, Gone::Ended);
+        }
+        gone
     }
 
     fn insert(&mut self, record: Record, names: &[Name]) -> RecordId {
@@ -309,15 +453,19 @@ impl Router {
         self.names.next_id += 1;
         self.names.seen.insert(record.digest, id);
         self.names.expiries.insert((record.expires, id));
-        self.names.owners.entry(record.owner.node_id).or_default().records.insert((record.seq, id));
+        let of_owner = self.names.owners.entry(record.owner.node_id).or_default();
+        of_owner.of_kind(record.withdraw).0.insert((record.seq, id));
+        of_owner.bytes += record.bytes();
+        let withdraw = record.withdraw;
         self.names.records.insert(id, record);
         for name in names {
-            self.names.remove_tombstone(name);
-            if let Some(question) = self.names.passed_on.get_mut(name) {
+            if withdraw {
+                self.names.heard.remove(name);
+            } else if let Some(question) = self.names.passed_on.get_mut(name) {
                 question.open = false;
             }
-            if let Some(old) = self.names.names.insert(*name, id) {
-                self.release(old, 1);
+            if let Some(old) = self.names.words.insert(*name, id) {
+                self.release(old, 1, Gone::Superseded);
             }
         }
         self.hold(id, names.len());
@@ -327,48 +475,75 @@ impl Router {
     fn hold(&mut self, id: RecordId, names: usize) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
         record.live += names;
-        self.names.owners.entry(record.owner.node_id).or_default().names += names;
-        if let Some(link) = self.links.get_mut(&record.from) {
-            link.names += names;
+        let (owner, withdraw, from) = (record.owner.node_id, record.withdraw, record.from);
+        self.count(&owner, withdraw, from, names, usize::saturating_add);
+        self.release(id, 0, Gone::Unwanted);
+    }
+
+    /// Counts names that a record speaks for, more or fewer.
+    fn count(
+        &mut self,
+        owner: &NodeId,
+        withdraw: bool,
+        from: LinkId,
+        names: usize,
+        change: fn(usize, usize) -> usize,
+    ) {
+        let Some(of_owner) = self.names.owners.get_mut(owner) else { return };
+        let (_, count) = of_owner.of_kind(withdraw);
+        let old = std::mem::replace(count, change(*count, names));
+        let new = *count;
+        if withdraw {
+            self.names.withdrawn = self.names.withdrawn + new - old;
+            self.names.most_withdrawn.remove(&(old, *owner));
+            if new > 0 {
+                self.names.most_withdrawn.insert((new, *owner));
+            }
+        } else if let Some(link) = self.links.get_mut(&from) {
+            link.names = change(link.names, names);
         }
-        self.release(id, 0);
     }
 
     /// Names are not of this record any more; without any it is gone.
-    fn release(&mut self, id: RecordId, names: usize) {
+    fn release(&mut self, id: RecordId, names: usize, gone: Gone) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
         record.live -= names;
-        if let Some(link) = self.links.get_mut(&record.from) {
-            link.names = link.names.saturating_sub(names);
-        }
-        if let Some(of_owner) = self.names.owners.get_mut(&record.owner.node_id) {
-            of_owner.names -= names;
-        }
-        if record.live > 0 {
+        let is_gone = record.live == 0;
+        let (owner, withdraw, from) = (record.owner.node_id, record.withdraw, record.from);
+        self.count(&owner, withdraw, from, names, usize::saturating_sub);
+        if !is_gone {
             return;
         }
-        if let Some(record) = self.names.records.remove(&id) {
-            self.names.seen.remove(&record.digest);
-            self.names.expiries.remove(&(record.expires, id));
-            if let Some(of_owner) = self.names.owners.get_mut(&record.owner.node_id) {
-                of_owner.records.remove(&(record.seq, id));
-                if of_owner.records.is_empty() {
-                    self.names.owners.remove(&record.owner.node_id);
-                }
+        let Some(record) = self.names.records.remove(&id) else { return };
+        self.names.seen.remove(&record.digest);
+        self.names.expiries.remove(&(record.expires, id));
+        self.names.waits_no_more(&owner, id);
+        if let Some(of_owner) = self.names.owners.get_mut(&owner) {
+            of_owner.of_kind(withdraw).0.remove(&(record.seq, id));
+            of_owner.bytes = of_owner.bytes.saturating_sub(record.bytes());
+            if of_owner.records.is_empty() && of_owner.withdrawals.is_empty() {
+                self.names.owners.remove(&owner);
             }
+        }
+        let (now, max) = (self.now.instant, self.config.limits.nodes_max);
+        let Record { seq, digest, signed, .. } = record;
+        match gone {
+            Gone::Superseded => self.names.memory.superseded(now, &owner, seq, digest, max),
+            Gone::Ended => self.names.memory.ended(now, &owner, seq, digest, &signed, max),
+            Gone::Unwanted => {}
         }
     }
 
     /// Forgets all names that a record still speaks for.
-    fn forget_record(&mut self, id: RecordId) -> Vec<Name> {
+    fn forget_record(&mut self, id: RecordId, gone: Gone) -> Vec<Name> {
         let Some(record) = self.names.records.get(&id) else { return Vec::new() };
         let names: Vec<_> =
-            record.names.iter().copied().filter(|n| self.names.names.get(n) == Some(&id)).collect();
+            record.names.iter().copied().filter(|n| self.names.words.get(n) == Some(&id)).collect();
         for name in &names {
-            self.names.names.remove(name);
+            self.names.words.remove(name);
             self.names.heard.remove(name);
         }
-        self.release(id, names.len());
+        self.release(id, names.len(), gone);
         names
     }
 
@@ -376,35 +551,24 @@ impl Router {
     pub(crate) fn void_names(&mut self, owner: &NodeId, floor: u64) {
         let old = self.names.owners.get(owner).into_iter().flat_map(|o| o.records.range(..(floor, 0)));
         for id in old.map(|(_, id)| *id).collect::<Vec<_>>() {
-            let names = self.forget_record(id);
+            let names = self.forget_record(id, Gone::Superseded);
             self.routes_changed(&names);
         }
     }
 
-    fn withdraw(&mut self, now: Now, link: LinkId, seq: u64, owner: &NodeId, names: &[Name], signed: Signed) {
-        let known: Vec<_> = names.iter().copied().filter(|n| self.names.names.contains_key(n)).collect();
-        for name in names {
-            self.names.remove_tombstone(name);
-            if self.names.tombstones.len() >= self.config.limits.tombstones_max
-                && let Some((_, oldest)) = self.names.forgets.pop_first()
-            {
-                self.names.tombstones.remove(&oldest);
-            }
-            let until = now.instant + 2 * CLOCK_SKEW_MAX;
-            self.names.tombstones.insert(*name, Tombstone { seq, until, withdrawal: signed.clone() });
-            self.names.forgets.insert((until, *name));
-            if let Some(id) = self.names.names.remove(name) {
-                self.names.heard.remove(name);
-                self.release(id, 1);
-            }
-        }
+    fn withdraw(&mut self, link: LinkId, owner: &NodeId, record: Record, names: &[Name]) {
+        let mut known: Vec<_> = names.iter().copied().filter(|n| self.names.id(n).is_some()).collect();
+        let frame = Control::Advert { cost: 0, signed: record.signed.clone() };
+        let id = self.insert(record, names);
         // Those who never heard of the names need not hear that they are gone.
-        if !known.is_empty() {
-            let frame = Control::Advert { cost: 0, signed };
-            self.tell_routers(link, owner, &known, std::slice::from_ref(&frame));
+        if known.is_empty() {
+            self.charge_stale(link);
+        } else {
+            self.pass_on_or_wait(link, owner, id);
             self.tell_watchers(link, &known, &frame);
-            self.routes_changed(&known);
         }
+        known.extend(self.make_room(owner));
+        self.routes_changed(&known);
     }
 
     /// A node that goes by what it is told: the owner of a record's names is in reach over this link.
@@ -412,15 +576,15 @@ impl Router {
         if self.config.transit || link == LinkId::LOCAL {
             return;
         }
-        let Some(record) = self.names.records.get(&id) else { return };
+        let Some(record) = self.names.records.get(&id).filter(|record| !record.withdraw) else { return };
         let seq = record.seq;
         let names: Vec<_> =
             record.names.iter().copied().filter(|n| self.names.watchers.contains_key(n)).collect();
         for name in &names {
             // It may have been without interest when the record came.
             if self.names.known_seq(name).is_none_or(|known| known < seq) {
-                if let Some(old) = self.names.names.insert(*name, id) {
-                    self.release(old, 1);
+                if let Some(old) = self.names.words.insert(*name, id) {
+                    self.release(old, 1, Gone::Superseded);
                 }
                 self.hold(id, 1);
             }
@@ -517,8 +681,9 @@ impl Router {
         self.names.stop_asking(name);
         if !self.config.transit && self.way(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
             self.names.heard.remove(name);
-            if let Some(id) = self.names.names.remove(name) {
-                self.release(id, 1);
+            if let Some(id) = self.names.id(name) {
+                self.names.words.remove(name);
+                self.release(id, 1, Gone::Unwanted);
             }
         }
     }
@@ -543,46 +708,30 @@ impl Router {
         }
     }
 
-    /// Tells a router that just greeted of names: of those of this node, and if the mapping says so of all.
-    pub(crate) fn send_names(&mut self, link: LinkId) {
+    /// The next record, from one number up to another, that a router is told unasked: those of this node, and if the mapping says
+    /// so all. It may have been out of reach when names were withdrawn, so it hears of that, too.
+    pub(crate) fn next_advert(&self, from: RecordId, end: RecordId) -> Option<RecordId> {
         let all = self.config.transit && self.mapping.tells_unasked();
         let own = self.config.node;
-        let told: Vec<_> = self
-            .names
-            .records
-            .iter()
-            .filter(|(_, r)| all || r.owner.node_id == own)
-            .map(|(id, _)| *id)
-            .collect();
-        for id in told {
-            for frame in self.record_frames(id, 0) {
-                self.send(link, frame);
-            }
-        }
-        // It may have been out of reach when these were withdrawn.
-        let recent = self.now.instant.checked_sub(self.config.limits.lease_max);
-        let recent = |t: &&Tombstone| recent.is_none_or(|recent| t.until > recent + 2 * CLOCK_SKEW_MAX);
-        let withdrawals = self.names.tombstones.values().filter(|_| all).filter(recent);
-        let distinct: BTreeMap<_, _> =
-            withdrawals.map(|t| (t.withdrawal.signature.clone(), &t.withdrawal)).collect();
-        let frames: Vec<_> = distinct
-            .into_values()
-            .map(|signed| Control::Advert { cost: 0, signed: signed.clone() })
-            .collect();
-        for frame in frames {
-            self.send(link, frame);
-        }
+        // Whatever a withdrawal of before that ended has no lease left.
+        let oldest = self.now.instant + 2 * CLOCK_SKEW_MAX - self.config.limits.lease_max;
+        let told = |record: &Record| match record.withdraw {
+            true => all && record.expires > oldest,
+            false => all || record.owner.node_id == own,
+        };
+        self.names.records.range(from..end).find(|(_, record)| told(record)).map(|(id, _)| *id)
     }
 
     /// An advertisement, and the withdrawals of those of its names that do not hold any more.
-    fn record_frames(&self, id: RecordId, cost: u32) -> Vec<Control> {
+    pub(crate) fn record_frames(&self, id: RecordId, cost: u32) -> Vec<Control> {
         let Some(record) = self.names.records.get(&id) else { return Vec::new() };
         let mut frames = vec![Control::Advert { cost, signed: record.signed.clone() }];
         if record.live < record.names.len() {
             let mut withdrawals = BTreeMap::new();
             for name in &record.names {
-                if let Some(tombstone) = self.names.tombstones.get(name).filter(|t| t.seq > record.seq) {
-                    withdrawals.insert(tombstone.seq, tombstone.withdrawal.clone());
+                let word = self.names.words.get(name).and_then(|id| self.names.records.get(id));
+                if let Some(newer) = word.filter(|word| word.withdraw && word.seq > record.seq) {
+                    withdrawals.insert(newer.seq, newer.signed.clone());
                 }
             }
             frames.extend(withdrawals.into_values().map(|signed| Control::Advert { cost: 0, signed }));
@@ -590,8 +739,11 @@ impl Router {
         frames
     }
 
-    /// Passes on what came over `ingress` of names of `owner`: to all routers, or to those who asked.
-    fn tell_routers(&mut self, ingress: LinkId, owner: &NodeId, names: &[Name], frames: &[Control]) {
+    /// Passes on a record that came over `ingress`: to all routers, or to those who asked.
+    pub(crate) fn tell_record_to_routers(&mut self, ingress: LinkId, owner: &NodeId, id: RecordId) {
+        let Some(record) = self.names.records.get(&id) else { return };
+        let names: Vec<_> =
+            record.names.iter().copied().filter(|n| self.names.words.get(n) == Some(&id)).collect();
         let own = *owner == self.config.node;
         if names.is_empty() || !(self.config.transit || own) {
             return;
@@ -608,10 +760,10 @@ impl Router {
             .collect();
         for link in targets {
             if !everyone {
-                self.answer(link, owner, names);
+                self.answer(link, owner, &names);
             }
-            for frame in frames {
-                self.send(link, frame.clone());
+            for frame in self.record_frames(id, 0) {
+                self.send(link, frame);
             }
         }
     }
@@ -682,7 +834,7 @@ impl Router {
                 continue;
             };
             let way = self.way(name).filter(|(way, _)| self.may_tell(*way, link));
-            let id = self.names.names.get(name).copied();
+            let id = self.names.id(name);
             let news = match (told, way.zip(id)) {
                 (None, None) => continue,
                 (Some(_), None) => {
@@ -796,7 +948,7 @@ impl Router {
     }
 
     fn mark_asked(&mut self, now: Instant, name: &Name) {
-        let record = self.names.names.get(name).and_then(|id| self.names.records.get_mut(id));
+        let record = self.names.id(name).and_then(|id| self.names.records.get_mut(&id));
         if let Some(record) = record {
             record.asked = Some(now);
         }
@@ -819,7 +971,7 @@ impl Router {
     }
 
     fn tell_record(&mut self, link: LinkId, name: &Name) {
-        if let Some(id) = self.names.names.get(name).copied() {
+        if let Some(id) = self.names.id(name) {
             for frame in self.record_frames(id, 0) {
                 self.send(link, frame);
             }
@@ -897,14 +1049,14 @@ impl Router {
     pub(crate) fn names_timeout(&mut self, now: Now) {
         while let Some((at, id)) = self.names.expiries.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.expiries.remove(&(at, id));
-            let names = self.forget_record(id);
-            self.routes_changed(&names);
+            let withdraw = self.names.records.get(&id).is_some_and(|record| record.withdraw);
+            // Nothing verifies any more that a withdrawal which is over speaks against.
+            let names = self.forget_record(id, if withdraw { Gone::Superseded } else { Gone::Ended });
+            if !withdraw {
+                self.routes_changed(&names);
+            }
         }
-        while let Some((at, name)) = self.names.forgets.first().copied().filter(|(at, _)| *at <= now.instant)
-        {
-            self.names.forgets.remove(&(at, name));
-            self.names.tombstones.remove(&name);
-        }
+        self.names.memory.expire(now.instant);
         if self.names.prune_at.is_some_and(|at| at <= now.instant) {
             for state in self.links.values_mut() {
                 state.asks.retain(|_, until| *until > now.instant);
@@ -922,7 +1074,8 @@ impl Router {
         let untrusted = |(_, r): &(&RecordId, &Record)| self.is_untrusted(&r.owner.path);
         let gone: Vec<_> = self.names.records.iter().filter(untrusted).map(|(id, _)| *id).collect();
         for id in gone {
-            let names = self.forget_record(id);
+            // It counts again if its certificate does.
+            let names = self.forget_record(id, Gone::Unwanted);
             self.routes_changed(&names);
         }
     }
@@ -939,6 +1092,6 @@ impl Router {
             }
             r.names.iter().filter(|n| self.way(n).is_some()).count()
         };
-        self.names.records.values().filter(reached).map(heard).sum()
+        self.names.records.values().filter(|r| !r.withdraw).filter(reached).map(heard).sum()
     }
 }

@@ -89,6 +89,12 @@ pub enum Output {
     /// Other certificates are believed from here on: a newer revocation list came. To be kept, and told to whatever
     /// else verifies certificates.
     Trust(Arc<TrustAnchors>),
+    /// Call [`Router::handle_flushed`] once the link has taken all frames before; the router has more for it than a queue is to
+    /// hold.
+    Flush {
+        /// Which.
+        link: LinkId,
+    },
     /// Something was refused; count it and, where it matters, say it.
     Dropped(Dropped),
     /// Nothing more to do until then, or until something happens.
@@ -169,6 +175,9 @@ pub enum DropReason {
         /// Which.
         what: &'static str,
     },
+    /// The neighbour has brought too many announcements that were no news; not looked at.
+    #[error("brings too many announcements that are old")]
+    StaleFlood,
     /// A frame for a name or sink that is not known here.
     #[error("{what} for a name or sink that is unknown here")]
     Unknown {
@@ -202,6 +211,7 @@ impl DropReason {
             | Self::NotOwner { .. }
             | Self::HopLimit
             | Self::Limit { .. }
+            | Self::StaleFlood
             | Self::Crl(_)
             | Self::NotRouter => true,
             Self::Stale { .. } | Self::Unknown { .. } | Self::WrongWay { .. } | Self::NoLink => false,
@@ -216,6 +226,7 @@ impl DropReason {
             Self::Stale { .. } => "stale",
             Self::HopLimit => "hop_limit",
             Self::Limit { .. } => "limit",
+            Self::StaleFlood => "stale_flood",
             Self::Unknown { .. } => "unknown",
             Self::WrongWay { .. } => "wrong_way",
             Self::NoLink => "no_link",
@@ -259,6 +270,8 @@ pub struct Router {
     /// Revocation lists that seemed to be from the future, and when to look at them again.
     pub(crate) early_crls: Vec<Bytes>,
     pub(crate) early_at: Option<Instant>,
+    /// When to pass on what was beyond the allowance of its signer.
+    pub(crate) late_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
     /// As the driver said last.
     pub(crate) now: Now,
@@ -284,6 +297,7 @@ impl Router {
             deadlines: BTreeSet::new(),
             early_crls: Vec::new(),
             early_at: None,
+            late_at: None,
             outputs: VecDeque::new(),
             now,
         }
@@ -378,6 +392,12 @@ impl Router {
         }
     }
 
+    /// The link has taken all frames that came before an [`Output::Flush`].
+    pub fn handle_flushed(&mut self, now: Now, link: LinkId) {
+        self.now = now;
+        self.go_on_telling(link);
+    }
+
     /// Time passed.
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
@@ -385,6 +405,7 @@ impl Router {
         self.retry_crls(now);
         self.expire_nodes(now);
         self.names_timeout(now);
+        self.pass_on_late(now);
         self.branches_timeout(now);
     }
 
@@ -398,14 +419,16 @@ impl Router {
         self.outputs.pop_front().unwrap_or_else(|| {
             let branch = self.deadlines.first().map(|(at, ..)| *at);
             let links = self.links.values().filter_map(|l| l.expires);
-            let topology = [self.topology.search_at, self.topology.originate_at, self.topology.next_expiry()];
+            let topology =
+                [self.topology.search_at, self.topology.originate_at, self.topology.next_deadline()];
             let all = topology
                 .into_iter()
                 .flatten()
                 .chain(self.early_at)
                 .chain(branch)
                 .chain(links)
-                .chain(self.names.deadlines());
+                .chain(self.names.deadlines())
+                .chain(self.late_at);
             Output::Timeout(all.min())
         })
     }
@@ -480,8 +503,7 @@ impl Router {
             return;
         }
         if to_router {
-            self.send_topology(link);
-            self.send_names(link);
+            self.begin_telling(link);
         }
         self.send_interests(link);
         self.links_changed(self.now.instant);
@@ -516,6 +538,25 @@ impl Router {
         }
         let limits = &self.config.limits;
         self.allowances.entry(*node).or_insert_with(|| Allowance::new(limits))
+    }
+
+    /// Returns true if an announcement from over `link` is to be verified; else it is dropped, because its neighbour brought
+    /// too many that were no news.
+    pub(crate) fn may_bring(&mut self, link: LinkId) -> bool {
+        let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return true };
+        let (node, is_router, now) = (state.node, state.is_transit(), self.now.instant);
+        let may = self.allowance(&node).may_bring(now, is_router);
+        if !may {
+            self.drop_frame(link, DropReason::StaleFlood);
+        }
+        may
+    }
+
+    /// Charges the neighbour that brought an announcement which was verified in vain.
+    pub(crate) fn charge_stale(&mut self, link: LinkId) {
+        let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return };
+        let (node, is_router, now) = (state.node, state.is_transit(), self.now.instant);
+        self.allowance(&node).brought_stale(now, is_router);
     }
 
     pub(crate) fn send(&mut self, link: LinkId, frame: Control) {

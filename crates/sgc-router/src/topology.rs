@@ -5,13 +5,15 @@
 //! Ways to names are `names.rs`'s.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_trust::{CertId, signed_digest, verify_link_state};
+use sgc_trust::{CertId, next_seq, signed_digest, verify_link_state};
 use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed};
 
 use crate::links::LinkState;
+use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::spf::{Path, shortest_paths};
 
@@ -67,6 +69,10 @@ pub(crate) struct Topology {
     nodes: BTreeMap<NodeId, NodeRecord>,
     expiries: BTreeSet<(Instant, NodeId)>,
     seen: BTreeMap<[u8; 32], NodeId>,
+    /// Link states that are in force no longer.
+    memory: Memory,
+    /// Nodes whose link states wait for their allowance to be passed on.
+    pub(crate) late: BTreeSet<NodeId>,
     paths: BTreeMap<NodeId, Path>,
     /// When to search for ways, if something changed.
     pub(crate) search_at: Option<Instant>,
@@ -90,8 +96,25 @@ impl Topology {
         self.nodes.len()
     }
 
-    pub(crate) fn next_expiry(&self) -> Option<Instant> {
-        self.expiries.first().map(|(at, _)| *at)
+    pub(crate) fn next_deadline(&self) -> Option<Instant> {
+        self.expiries.first().map(|(at, _)| *at).into_iter().chain(self.memory.deadline()).min()
+    }
+
+    /// The nodes that described themselves, from one on.
+    pub(crate) fn nodes_from(&self, from: Bound<NodeId>) -> impl Iterator<Item = (&NodeId, &NodeRecord)> {
+        self.nodes.range((from, Bound::Unbounded))
+    }
+
+    /// The greatest number that a node described itself with, as far as is known.
+    fn known_seq(&self, node: &NodeId) -> Option<u64> {
+        let ended = self.memory.floor(node).checked_sub(1);
+        self.nodes.get(node).map(|record| record.seq).max(ended)
+    }
+
+    /// The link state of that number.
+    fn newest(&self, node: &NodeId) -> Option<(u64, &Signed)> {
+        let in_force = self.nodes.get(node).map(|record| (record.seq, &record.signed));
+        in_force.into_iter().chain(self.memory.newest(node)).max_by_key(|(seq, _)| *seq)
     }
 
     /// Something changed that ways depend on.
@@ -153,18 +176,28 @@ impl Topology {
         }
     }
 
-    fn insert(&mut self, node: NodeId, record: NodeRecord) {
-        self.remove(&node);
+    fn insert(&mut self, now: Instant, node: NodeId, record: NodeRecord, max: usize) {
+        if let Some(old) = self.take(&node) {
+            self.memory.superseded(now, &node, old.seq, old.digest, max);
+        }
         self.seen.insert(record.digest, node);
         self.expiries.insert((record.expires, node));
         self.nodes.insert(node, record);
     }
 
-    fn remove(&mut self, node: &NodeId) -> bool {
-        let Some(old) = self.nodes.remove(node) else { return false };
+    /// Takes a link state out of force; returns the number below which advertisements of its node are void.
+    fn end(&mut self, now: Instant, node: &NodeId, max: usize) -> Option<u64> {
+        let old = self.take(node)?;
+        self.memory.ended(now, node, old.seq, old.digest, &old.signed, max);
+        Some(old.floor)
+    }
+
+    fn take(&mut self, node: &NodeId) -> Option<NodeRecord> {
+        let old = self.nodes.remove(node)?;
         self.seen.remove(&old.digest);
         self.expiries.remove(&(old.expires, *node));
-        true
+        self.late.remove(node);
+        Some(old)
     }
 }
 
@@ -182,6 +215,12 @@ impl Router {
         if self.topology.seen.contains_key(&digest) {
             return;
         }
+        if let Some((node, seq)) = self.topology.memory.known(&digest) {
+            return self.stale_link_state(link, &node, seq);
+        }
+        if !self.may_bring(link) {
+            return;
+        }
         let verified = match verify_link_state(&self.config.anchors, &signed, now.unix) {
             Ok(verified) => verified,
             Err(why) => return self.not_verified(now, link, "link state", why),
@@ -192,36 +231,32 @@ impl Router {
             if body.seq >= self.topology.own_seq {
                 self.topology.own_seq = body.seq;
                 self.topology.touch_own(now.instant);
+            } else {
+                self.charge_stale(link);
             }
             return;
         }
-        if !self.config.transit {
-            return self.drop_frame(link, DropReason::Unknown { what: "link state" });
+        let refused = if !self.config.transit {
+            Some(DropReason::Unknown { what: "link state" })
+        } else if !from_router && node != neighbour {
+            Some(DropReason::NotOwner { owner: node })
+        } else if body.transit && !verified.node.may_route {
+            Some(DropReason::NotRouter)
+        } else {
+            None
+        };
+        if let Some(refused) = refused {
+            self.charge_stale(link);
+            return self.drop_frame(link, refused);
         }
-        if !from_router && node != neighbour {
-            return self.drop_frame(link, DropReason::NotOwner { owner: node });
+        if self.topology.known_seq(&node).is_some_and(|known| known >= body.seq) {
+            self.charge_stale(link);
+            return self.stale_link_state(link, &node, body.seq);
         }
-        if body.transit && !verified.node.may_route {
-            return self.drop_frame(link, DropReason::NotRouter);
-        }
-        if !self.allowance(&node).may_announce(now.instant) {
-            return self.drop_frame(link, DropReason::Limit { what: "announcements of a node per second" });
-        }
-        match self.topology.node(&node) {
-            Some(known) if known.seq >= body.seq => {
-                let (seq, known) = (body.seq, known.seq);
-                if node == neighbour && seq < known {
-                    // It should hear that it said something newer before.
-                    let signed = self.topology.nodes[&node].signed.clone();
-                    self.send(link, Control::LinkState { signed });
-                }
-                return self.drop_frame(link, DropReason::Stale { seq, known });
-            }
-            Some(_) => {}
-            None if self.topology.len() >= self.config.limits.nodes_max => {
-                return self.drop_frame(link, DropReason::Limit { what: "nodes" });
-            }
-            None => {}
+        let nodes_max = self.config.limits.nodes_max;
+        if self.topology.node(&node).is_none() && self.topology.len() >= nodes_max {
+            self.charge_stale(link);
+            return self.drop_frame(link, DropReason::Limit { what: "nodes" });
         }
         let expires = match self.lease_end(now, body.lease_ms, &verified.node) {
             Ok(expires) => expires,
@@ -239,10 +274,22 @@ impl Router {
             expires,
         };
         let floor = record.floor;
-        self.topology.insert(node, record);
+        self.topology.insert(now.instant, node, record, nodes_max);
         self.topology.touch(now.instant);
         self.void_names(&node, floor);
-        self.tell_link_state(link, &node);
+        self.pass_on_node_or_wait(link, &node);
+    }
+
+    /// A node described itself with a greater number before; if it says this itself, it should hear of that.
+    fn stale_link_state(&mut self, link: LinkId, node: &NodeId, seq: u64) {
+        let known = self.topology.known_seq(node).unwrap_or(seq);
+        if self.links.get(&link).is_some_and(|state| state.node == *node)
+            && let Some((_, newer)) = self.topology.newest(node).filter(|(newer, _)| *newer > seq)
+        {
+            let signed = newer.clone();
+            self.send(link, Control::LinkState { signed });
+        }
+        self.drop_frame(link, DropReason::Stale { seq, known });
     }
 
     /// Describes this node, if that is due: to all routers that it is linked to.
@@ -263,7 +310,7 @@ impl Router {
                 attached.insert(state.node.tag());
             }
         }
-        let own_seq = now.unix.0.max(self.topology.own_seq + 1);
+        let own_seq = next_seq(self.topology.own_seq, now.unix);
         self.topology.own_seq = own_seq;
         let identity = &self.config.identity;
         let body = LinkStateBody {
@@ -290,13 +337,13 @@ impl Router {
             // Always renewed before.
             expires: now.instant + LEASE,
         };
-        self.topology.insert(node, record);
+        self.topology.insert(now.instant, node, record, self.config.limits.nodes_max);
         self.topology.touch(now.instant);
         self.tell_link_state(LinkId::LOCAL, &node);
     }
 
     /// Passes on what a node said of itself: a router to all routers, others as the mapping says.
-    fn tell_link_state(&mut self, ingress: LinkId, node: &NodeId) {
+    pub(crate) fn tell_link_state(&mut self, ingress: LinkId, node: &NodeId) {
         let Some(record) = self.topology.node(node) else { return };
         let (everyone, signed) = (record.transit || *node == self.config.node, record.signed.clone());
         let everyone = everyone || self.mapping.tells_unasked();
@@ -308,19 +355,6 @@ impl Router {
             .collect();
         for link in targets {
             self.send(link, Control::LinkState { signed: signed.clone() });
-        }
-    }
-
-    /// Tells a router that just greeted what is known of the network.
-    pub(crate) fn send_topology(&mut self, link: LinkId) {
-        let unasked = self.mapping.tells_unasked();
-        let own = self.config.node;
-        let told = |(node, record): &(&NodeId, &NodeRecord)| {
-            **node == own || self.config.transit && (record.transit || unasked)
-        };
-        let frames: Vec<_> = self.topology.nodes.iter().filter(told).map(|(_, r)| r.signed.clone()).collect();
-        for signed in frames {
-            self.send(link, Control::LinkState { signed });
         }
     }
 
@@ -344,10 +378,18 @@ impl Router {
         {
             self.topology.expiries.remove(&(at, node));
             if node != self.config.node {
-                self.topology.remove(&node);
-                self.topology.touch(now.instant);
+                self.end_node(now.instant, &node);
             }
         }
+        self.topology.memory.expire(now.instant);
+    }
+
+    /// Takes a link state out of force; what its node advertised before the run that it was of stays void.
+    fn end_node(&mut self, now: Instant, node: &NodeId) {
+        if let Some(floor) = self.topology.end(now, node, self.config.limits.nodes_max) {
+            self.names.run_ended(now, node, floor, self.config.limits.nodes_max);
+        }
+        self.topology.touch(now);
     }
 
     /// Forgets what nodes said whose certificates are no longer believed.
@@ -360,7 +402,8 @@ impl Router {
             .map(|(n, _)| *n)
             .collect();
         for node in gone {
-            self.topology.remove(&node);
+            // It counts again if its certificate does.
+            self.topology.take(&node);
             self.topology.touch(now);
         }
     }

@@ -41,7 +41,15 @@ impl Router {
     }
 
     pub(crate) fn handle_crl(&mut self, now: Now, link: LinkId, der: &Bytes) {
-        if let Err(why) = self.learn_crl(now, link, der) {
+        let known = self.config.anchors.crls().chain(&self.early_crls).any(|known| known == der);
+        if known || !self.may_bring(link) {
+            return;
+        }
+        let learnt = self.learn_crl(now, link, der);
+        if !matches!(learnt, Ok(true)) {
+            self.charge_stale(link);
+        }
+        if let Err(why) = learnt {
             // The clock that is wrong may be this node's own, and nobody tells it of the list again.
             if matches!(why, CrlError::NotYetValid { .. }) && self.early_crls.len() < EARLY_CRLS_MAX {
                 self.early_crls.push(der.clone());
@@ -128,11 +136,18 @@ impl Router {
             ) => true,
             // Another router may trust another CA.
             SignedError::Cert(CertError::UnknownIssuer) => from_router,
-            SignedError::Cert(_) | SignedError::Signature(_) | SignedError::Decode(_) => false,
+            SignedError::Cert(_)
+            | SignedError::Signature(_)
+            | SignedError::Decode(_)
+            | SignedError::Sequence { .. } => false,
         };
+        // Those two cost no verification, and a router may well bring many of them.
+        let is_cheap = matches!(why, SignedError::Clock { .. } | SignedError::Cert(CertError::UnknownIssuer));
         self.drop_frame(link, DropReason::NotVerified { what, why });
         if !honest {
             self.count_forgery(now, link);
+        } else if !is_cheap {
+            self.charge_stale(link);
         }
     }
 

@@ -34,6 +34,10 @@ struct Bench {
     dropped: Vec<&'static str>,
     entry: Option<FibEntry>,
     seq: u64,
+    /// Links that the router waits for to take what they were sent.
+    flushes: Vec<LinkId>,
+    /// True while no link takes anything.
+    stuck: bool,
 }
 
 impl Bench {
@@ -63,6 +67,8 @@ impl Bench {
             dropped: Vec::new(),
             entry: None,
             seq: 0,
+            flushes: Vec::new(),
+            stuck: false,
         };
         for n in 1..=3 {
             bench.up(n, &bench.routers[n as usize - 1].clone(), true, 1000);
@@ -90,6 +96,8 @@ impl Bench {
                     self.timeout = at;
                     return;
                 }
+                Output::Flush { link } if self.stuck => self.flushes.push(link),
+                Output::Flush { link } => self.router.handle_flushed(self.clock.now(), link),
                 Output::Close { .. } | Output::Trust(_) => {}
             }
         }
@@ -144,15 +152,19 @@ impl Bench {
     }
 
     fn advert_frame(&self, seq: u64, withdraw: bool, blinds: &[Blind]) -> Control {
+        self.advert_of(&self.owner, seq, withdraw, blinds)
+    }
+
+    fn advert_of(&self, owner: &Identity, seq: u64, withdraw: bool, blinds: &[Blind]) -> Control {
         let body = AdvertBody {
-            chain: self.owner.chain_bytes(),
+            chain: owner.chain_bytes(),
             seq,
             issued_at: self.clock.now().unix,
             lease_ms: LEASE.as_millis() as u32,
             withdraw,
             blinds: blinds.to_vec(),
         };
-        Control::Advert { cost: 0, signed: self.owner.sign_advert(&body) }
+        Control::Advert { cost: 0, signed: owner.sign_advert(&body) }
     }
 
     fn advert(&mut self, link: u32, seq: u64, blinds: &[Blind]) {
@@ -446,16 +458,249 @@ fn what_a_node_signs_for_all_is_bounded_and_so_are_interests() {
     let limits = Limits { announcements_burst: 8, queries_burst: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     bench.with_proxies();
-    for seq in 10..20 {
+    let mut passed_on = 0;
+    for seq in 10..30 {
         bench.advert(1, seq, &[A]);
+        passed_on += bench.sent.iter().filter(|(link, _)| *link == 2).count();
     }
-    assert_eq!(bench.dropped, ["limit"; 2]);
+    assert_eq!((passed_on, bench.dropped.len()), (8, 0), "it is known here, and goes no further for now");
+    bench.sent.clear();
     bench.pass(Duration::from_secs(10));
-    bench.advert(1, 20, &[A]);
-    assert_eq!(bench.dropped.len(), 2, "it comes back with time");
+    let told: Vec<_> =
+        bench.sent.iter().filter(|(link, frame)| *link == 2 && advert_seq(frame).is_some()).collect();
+    assert_eq!(told.len(), 1, "the newest alone goes on when there is room");
+    assert_eq!(advert_seq(&told[0].1), Some(29));
     let names: Vec<_> = (0..9).map(|n| bench.name(&numbered(n))).collect();
     bench.frame(4, Control::Interest { names });
-    assert_eq!((bench.dropped.len(), bench.told()), (3, vec![]));
+    assert_eq!((bench.dropped.as_slice(), bench.told()), (["limit"].as_slice(), vec![]));
+}
+
+#[test]
+fn link_states_beyond_what_a_node_may_sign_are_passed_on_later() {
+    let mut bench = Bench::with(MappingKind::Flood, Limits { announcements_burst: 8, ..Limits::default() });
+    bench.pass(ms(200));
+    let mut passed_on = 0;
+    for _ in 0..20 {
+        bench.seq += 1;
+        let signed = bench.routers[3].sign_link_state(&bench.link_state(&bench.routers[3], bench.seq, &[]));
+        bench.frame(1, Control::LinkState { signed });
+        passed_on += bench.sent.iter().filter(|(link, _)| *link == 2).count();
+    }
+    assert_eq!((passed_on, bench.dropped.len()), (8, 0));
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(3));
+    let newest = bench.sent.iter().filter_map(|(link, frame)| match frame {
+        Control::LinkState { signed } if *link == 2 => LinkStateBody::from_slice(&signed.body).ok(),
+        _ => None,
+    });
+    assert_eq!(newest.map(|body| body.seq).collect::<Vec<_>>(), [bench.seq]);
+}
+
+fn advert_seq(frame: &Control) -> Option<u64> {
+    let Control::Advert { signed, .. } = frame else { return None };
+    AdvertBody::from_slice(&signed.body).ok().map(|body| body.seq)
+}
+
+/// Whether fresh advertisements and link states of the owner reach link 3, in their order.
+fn assert_news_passes(bench: &mut Bench, from: u64) {
+    for seq in from..from + 12 {
+        bench.advert(1, seq, &[A]);
+        let passed: Vec<_> =
+            bench.sent.iter().filter(|(link, _)| *link == 3).filter_map(|(_, f)| advert_seq(f)).collect();
+        assert_eq!(passed, [seq], "{:?}", bench.dropped);
+        bench.sent.clear();
+        bench.owner_says(1, 0, &[(4, 500)]);
+        assert!(bench.told().contains(&(3, "link state")), "{:?}", bench.dropped);
+        bench.pass(Duration::from_secs(1));
+    }
+}
+
+#[test]
+fn replays_of_a_nodes_announcements_leave_it_its_allowance_and_cost_who_brings_them() {
+    let limits = Limits { announcements_burst: 32, stale_burst: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    bench.with_owner_behind(5000, 9000);
+    let (mut adverts, mut states) = (vec![], vec![]);
+    for seq in 11..41 {
+        adverts.push(bench.advert_frame(seq, false, &[A]));
+        bench.frame(1, adverts[adverts.len() - 1].clone());
+        bench.seq += 1;
+        let body = LinkStateBody { transit: false, ..bench.link_state(&bench.owner, bench.seq, &[(4, 500)]) };
+        states.push(Control::LinkState { signed: bench.owner.sign_link_state(&body) });
+        bench.frame(1, states[states.len() - 1].clone());
+        bench.pass(Duration::from_secs(1));
+    }
+    bench.dropped.clear();
+    let mut fresh = 41;
+    for _ in 0..3 {
+        for n in 0..1000 {
+            for old in [&adverts[n % 30], &states[n % 30]] {
+                bench.frame(2, old.clone());
+                assert_eq!(bench.told(), [], "no replay goes on");
+            }
+        }
+        assert_news_passes(&mut bench, fresh);
+        fresh += 12;
+    }
+    let of = |key| bench.dropped.iter().filter(|d| **d == key).count();
+    assert_eq!(of("limit"), 0);
+    // Those that are remembered by their digest are known at once; others cost a verification, which is charged.
+    assert!(of("stale_flood") > 2000, "{}", of("stale_flood"));
+    // Others bring news as before: the neighbour pays for itself.
+    bench.dropped.clear();
+    bench.says(3, 3, &[(0, 1000)], false);
+    assert_eq!(bench.dropped, [""; 0]);
+}
+
+#[test]
+fn an_announcement_whose_lease_is_over_is_not_news_again() {
+    let mut bench = Bench::new();
+    bench.with_owner_behind(5000, 9000);
+    let older = bench.advert_frame(11, false, &[B]);
+    let last = bench.advert_frame(12, false, &[A, B]);
+    bench.frame(1, last.clone());
+    let where_it_is = LinkStateBody { transit: false, ..bench.link_state(&bench.owner, 90, &[(4, 500)]) };
+    let where_it_is = Control::LinkState { signed: bench.owner.sign_link_state(&where_it_is) };
+    bench.frame(1, where_it_is.clone());
+    bench.pass(LEASE + ms(1000));
+    assert_eq!((bench.route(&A), bench.router.stats().names), (None, 0));
+    let nodes = bench.router.stats().nodes;
+    // They verify for nine more minutes.
+    for old in [&older, &last, &where_it_is] {
+        bench.frame(2, old.clone());
+        assert_eq!(bench.told(), []);
+    }
+    assert_eq!((bench.router.stats().names, bench.router.stats().nodes), (0, nodes));
+    assert_eq!(bench.dropped, ["stale"; 3]);
+    bench.seq = 100;
+    bench.with_owner_behind(5000, 9000);
+    assert_eq!(bench.route(&A), None, "what comes with an old number does not count");
+    bench.advert(1, 13, &[A]);
+    assert!(bench.route(&A).is_some());
+}
+
+#[test]
+fn an_owner_hears_which_number_it_has_to_exceed_after_its_lease() {
+    let mut bench = Bench::new();
+    bench.up(6, &bench.owner.clone(), false, 1000);
+    bench.advert(6, 50, &[A]);
+    bench.seq = 5;
+    bench.owner_says(6, 0, &[(0, 1000)]);
+    bench.pass(LEASE + ms(1000));
+    bench.advert(6, 20, &[B]);
+    let told: Vec<_> =
+        bench.sent.iter().filter_map(|(link, frame)| Some((*link, advert_seq(frame)?))).collect();
+    assert_eq!(told, [(6, 50)]);
+    bench.seq = 0;
+    bench.owner_says(6, 0, &[(0, 1000)]);
+    assert_eq!(bench.told(), [(6, "link state")]);
+}
+
+#[test]
+fn what_one_owner_withdraws_displaces_nothing_of_another() {
+    let limits = Limits { tombstones_max: 64, adverts_per_owner_max: 40, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    bench.with_owner_behind(5000, 9000);
+    let old = bench.advert_frame(11, false, &[B]);
+    bench.frame(1, old.clone());
+    bench.frame(1, bench.advert_frame(12, true, &[B]));
+    let mallory = identity(&Member::new("mallory"));
+    let first = bench.advert_of(&mallory, 19, false, &[numbered(20)]);
+    for n in 20..400 {
+        let blinds = [numbered(n as usize)];
+        bench.frame(1, bench.advert_of(&mallory, 2 * n, false, &blinds));
+        bench.frame(1, bench.advert_of(&mallory, 2 * n + 1, true, &blinds));
+        bench.pass(ms(100));
+    }
+    assert!(bench.router.stats().tombstones <= 64);
+    bench.dropped.clear();
+    bench.frame(2, old);
+    assert_eq!((bench.route(&B), bench.dropped.as_slice()), (None, ["stale"].as_slice()));
+    // What it displaced of its own is void all the same.
+    bench.frame(2, first);
+    assert_eq!((bench.told(), bench.dropped.len()), (vec![], 2));
+}
+
+#[test]
+fn what_an_owner_advertises_is_bounded_in_records_and_bytes() {
+    // A record of 256 names of which one is left, again and again.
+    let all: Vec<_> = (0..255).map(numbered).collect();
+    let of_records = Limits { adverts_per_owner_max: 20, ..Limits::default() };
+    let of_bytes = Limits { advert_bytes_per_owner_max: 20 * 50_000, ..Limits::default() };
+    for limits in [of_records, of_bytes] {
+        let mut bench = Bench::with(MappingKind::Flood, limits);
+        let honest = bench.advert_of(&bench.user, 10, false, &[A]);
+        bench.frame(1, honest);
+        for n in 0..200 {
+            let blinds: Vec<_> = all.iter().copied().chain([numbered(1000 + n)]).collect();
+            bench.advert(1, 10 + n as u64, &blinds);
+            bench.pass(ms(40));
+        }
+        let names = bench.router.stats().names;
+        assert!((256..256 + 1 + 24).contains(&names), "{names}");
+        assert!(bench.router.route(&name_of(&bench.user.node_id(), &A)).is_none() && names > 256);
+        // The oldest are gone, the newest are there, and a replay of those that are gone brings them not back.
+        bench.dropped.clear();
+        let blinds: Vec<_> = all.iter().copied().chain([numbered(1000)]).collect();
+        bench.advert(2, 10, &blinds);
+        assert_eq!((bench.dropped.as_slice(), bench.router.stats().names), (["stale"].as_slice(), names));
+    }
+}
+
+#[test]
+fn a_sequence_number_without_a_greater_one_is_not_believed() {
+    let mut bench = Bench::new();
+    for seq in [u64::MAX, u64::MAX - 1, bench.clock.now().unix.0 + (11 * 365 * 86_400_000)] {
+        bench.advert(1, seq, &[A]);
+        let body = bench.link_state(&bench.routers[3], seq, &[]);
+        let signed = bench.routers[3].sign_link_state(&body);
+        bench.frame(1, Control::LinkState { signed });
+    }
+    assert_eq!(bench.dropped, ["not_verified"; 6]);
+    assert_eq!(bench.router.stats().names, 0);
+}
+
+#[test]
+fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
+    let mut bench =
+        Bench::with(MappingKind::Flood, Limits { adverts_per_owner_max: 10_000, ..Limits::default() });
+    bench.with_owner_behind(5000, 9000);
+    for n in 0..9000 {
+        bench.advert(1, 11 + n as u64, &[numbered(n)]);
+        bench.pass(ms(40));
+    }
+    // The last announcements of the others are of a minute ago.
+    let names = bench.router.stats().names;
+    assert!(names > 1400, "{names}");
+    bench.stuck = true;
+    let late = bench.routers[4].clone();
+    bench.up(6, &late, true, 1000);
+    let (mut adverts, mut parts) = (std::collections::BTreeSet::new(), 0);
+    loop {
+        let to_late: Vec<_> = bench.sent.iter().filter(|(link, _)| *link == 6).collect();
+        assert!(to_late.len() <= 260, "{} frames in one turn", to_late.len());
+        adverts.extend(to_late.iter().filter_map(|(_, frame)| advert_seq(frame)));
+        parts += 1;
+        let Some(link) = bench.flushes.pop() else { break };
+        assert_eq!((link, bench.flushes.len()), (LinkId(6), 0));
+        bench.sent.clear();
+        if parts == 3 {
+            // News do not wait for it.
+            bench.advert(1, 20_000, &[B]);
+            assert!(bench.told().contains(&(6, "advert")));
+            bench.sent.clear();
+        }
+        bench.router.handle_flushed(bench.clock.now(), link);
+        bench.drain();
+    }
+    assert_eq!((adverts.len(), parts), (names, names.div_ceil(256)));
+    // A link that ends meanwhile is not told on.
+    bench.up(7, &late, true, 1000);
+    let link = bench.flushes.pop().expect("there is more than a part");
+    bench.link_down(7);
+    bench.router.handle_flushed(bench.clock.now(), link);
+    bench.drain();
+    assert!(bench.sent.iter().all(|(link, _)| *link != 7));
 }
 
 #[test]

@@ -91,8 +91,16 @@ impl Recording {
     /// A machine to which the same happened; it shares no byte with any other.
     pub fn replay(&self) -> Router {
         let mut router = Router::new(self.config.clone(), self.began);
-        let drain = |router: &mut Router| while !matches!(router.poll_output(), Output::Timeout(_)) {};
-        drain(&mut router);
+        let drain = |router: &mut Router, now| {
+            loop {
+                match router.poll_output() {
+                    Output::Timeout(_) => break,
+                    Output::Flush { link } => router.handle_flushed(now, link),
+                    _ => {}
+                }
+            }
+        };
+        drain(&mut router, self.began);
         for (now, input) in &self.inputs {
             match input {
                 Input::Up(link, neighbour) => router.handle_link_up(*now, *link, neighbour.clone()),
@@ -103,7 +111,7 @@ impl Recording {
                 }
                 Input::Timeout => router.handle_timeout(*now),
             }
-            drain(&mut router);
+            drain(&mut router, *now);
         }
         router
     }
@@ -534,6 +542,7 @@ impl Mesh {
         let wake = loop {
             match router.poll_output() {
                 Output::Timeout(at) => break at,
+                Output::Flush { link } => router.handle_flushed(now, link),
                 output => outputs.push(output),
             }
         };
@@ -547,7 +556,7 @@ impl Mesh {
                 Output::Send { link, frame } => self.carry(station, link, frame),
                 Output::Dropped(dropped) => *self.tally.drops.entry(dropped.reason.key()).or_default() += 1,
                 Output::Close { reason, .. } => panic!("honest nodes close a link: {reason}"),
-                Output::Forward { .. } | Output::Trust(_) | Output::Timeout(_) => {}
+                Output::Forward { .. } | Output::Trust(_) | Output::Timeout(_) | Output::Flush { .. } => {}
             }
         }
         for frame in local {

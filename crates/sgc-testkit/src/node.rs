@@ -468,6 +468,7 @@ impl Running {
                 sgc_router::Output::Close { link, reason } => {
                     self.effects.push(Effect::Close(link, reason));
                 }
+                sgc_router::Output::Flush { link } => self.router.handle_flushed(now, link),
                 sgc_router::Output::Trust(anchors) => {
                     self.anchors = anchors.clone();
                     self.effects.push(Effect::Trust(anchors.clone()));

@@ -106,11 +106,47 @@ fn an_altered_or_ancient_advertisement_is_not_believed() {
     world.inject(west, east, &Control::Advert { cost: 1, signed: altered(signed) });
     world.run(ms(500));
     assert_eq!(drops(&world, east, "not_verified"), 1);
-    world.run(ms(11 * 60 * 1000));
+    // Its lease is over, but it would verify.
+    world.run(ms(9 * 60 * 1000));
+    world.inject(west, east, &advert);
+    world.run(ms(500));
+    assert_eq!((drops(&world, east, "not_verified"), drops(&world, east, "stale")), (1, 1));
+    assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
+    world.run(ms(21 * 60 * 1000));
     world.inject(west, east, &advert);
     world.run(ms(500));
     assert_eq!(drops(&world, east, "not_verified"), 2, "signed too long ago");
     assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
+}
+
+#[test]
+fn a_router_that_keeps_leaves_back_and_plays_requests_again_locks_nobody_out() {
+    let mut scene = scene(31);
+    let max = sgc_endpoint::Limits::default().sinks_per_peer_max;
+    let (arm, east, west, desk) = (scene.arm, scene.east, scene.west, scene.desk);
+    scene.world.tamper(west, east, |frame| match frame {
+        Control::Leave { .. } => vec![],
+        frame => vec![frame.clone()],
+    });
+    for _ in 0..max + 4 {
+        assert_flows(&mut scene);
+        scene.world.restart(desk);
+    }
+    assert_flows(&mut scene);
+    let places = scene.world.granted(arm, "/chatter").iter().filter(|n| **n == desk).count();
+    assert_eq!(places, max);
+    let world = &mut scene.world;
+    let joins: Vec<_> = world
+        .captured()
+        .iter()
+        .filter(|c| (c.from, c.to) == (west, east) && matches!(c.frame, Control::Join { .. }))
+        .map(|c| c.frame.clone())
+        .collect();
+    for join in &joins {
+        world.inject(west, east, join);
+    }
+    world.run(ms(500));
+    assert_flows(&mut scene);
 }
 
 #[test]

@@ -18,9 +18,12 @@ impl<N: RosNetwork> Core<N> {
                 let Some(entry) = self.links.get_mut(&link) else { return };
                 entry.heart.stir();
                 if !entry.control.send(frame) {
-                    warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
-                    self.control_drops.count_from("control_queue_full", link);
-                    entry.link.close(CloseReason::Overloaded);
+                    self.close_overloaded(link);
+                }
+            }
+            RouterOutput::Flush { link } => {
+                if self.links.get(&link).is_some_and(|entry| !entry.control.flush()) {
+                    self.close_overloaded(link);
                 }
             }
             RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
@@ -83,6 +86,13 @@ impl<N: RosNetwork> Core<N> {
             }
             RouterOutput::Timeout(_) => {}
         }
+    }
+
+    fn close_overloaded(&mut self, link: LinkId) {
+        let Some(entry) = self.links.get(&link) else { return };
+        warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
+        self.control_drops.count_from("control_queue_full", link);
+        entry.link.close(CloseReason::Overloaded);
     }
 
     pub(super) fn endpoint_output(&mut self, output: EndpointOutput) {
