@@ -43,6 +43,9 @@ impl Machine {
             announcements_burst: u32::MAX,
             names_per_owner_max: usize::MAX,
             names_per_router_max: usize::MAX,
+            adverts_per_owner_max: usize::MAX,
+            advert_bytes_per_owner_max: usize::MAX,
+            stale_burst: u32::MAX,
             ..Limits::default()
         };
         let config = RouterConfig {
@@ -112,6 +115,7 @@ impl Machine {
         loop {
             match self.router.poll_output() {
                 Output::Send { link, .. } => sent_to.push(link),
+                Output::Flush { link } => self.router.handle_flushed(self.now, link),
                 Output::Dropped(dropped) => bail!("the router refuses a frame: {}", dropped.reason),
                 Output::Close { reason, .. } => bail!("the router closes a link: {reason}"),
                 Output::Timeout(at) => {

@@ -9,18 +9,21 @@ use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Control,
-    Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, Qos, Recover,
-    RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
+    Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason,
+    Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
-use crate::endpoint::{Dropped, Endpoint, Event};
+use crate::endpoint::{Dropped, Endpoint, Event, Limits};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 use crate::{SinkProgress, SourceProgress};
 
 /// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
 /// epochs whose packets are still under way.
 const EPOCHS_AHEAD_MAX: u32 = 3;
+
+/// A request that is older than the one known of its sink or node.
+pub(crate) const OLDER_REQUEST: &str = "older request";
 
 /// How long changes of the catalogue are gathered after it was sent.
 const CATALOGUE_REST: Duration = Duration::from_millis(100);
@@ -494,14 +497,14 @@ impl Endpoint {
                 return;
             }
         };
-        let JoinBody { name, sink, request, reply_key, .. } = join.body;
+        let JoinBody { name, sink, request, reply_key, issued_at, .. } = join.body;
         // In a post-quantum fleet nothing is granted that a recording could be made to tell later.
         let identity = &self.config.identity;
         let own_fleet = join.peer.ca == identity.as_peer().ca;
         if identity.post_quantum() && own_fleet && reply_key.len() != Kem::XWing.reply_key_bytes() {
             return self.refuse(name, sink, 1, RefuseReason::NotVerified);
         }
-        let asked = GrantedSink { peer: join.peer, request, reply_key, serial: 0, told: None };
+        let asked = GrantedSink { peer: join.peer, request, reply_key, issued_at, serial: 0, told: None };
         if self.is_catalogue(&name) {
             self.handle_follow(name, sink, asked);
         } else if self.is_renewal(&name) {
@@ -515,11 +518,19 @@ impl Endpoint {
 
     fn handle_subscribe_or_publish(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let peer = asked.peer.node_id;
+        let known = self.shares.shares.get(&name).and_then(|share| share.sinks.get(&sink));
+        if known.is_some_and(|known| is_older(&asked, known)) {
+            return self.unexpected(OLDER_REQUEST);
+        }
         self.replace_publisher(&name, &sink, &asked);
-        if let Err(reason) = self.admit(&name, &sink, &asked) {
-            self.refuse(name, sink, 1, reason);
-            self.event(Event::SinkRefused { name, peer, reason });
-            return;
+        match self.admit(&name, &sink, &asked) {
+            Ok(None) => {}
+            Ok(Some(oldest)) => self.give_up_place(name, oldest),
+            Err(reason) => {
+                self.refuse(name, sink, 1, reason);
+                self.event(Event::SinkRefused { name, peer, reason });
+                return;
+            }
         }
         let max = self.config.limits.sinks_per_name_max;
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
@@ -568,8 +579,8 @@ impl Endpoint {
         }
     }
 
-    /// Whether a request for a share may be granted.
-    fn admit(&self, name: &Name, sink: &SinkId, asked: &GrantedSink) -> Result<(), RefuseReason> {
+    /// Whether a request for a share may be granted, and the sink that has to give up its place for it.
+    fn admit(&self, name: &Name, sink: &SinkId, asked: &GrantedSink) -> Result<Option<SinkId>, RefuseReason> {
         let share = self.shares.shares.get(name).ok_or(RefuseReason::NotShared)?;
         share.spec.policy.permits(&asked.peer, asked.request.role()).map_err(refusal)?;
         match &asked.request {
@@ -585,47 +596,45 @@ impl Endpoint {
         }
         if let Some(known) = share.sinks.get(sink) {
             let same = known.peer.node_id == asked.peer.node_id && known.request == asked.request;
-            return if same { Ok(()) } else { Err(RefuseReason::NotPermitted) };
+            return if same { Ok(None) } else { Err(RefuseReason::NotPermitted) };
         }
-        let limits = &self.config.limits;
-        let of_peer = share.sinks.values().filter(|s| s.peer.node_id == asked.peer.node_id).count();
-        if share.sinks.len() >= limits.sinks_per_name_max || of_peer >= limits.sinks_per_peer_max {
-            return Err(RefuseReason::Limit);
-        }
-        Ok(())
+        place(share.sinks.iter(), asked, &self.config.limits)
+    }
+
+    /// Ends the oldest sink of a node that has as many as it may.
+    fn give_up_place(&mut self, name: Name, sink: SinkId) {
+        let granted = self.shares.shares.get(&name).and_then(|share| share.sinks.get(&sink));
+        let Some(serial) = granted.map(|granted| granted.serial + 1) else { return };
+        self.handle_leave(name, sink);
+        self.refuse(name, sink, serial, RefuseReason::Limit);
     }
 
     fn handle_follow(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
         let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
-        let refused = if !matches!(asked.request, Request::Subscribe { .. }) {
-            Some(RefuseReason::RoleNotOffered)
+        let place = if !matches!(asked.request, Request::Subscribe { .. }) {
+            Err(RefuseReason::RoleNotOffered)
         } else if !own_fleet {
-            Some(RefuseReason::NotPermitted)
-        } else if self.follower_places(&name, &sink, &asked.peer.node_id) == 0 {
-            Some(RefuseReason::Limit)
+            Err(RefuseReason::NotPermitted)
+        } else if let Some(known) = self.shares.followers.get(&(name, sink)) {
+            if is_older(&asked, known) {
+                return self.unexpected(OLDER_REQUEST);
+            }
+            if known.peer.node_id == asked.peer.node_id { Ok(None) } else { Err(RefuseReason::Limit) }
         } else {
-            None
+            place(self.shares.followers.iter(), &asked, &self.config.limits)
         };
-        match refused {
-            Some(reason) => self.refuse(name, sink, 1, reason),
-            None => {
-                let serial = self.shares.followers.get(&(name, sink)).map_or(0, |f| f.serial);
-                self.shares.followers.insert((name, sink), GrantedSink { serial, ..asked });
-                self.tell_follower(name, sink);
+        match place {
+            Err(reason) => return self.refuse(name, sink, 1, reason),
+            Ok(None) => {}
+            Ok(Some((name, oldest))) => {
+                if let Some(granted) = self.shares.followers.remove(&(name, oldest)) {
+                    self.refuse(name, oldest, granted.serial + 1, RefuseReason::Limit);
+                }
             }
         }
-    }
-
-    /// How many more catalogues may be sent to a node that asks as `sink`; one that asks again has its place.
-    fn follower_places(&self, name: &Name, sink: &SinkId, peer: &NodeId) -> usize {
-        let followers = &self.shares.followers;
-        if let Some(known) = followers.get(&(*name, *sink)) {
-            return usize::from(known.peer.node_id == *peer);
-        }
-        let limits = &self.config.limits;
-        let of_peer = followers.values().filter(|f| f.peer.node_id == *peer).count();
-        let left = limits.sinks_per_peer_max.saturating_sub(of_peer);
-        left.min(limits.sinks_per_name_max.saturating_sub(followers.len()))
+        let serial = self.shares.followers.get(&(name, sink)).map_or(0, |f| f.serial);
+        self.shares.followers.insert((name, sink), GrantedSink { serial, ..asked });
+        self.tell_follower(name, sink);
     }
 
     fn handle_renew(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
@@ -638,8 +647,12 @@ impl Endpoint {
         }
         let peer = asked.peer.clone();
         // One place for a node: the newer request is of the newer run, or of a newer certificate.
-        let older = self.renewals.iter().find(|(id, s)| **id != sink && s.peer.node_id == peer.node_id);
-        if let Some((older, serial)) = older.map(|(id, s)| (*id, s.serial + 1)) {
+        let other = self.renewals.iter().find(|(id, s)| **id != sink && s.peer.node_id == peer.node_id);
+        let known = other.map(|(_, other)| other).or_else(|| self.renewals.get(&sink));
+        if known.is_some_and(|known| is_older(&asked, known)) {
+            return self.unexpected(OLDER_REQUEST);
+        }
+        if let Some((older, serial)) = other.map(|(id, s)| (*id, s.serial + 1)) {
             self.renewals.remove(&older);
             self.refuse(name, older, serial, RefuseReason::Limit);
         }
@@ -692,6 +705,31 @@ impl Endpoint {
             _ => self.unexpected("recover"),
         }
     }
+}
+
+/// Whether a request of a node was signed before another one of it, and so is played again.
+pub(crate) fn is_older(asked: &GrantedSink, known: &GrantedSink) -> bool {
+    asked.peer.node_id == known.peer.node_id && asked.issued_at < known.issued_at
+}
+
+/// Returns the place that one who asks takes from its own node, if that has as many as it may: that of the request which was
+/// signed first. Routers on the way may keep leaves back and play requests again, but sign none.
+pub(crate) fn place<'a, K: Copy + 'a>(
+    granted: impl ExactSizeIterator<Item = (&'a K, &'a GrantedSink)>,
+    asked: &GrantedSink,
+    limits: &Limits,
+) -> Result<Option<K>, RefuseReason> {
+    let all = granted.len();
+    let of_peer: Vec<_> = granted
+        .filter(|(_, s)| s.peer.node_id == asked.peer.node_id)
+        .map(|(key, s)| (s.issued_at, *key))
+        .collect();
+    if of_peer.len() >= limits.sinks_per_peer_max {
+        let oldest = of_peer.iter().min_by_key(|(issued_at, _)| *issued_at);
+        let oldest = oldest.filter(|(issued_at, _)| *issued_at < asked.issued_at);
+        return oldest.map(|(_, key)| Some(*key)).ok_or(RefuseReason::Limit);
+    }
+    if all >= limits.sinks_per_name_max { Err(RefuseReason::Limit) } else { Ok(None) }
 }
 
 fn refusal(denied: Denied) -> RefuseReason {

@@ -10,6 +10,7 @@ use sgc_trust::{Policy, Suite, VerifiedPeer};
 use sgc_wire::{
     Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, ENTRY_SOURCES_MAX, GRANT_SOURCES_MAX, Kind,
     Metadata, Name, NodeId, Qos, Request, Role, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    UnixMillis,
 };
 
 use crate::{PackedType, SinkProgress, SourceProgress};
@@ -63,6 +64,8 @@ pub(crate) struct GrantedSink {
     pub(crate) peer: VerifiedPeer,
     pub(crate) request: Request,
     pub(crate) reply_key: Bytes,
+    /// When the request was signed: of requests that are played again none is newer than the last of their node.
+    pub(crate) issued_at: UnixMillis,
     /// Serial of the last answer.
     pub(crate) serial: u64,
     /// What it was told last, so that it is not told again; only used for catalogues.

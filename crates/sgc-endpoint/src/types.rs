@@ -16,6 +16,7 @@ use sgc_wire::{
 use crate::Endpoint;
 use crate::compression::{CompressionError, Compressor, Decompressor};
 use crate::joins::Wish;
+use crate::owner::{OLDER_REQUEST, is_older, place};
 use crate::shares::GrantedSink;
 
 /// What the length before a compressed description takes.
@@ -116,16 +117,19 @@ impl Endpoint {
         let Ok(question) = TypeQuestion::from_slice(what) else {
             return self.refuse(name, sink, 1, RefuseReason::NotVerified);
         };
-        let peer = asker.peer.node_id;
-        let known = self.questions.get(&sink).map(|asked| (asked.asker.peer.node_id, asked.asker.serial));
-        let of_peer = self.questions.values().filter(|asked| asked.asker.peer.node_id == peer).count();
-        let limits = &self.config.limits;
-        let has_room =
-            self.questions.len() < limits.sinks_per_name_max && of_peer < limits.sinks_per_peer_max;
-        let serial = match known {
-            Some((known, serial)) if known == peer => serial,
-            None if has_room => 0,
-            Some(_) | None => return self.refuse(name, sink, 1, RefuseReason::Limit),
+        let serial = match self.questions.get(&sink).map(|known| &known.asker) {
+            Some(known) if is_older(&asker, known) => return self.unexpected(OLDER_REQUEST),
+            Some(known) if known.peer.node_id == asker.peer.node_id => known.serial,
+            Some(_) => return self.refuse(name, sink, 1, RefuseReason::Limit),
+            None => {
+                let askers = self.questions.iter().map(|(sink, asked)| (sink, &asked.asker));
+                match place(askers, &asker, &self.config.limits) {
+                    Ok(None) => {}
+                    Ok(Some(oldest)) => self.end_question(oldest, RefuseReason::Limit),
+                    Err(reason) => return self.refuse(name, sink, 1, reason),
+                }
+                0
+            }
         };
         let names = question.names.into_iter().collect();
         self.questions.insert(sink, TypeAsker { asker: GrantedSink { serial, ..asker }, names });
@@ -167,12 +171,17 @@ impl Endpoint {
     /// Cuts those who lost their certificate.
     pub(crate) fn enforce_types(&mut self) {
         let lost = |(sink, asked): (&SinkId, &TypeAsker)| {
-            self.standing(&asked.asker.peer).map(|reason| (*sink, asked.asker.serial + 1, reason))
+            self.standing(&asked.asker.peer).map(|reason| (*sink, reason))
         };
         let lost: Vec<_> = self.questions.iter().filter_map(lost).collect();
-        for (sink, serial, reason) in lost {
-            self.questions.remove(&sink);
-            self.refuse(self.types_name.0, sink, serial, reason);
+        for (sink, reason) in lost {
+            self.end_question(sink, reason);
+        }
+    }
+
+    fn end_question(&mut self, sink: SinkId, reason: RefuseReason) {
+        if let Some(asked) = self.questions.remove(&sink) {
+            self.refuse(self.types_name.0, sink, asked.asker.serial + 1, reason);
         }
     }
 

@@ -127,6 +127,98 @@ fn join(bench: &Bench, who: &Identity, name: Name, sink: u8) -> (Control, ReplyK
 }
 
 #[test]
+fn a_node_with_all_places_of_a_topic_takes_those_of_its_oldest_requests() {
+    let mut bench = owner();
+    let limits = Limits::default();
+    let (desk, lap) = (identity(&Member::new("desk")), identity(&Member::new("lap")));
+    let topic = bench.share_with_fleet("/a");
+    let catalogue = bench.endpoint.catalogue_name().expect("it has one");
+    for name in [topic, catalogue] {
+        let (frame, _) = join(&bench, &lap, name, 200);
+        bench.frame(frame);
+        let mut frames = Vec::new();
+        for n in 1..=20 {
+            bench.clock.advance_to(bench.clock.instant() + std::time::Duration::from_secs(1));
+            let (frame, _) = join(&bench, &desk, name, n);
+            frames.push(frame.clone());
+            bench.frame(frame);
+            let mut answers = bench.answers();
+            answers.sort_by_key(|(sink, _)| *sink);
+            let gone = n.checked_sub(limits.sinks_per_peer_max as u8).filter(|gone| *gone > 0);
+            let gone = gone.map(|gone| (SinkId([gone; 16]), Some(RefuseReason::Limit)));
+            let expected: Vec<_> = gone.into_iter().chain([(SinkId([n; 16]), None)]).collect();
+            assert_eq!(answers, expected, "request {n}");
+        }
+        // A router that has them plays them again: those that gave up their places get none from newer ones.
+        for n in 1..=4 {
+            bench.frame(frames[n - 1].clone());
+            assert_eq!(bench.answers(), [(SinkId([n as u8; 16]), Some(RefuseReason::Limit))]);
+        }
+    }
+    let granted = bench.endpoint.granted(&topic);
+    let of_desk: Vec<_> =
+        granted.iter().filter(|(_, node)| *node == desk.node_id()).map(|(s, _)| s.0[0]).collect();
+    assert_eq!((of_desk, granted.len()), ((5..=20).collect(), 17), "and none from another node");
+}
+
+#[test]
+fn an_older_request_of_a_sink_does_not_bring_its_key_back() {
+    let mut bench = owner();
+    let desk = identity(&Member::new("desk"));
+    let topic = bench.share_with_fleet("/a");
+    let catalogue = bench.endpoint.catalogue_name().expect("it has one");
+    for name in [topic, catalogue] {
+        let (older, _) = join(&bench, &desk, name, 1);
+        bench.clock.advance_to(bench.clock.instant() + std::time::Duration::from_secs(1));
+        let (newer, key) = join(&bench, &desk, name, 1);
+        bench.frame(older.clone());
+        bench.frame(newer);
+        bench.frame(older);
+        assert_eq!((bench.answers().len(), bench.dropped.len()), (0, 1), "{:?}", bench.dropped);
+        bench.share_with_fleet(if name == topic { "/b" } else { "/c" });
+        bench.endpoint.rotate(bench.clock.now(), &topic);
+        bench.clock.advance_to(bench.clock.instant() + std::time::Duration::from_secs(1));
+        bench.endpoint.handle_timeout(bench.clock.now());
+        bench.drain();
+        let of_name = bench.sent.iter().find_map(|frame| match frame {
+            Control::Answer { signed } => {
+                AnswerBody::from_slice(&signed.body).ok().filter(|body| body.name == name)
+            }
+            _ => None,
+        });
+        let Some(AnswerBody { sink, serial, answer: Answer::Grant { enc, sealed }, .. }) = of_name else {
+            panic!("what changed is granted again")
+        };
+        assert!(key.open(&name, &sink, serial, &enc, &sealed).is_ok(), "with the newest key");
+    }
+}
+
+#[test]
+fn names_that_come_one_by_one_do_not_stay_apart() {
+    let mut bench = owner();
+    // Which advertisement speaks for each name, as routers keep it.
+    let mut words = std::collections::BTreeMap::new();
+    let mut most = 0;
+    for n in 0..500 {
+        bench.share_with_fleet(&format!("/a{n}"));
+        bench.drain();
+        for frame in &bench.sent {
+            let Control::Advert { signed, .. } = frame else { continue };
+            let body = AdvertBody::from_slice(&signed.body).expect("ours");
+            words.extend(body.blinds.iter().map(|blind| (*blind, body.seq)));
+        }
+        let apart: std::collections::BTreeSet<_> = words.values().collect();
+        most = most.max(apart.len());
+        bench.clock.advance_to(bench.clock.now().instant + ADVERT_INTERVAL);
+    }
+    assert!(
+        words.len() >= 499 && (60..70).contains(&most),
+        "{most} advertisements speak for {} names",
+        words.len()
+    );
+}
+
+#[test]
 fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
     let mut bench = owner();
     let name = bench.share_with_fleet("/a");
@@ -208,7 +300,7 @@ fn names_that_come_one_by_one_are_gathered_as_routers_take_no_more() {
     bench.drain();
     adverts.extend(bench.adverts());
     assert_eq!(adverts.len(), ADVERTS_BURST as usize, "one with all the others");
-    assert_eq!(adverts.iter().map(|advert| advert.2).sum::<usize>(), count);
+    assert_eq!(adverts.last().map(|advert| advert.2), Some(count + 1), "and again with those before");
     // The end is told at once.
     bench.endpoint.withdraw_all(bench.clock.now());
     bench.drain();
