@@ -4,19 +4,18 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_trust::{TrustAnchors, VerifiedPeer};
 use sgc_wire::UnixMillis;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::access::{Access, Admission, Client, Denied};
+use crate::access_watch::AccessWatch;
+use crate::clock::WallClock;
 use crate::hub::lock;
 
-/// How often it is looked whether a client may stay whose time has no end that a timer could wait for: clocks are set.
-const LOOK_AGAIN_MAX: Duration = Duration::from_secs(60);
 /// Connections of other hosts that may be in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
 /// The same of one of them.
@@ -64,7 +63,7 @@ pub(crate) struct Arrival {
 /// Who comes in.
 #[derive(Debug)]
 pub(crate) struct Door {
-    access: watch::Sender<Access>,
+    access: AccessWatch,
     clients: Mutex<BTreeMap<u64, ClientStatus>>,
     refused: Mutex<BTreeMap<&'static str, u64>>,
     next: AtomicU64,
@@ -86,18 +85,18 @@ impl Drop for Place {
 
 impl Door {
     pub(crate) fn new(access: Access, clients_max: usize) -> Arc<Self> {
-        let access = watch::Sender::new(access);
+        let access = AccessWatch::new(access, WallClock::system());
         let (clients, refused, next) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
         Arc::new(Self { access, clients, refused, next, clients_max })
     }
 
-    /// Other rules from now on: who is no longer admitted is disconnected.
-    pub(crate) fn change_access(&self, change: impl FnOnce(&Access) -> Access) {
-        self.access.send_modify(|access| *access = change(access));
+    /// The rules in force.
+    pub(crate) fn rules(&self) -> &AccessWatch {
+        &self.access
     }
 
     pub(crate) fn access(&self) -> Access {
-        self.access.borrow().clone()
+        self.access.current()
     }
 
     /// What a certificate proves; an error says why it proves nothing.
@@ -152,20 +151,6 @@ impl Door {
         Some(Place { door: Arc::clone(self), number })
     }
 
-    /// Waits until a client may no longer stay.
-    pub(crate) async fn until_denied(&self, client: &Client) -> Denied {
-        let mut access = self.access.subscribe();
-        loop {
-            let current = access.borrow_and_update().clone();
-            if let Err(denied) = current.still_admits(client, now()) {
-                return denied;
-            }
-            let left = client.expires.map(|ends| Duration::from_millis(ends.0.saturating_sub(now().0) + 1));
-            let look_again = left.unwrap_or(LOOK_AGAIN_MAX).min(LOOK_AGAIN_MAX);
-            let _ = tokio::time::timeout(look_again, access.changed()).await;
-        }
-    }
-
     pub(crate) fn clients(&self) -> Vec<ClientStatus> {
         lock(&self.clients).values().cloned().collect()
     }
@@ -173,7 +158,7 @@ impl Door {
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         let counted = lock(&self.refused);
         // Whatever the protocol: of gRPC each call is admitted.
-        let denied = Some(("not admitted", self.access.borrow().denied())).filter(|(_, count)| *count > 0);
+        let denied = Some(("not admitted", self.access.current().denied())).filter(|(_, count)| *count > 0);
         let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
         all.map(|(why, count)| (why.to_owned(), count)).collect()
     }

@@ -10,9 +10,11 @@
 #![forbid(unsafe_code)]
 
 mod access;
+mod access_watch;
 mod action;
 mod aside;
 mod budget;
+mod clock;
 mod content;
 mod door;
 mod error;
@@ -39,9 +41,11 @@ pub use access::{
     ClientRule, Denied, HearRefusals, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, Right, SCOPE_BYTES_MAX,
     SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
 };
+pub use access_watch::AccessWatch;
 pub use action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
 };
+pub use clock::WallClock;
 pub use content::{Content, Form};
 pub use door::{ClientStatus, GatewayStatus};
 pub use error::{ErrorKind, GatewayError};

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rustls::ServerConfig;
 use rustls::sign::CertifiedKey;
-use sgc_trust::TrustAnchors;
+use sgc_trust::{TrustAnchors, VerifiedPeer};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, watch};
@@ -19,12 +19,12 @@ use tokio::time::{Instant, Sleep};
 use tokio_rustls::TlsAcceptor;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::access::Access;
-use crate::door::{Arrival, Door, GatewayStatus, Handshake, Handshakes, Place, now};
-use crate::foxglove;
+use crate::access::{Access, Denied};
+use crate::door::{Arrival, Door, GatewayStatus, Handshake, Handshakes, Place};
+use crate::foxglove::{self, FoxgloveError};
 use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
-use crate::rosbridge::{self, Authenticate, RosbridgeOptions, StillAdmits};
+use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
 use crate::ws::{UpgradeError, upgrade};
@@ -33,6 +33,8 @@ use crate::ws::{UpgradeError, upgrade};
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
 /// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
+/// How long a connection of gRPC stays on which nobody is admitted any more: its streams say why they end.
+const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
 /// Connections that wait to be served by gRPC.
 const GRPC_WAITING_MAX: usize = 64;
 
@@ -125,27 +127,25 @@ trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
 
-/// A stream of bytes of gRPC: its client has a place from the first call that is admitted, and has to make it in time.
+/// A stream of bytes of gRPC. Its client has a place for as long as somebody is admitted on it, and has to be admitted in
+/// time.
 struct Placed {
     stream: Box<dyn Bytes>,
+    door: Arc<Door>,
+    connection: Connection,
     standing: Standing,
 }
 
 /// How far a client of gRPC has come.
 enum Standing {
-    /// It has not shown yet who it is.
-    Unproven(Unproven),
+    /// It has not shown yet who it is, and has until then to do so.
+    Unproven { deadline: Pin<Box<Sleep>>, _handshake: Handshake },
     /// It was admitted.
     Proven(#[expect(dead_code, reason = "it is for its end")] Place),
+    /// Nobody is admitted on it any more. It has until then to hear so, or to show something else.
+    Denied { deadline: Pin<Box<Sleep>> },
     /// It has to go; it was counted why.
     Refused,
-}
-
-struct Unproven {
-    door: Arc<Door>,
-    connection: Connection,
-    deadline: Pin<Box<Sleep>>,
-    _handshake: Handshake,
 }
 
 impl Placed {
@@ -157,29 +157,37 @@ impl Placed {
         handshake: Handshake,
     ) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(deadline));
-        let unproven = Unproven { door, connection, deadline, _handshake: handshake };
-        Self { stream, standing: Standing::Unproven(unproven) }
+        Self { stream, door, connection, standing: Standing::Unproven { deadline, _handshake: handshake } }
     }
 
     /// Fails once the client may not stay. To be asked before reading as before writing: who does not read what it is
     /// sent is not read from either.
     fn check(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
-        let unproven = match &mut self.standing {
-            Standing::Proven(_) => return Ok(()),
-            Standing::Refused => return Err(io::ErrorKind::ConnectionAborted.into()),
-            Standing::Unproven(unproven) => unproven,
-        };
-        let Unproven { door, connection, deadline, .. } = unproven;
-        let (standing, result) = if let Some(name) = connection.admitted_name() {
-            match door.enter(&name, "grpc", connection.peer()) {
+        let admitted = self.connection.poll_admitted(cx);
+        let (standing, result) = match (&mut self.standing, admitted) {
+            (Standing::Refused, _) => return Err(io::ErrorKind::ConnectionAborted.into()),
+            (Standing::Proven(_), Some(_)) => return Ok(()),
+            (Standing::Proven(_), None) => {
+                self.door.count("no longer admitted");
+                let deadline = Box::pin(tokio::time::sleep(GRPC_FAREWELL_MAX));
+                self.standing = Standing::Denied { deadline };
+                return self.check(cx);
+            }
+            (_, Some(name)) => match self.door.enter(&name, "grpc", self.connection.peer()) {
                 Some(place) => (Standing::Proven(place), Ok(())),
                 None => (Standing::Refused, Err(io::Error::other("too many clients"))),
-            }
-        } else if deadline.as_mut().poll(cx).is_ready() {
-            door.count("handshake too slow");
-            (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
-        } else {
-            return Ok(());
+            },
+            (Standing::Unproven { deadline, .. }, None) => match deadline.as_mut().poll(cx) {
+                Poll::Pending => return Ok(()),
+                Poll::Ready(()) => {
+                    self.door.count("handshake too slow");
+                    (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
+                }
+            },
+            (Standing::Denied { deadline }, None) => match deadline.as_mut().poll(cx) {
+                Poll::Pending => return Ok(()),
+                Poll::Ready(()) => (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into())),
+            },
         };
         self.standing = standing;
         result
@@ -254,9 +262,8 @@ impl Server {
         let door = Door::new(options.access, options.clients_max);
         let (grpc, accepted) = mpsc::channel(GRPC_WAITING_MAX);
         let mut tasks = JoinSet::new();
-        let rules = Arc::clone(&door);
         let grpc_options = GrpcOptions { session: options.limits, ..GrpcOptions::default() };
-        let front = Grpc::new(hub.clone(), move || rules.access(), grpc_options);
+        let front = Grpc::new(hub.clone(), door.rules().clone(), grpc_options);
         tasks.spawn(async move {
             if let Err(error) = front.serve(ReceiverStream::new(accepted)).await {
                 tracing::error!(%error, "gRPC is not served any more");
@@ -297,13 +304,25 @@ impl Server {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
-        self.shared.door.change_access(|before| access.after(before));
+        self.shared.door.rules().change(|before| access.after(before));
         Ok(())
+    }
+
+    /// Shows new connections another certificate; those that there are stay.
+    pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
+        let tls = tls_of(Some(key), &self.shared.door.access())?;
+        self.shared.tls.send_replace(tls);
+        Ok(())
+    }
+
+    /// Verifies tokens with the certificate of this peer from now on: the gateway's own, renewed.
+    pub fn set_gateway(&self, gateway: VerifiedPeer) {
+        self.shared.door.rules().change(|access| access.clone().with_gateway(gateway));
     }
 
     /// Other CAs, or other revocation lists of theirs.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
-        self.shared.door.change_access(|access| access.clone().with_anchors(anchors));
+        self.shared.door.rules().change(|access| access.clone().with_anchors(anchors));
     }
 
     /// What goes on.
@@ -421,38 +440,55 @@ async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
     let client = upgraded.client;
     let protocol = if upgraded.subprotocol.is_some() { "foxglove" } else { "rosbridge" };
     let Some(_place) = door.enter(&client.name, protocol, peer) else { return };
-    let session = Arc::new(Session::new(&shared.hub, client.clone(), shared.limits));
-    let served = async {
-        if upgraded.subprotocol.is_some() {
-            let served = foxglove::serve(upgraded.socket, session, shared.foxglove.clone()).await;
-            return served.map_err(|error| error.to_string());
-        }
-        let (asked, judged) = (Arc::clone(door), Arc::clone(door));
+    let name = Arc::clone(&client.name);
+    let session = Session::new(&shared.hub, client, shared.limits).admitted_by(door.rules().clone());
+    let ended = if upgraded.subprotocol.is_some() {
+        let served = foxglove::serve(upgraded.socket, Arc::new(session), shared.foxglove.clone());
+        served.await.map_err(Ended::from)
+    } else {
+        let asked = Arc::clone(door);
         // A token that comes later than the upgrade says who the client is from then on.
         let authenticate: Authenticate = Arc::new(move |token| {
             let admitted = asked.admit(&arrival, None, Some(token));
             admitted.map_err(|denied| denied.told().to_owned())
         });
-        let still_admits: StillAdmits = Arc::new(move |client| {
-            judged.access().still_admits(client, now()).map_err(|denied| denied.told().to_owned())
-        });
-        let options = RosbridgeOptions {
-            authenticate: Some(authenticate),
-            still_admits: Some(still_admits),
-            ..RosbridgeOptions::default()
-        };
-        let served = rosbridge::serve(upgraded.socket, session, options).await;
-        served.map_err(|error| error.to_string())
+        let options =
+            RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
+        let served = rosbridge::serve(upgraded.socket, Arc::new(session), options);
+        served.await.map_err(Ended::from)
     };
-    tokio::select! {
-        result = served => {
-            if let Err(error) = result {
-                tracing::debug!(%peer, %error, "a client's connection failed");
-            }
-        }
-        denied = door.until_denied(&client) => {
+    match ended {
+        Ok(()) => {}
+        Err(Ended::Denied(denied)) => {
             door.count("no longer admitted");
-            tracing::info!(client = %client.name, %denied, "a client is disconnected");
+            tracing::info!(client = %name, %denied, "a client is disconnected");
+        }
+        Err(Ended::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),
+    }
+}
+
+/// Why a client's connection ended, other than by its wish.
+enum Ended {
+    /// Its right ended.
+    Denied(Denied),
+    /// It failed, in these words.
+    Failed(String),
+}
+
+impl From<RosbridgeError> for Ended {
+    fn from(error: RosbridgeError) -> Self {
+        match error {
+            RosbridgeError::Denied(denied) => Self::Denied(denied),
+            error => Self::Failed(error.to_string()),
+        }
+    }
+}
+
+impl From<FoxgloveError> for Ended {
+    fn from(error: FoxgloveError) -> Self {
+        match error {
+            FoxgloveError::Denied(denied) => Self::Denied(denied),
+            error => Self::Failed(error.to_string()),
         }
     }
 }

@@ -8,7 +8,8 @@ use bytes::Bytes;
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
 use sgc_wire::Qos;
 
-use crate::access::{Client, Right};
+use crate::access::{Client, Denied, Right};
+use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
 use crate::error::GatewayError;
 use crate::feed::{FeedKey, Intaking, Subscription};
@@ -85,6 +86,8 @@ pub struct Advertise {
 pub struct Session {
     hub: Hub,
     client: Client,
+    /// What ends its right; none of a part of this program.
+    access: Option<AccessWatch>,
     limits: SessionLimits,
     calls: Arc<AtomicUsize>,
     waiting: Arc<AtomicUsize>,
@@ -119,6 +122,7 @@ impl Session {
         Self {
             hub: hub.clone(),
             client,
+            access: None,
             limits,
             calls: Arc::default(),
             waiting: Arc::default(),
@@ -126,11 +130,26 @@ impl Session {
         }
     }
 
+    /// The same, by these rules, which end the client's right.
+    #[must_use]
+    pub fn admitted_by(mut self, access: AccessWatch) -> Self {
+        self.access = Some(access);
+        self
+    }
+
+    /// Waits until the client's right ends, and says why it has. Whoever serves the client ends all that it has then.
+    pub async fn until_denied(&self) -> Denied {
+        match &self.access {
+            Some(access) => access.until_denied(&self.client).await,
+            None => std::future::pending().await,
+        }
+    }
+
     /// The same program's, now that it is another client: what it has already counts against its bounds.
     pub fn again(&self, client: Client) -> Self {
-        let (hub, limits) = (self.hub.clone(), self.limits);
+        let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
         let [calls, waiting, waits] = [&self.calls, &self.waiting, &self.waits].map(Arc::clone);
-        Self { hub, client, limits, calls, waiting, waits }
+        Self { hub, client, access, limits, calls, waiting, waits }
     }
 
     /// Who it is.

@@ -89,6 +89,15 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     Ok(Upgraded { socket, client, subprotocol })
 }
 
+/// What of a reason fits into a close frame, which has room for 123 bytes of words (RFC 6455, 5.5).
+pub(crate) fn close_reason(why: &str) -> &str {
+    let mut end = why.len().min(123);
+    while !why.is_char_boundary(end) {
+        end -= 1;
+    }
+    &why[..end]
+}
+
 fn refusal(status: StatusCode, why: &str) -> ErrorResponse {
     let mut response = ErrorResponse::new(Some(format!("{why}\n")));
     *response.status_mut() = status;

@@ -143,6 +143,7 @@ enum Evidence {
     },
     Certificate {
         peer: VerifiedPeer,
+        ip: IpAddr,
         origin: Option<Arc<str>>,
     },
     Token {
@@ -218,6 +219,13 @@ impl Access {
         self
     }
 
+    /// The same with another certificate of this node.
+    #[must_use]
+    pub fn with_gateway(mut self, gateway: VerifiedPeer) -> Self {
+        Arc::make_mut(&mut self.rules).gateway = Some(gateway);
+        self
+    }
+
     /// The rules.
     pub fn rules(&self) -> &AccessRules {
         &self.rules
@@ -251,8 +259,9 @@ impl Access {
         }
         let origin = admission.origin.map(Arc::from);
         if let Some(peer) = admission.certificate {
-            let evidence = Evidence::Certificate { peer: peer.clone(), origin: origin.clone() };
-            match self.judge_certificate(peer, admission.origin, admission.now) {
+            let ip = admission.peer.ip().to_canonical();
+            let evidence = Evidence::Certificate { peer: peer.clone(), ip, origin: origin.clone() };
+            match self.judge_certificate(peer, ip, admission.origin, admission.now) {
                 Ok(scope) => {
                     let name = self.rules.names.get(&peer.node_id).cloned();
                     let name = name.unwrap_or_else(|| format!("node {}", peer.node_id.short()));
@@ -280,8 +289,8 @@ impl Access {
         match &client.evidence {
             Evidence::Own => Ok(()),
             Evidence::Anonymous { ip, origin } => self.judge_anonymous(*ip, origin.as_deref()),
-            Evidence::Certificate { peer, origin } => {
-                let scope = self.judge_certificate(peer, origin.as_deref(), now)?;
+            Evidence::Certificate { peer, ip, origin } => {
+                let scope = self.judge_certificate(peer, *ip, origin.as_deref(), now)?;
                 if scope == *client.scope { Ok(()) } else { Err(Denied::Changed) }
             }
             Evidence::Token { id, is_exposed } => {
@@ -332,6 +341,7 @@ impl Access {
     fn judge_certificate(
         &self,
         peer: &VerifiedPeer,
+        ip: IpAddr,
         origin: Option<&str>,
         now: UnixMillis,
     ) -> Result<Scope, Denied> {
@@ -349,7 +359,7 @@ impl Access {
             return Err(Denied::NotListed { node });
         }
         // A browser shows a certificate to whatever page asks it to connect.
-        self.judge_origin(origin)?;
+        self.judge_origin(origin, ip)?;
         Ok(scope)
     }
 
@@ -368,18 +378,20 @@ impl Access {
 
     fn judge_anonymous(&self, ip: IpAddr, origin: Option<&str>) -> Result<(), Denied> {
         match self.rules.anonymous {
-            Anonymous::Local if ip.is_loopback() => self.judge_origin(origin),
-            Anonymous::All => self.judge_origin(origin),
+            Anonymous::Local if ip.is_loopback() => self.judge_origin(origin, ip),
+            Anonymous::All => self.judge_origin(origin, ip),
             Anonymous::Local | Anonymous::None => Err(Denied::NoCredentials { ip }),
         }
     }
 
-    /// Whether a page of there may connect without a token; a program, which has no origin, may.
-    fn judge_origin(&self, origin: Option<&str>) -> Result<(), Denied> {
+    /// Whether a page of there may connect without a token; a program, which has no origin, may. In the browser of another
+    /// host, `http://localhost` is a page of that host.
+    fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denied> {
         let Some(text) = origin else { return Ok(()) };
         let parsed = text.parse::<PageOrigin>();
         match &parsed {
-            Ok(origin) if origin.is_of_this_host() || self.rules.origins.contains(origin) => Ok(()),
+            Ok(origin) if ip.is_loopback() && origin.is_loopback() => Ok(()),
+            Ok(origin) if self.rules.origins.contains(origin) => Ok(()),
             _ => Err(Denied::Origin { origin: text.chars().take(ORIGIN_BYTES_MAX).collect() }),
         }
     }

@@ -18,8 +18,8 @@ const FILE: &str = "file://";
 pub struct PageOrigin(Box<str>);
 
 impl PageOrigin {
-    /// True of pages that this host serves to itself.
-    pub fn is_of_this_host(&self) -> bool {
+    /// Returns `true` for pages that a host serves to itself: to the host of the browser, whichever that is.
+    pub fn is_loopback(&self) -> bool {
         let Some((scheme, authority)) = self.0.split_once("://") else { return false };
         let host = host_and_port(authority).map(|(host, _)| host);
         matches!(scheme, "http" | "https") && host.is_some_and(is_loopback)
@@ -126,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pages_of_this_host_are_known() {
+    fn pages_that_a_host_serves_to_itself_are_known() {
         for (text, local) in [
             ("http://localhost", true),
             ("https://LocalHost:8443", true),
@@ -142,7 +142,7 @@ mod tests {
             ("https://app.foxglove.dev", false),
         ] {
             let origin: PageOrigin = text.parse().unwrap();
-            assert_eq!(origin.is_of_this_host(), local, "{text}");
+            assert_eq!(origin.is_loopback(), local, "{text}");
         }
     }
 

@@ -114,6 +114,31 @@ fn pages_of_elsewhere_are_kept_out_unless_they_are_listed() {
 }
 
 #[test]
+fn a_page_of_another_hosts_localhost_is_no_page_of_this_host() {
+    let cast = cast();
+    let origins = vec!["http://localhost:5173".parse().unwrap()];
+    let all = AccessRules { anonymous: Anonymous::All, ..cast.listing_desk("/odom") };
+    let listed = Access::new(AccessRules { origins, ..all.clone() });
+    let all = Access::new(all);
+    for certificate in [None, Some(cast.desk.as_peer())] {
+        for origin in ["http://localhost", "http://127.0.0.1:3000", "https://[::1]", "http://localhost:5173"] {
+            let page = |peer| Admission { origin: Some(origin), certificate, ..from(peer) };
+            let refused = Denied::Origin { origin: origin.to_owned() };
+            for peer in [ELSEWHERE, "[2001:db8::7]:1", "[::ffff:10.0.0.9]:1"] {
+                assert_eq!(all.admit(&page(peer)).unwrap_err(), refused, "{origin} of {peer}");
+            }
+            for peer in [HERE, "[::1]:1", "[::ffff:127.0.0.1]:1"] {
+                let client = all.admit(&page(peer)).unwrap();
+                assert_eq!(all.still_admits(&client, NOW), Ok(()), "{origin} of {peer}");
+            }
+        }
+        // Whoever lists it means the pages of every visitor's own host.
+        let page = Admission { origin: Some("http://localhost:5173"), certificate, ..from(ELSEWHERE) };
+        assert!(listed.admit(&page).is_ok());
+    }
+}
+
+#[test]
 fn a_token_gives_its_scope_and_no_more() {
     let cast = cast();
     let access = Access::new(cast.rules());
@@ -253,7 +278,9 @@ fn a_page_does_not_connect_by_its_browsers_certificate() {
     let certificate = Some(cast.desk.as_peer());
     let page = Admission { certificate, origin: Some("https://evil.example"), ..from(ELSEWHERE) };
     assert_eq!(access.admit(&page).unwrap_err(), Denied::Origin { origin: "https://evil.example".into() });
-    assert!(access.admit(&Admission { origin: Some("http://localhost"), ..page }).is_ok());
+    assert!(access.admit(&Admission { origin: Some("http://localhost"), ..page }).is_err());
+    let here = Admission { origin: Some("http://localhost"), peer: from(HERE).peer, ..page };
+    assert!(access.admit(&here).is_ok());
 }
 
 #[test]

@@ -26,8 +26,12 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Error as SocketError;
 use tokio_tungstenite::tungstenite::Message as Frame;
+use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
+use crate::access::Denied;
 use crate::session::Session;
+use crate::ws::close_reason;
 
 use connection::Connection;
 use outbox::Outbox;
@@ -84,6 +88,9 @@ pub enum FoxgloveError {
         /// For how long.
         silence_ms: u64,
     },
+    /// The client's right has ended.
+    #[error("the client's right has ended: {0}")]
+    Denied(#[source] Denied),
 }
 
 /// Serves a client until it leaves. To end it earlier, drop the future: what the client had ends with it.
@@ -100,13 +107,19 @@ where
 {
     let (mut sink, mut frames) = socket.split();
     let outbox = Outbox::new(session.limits().waiting_bytes_max);
-    let mut connection = Connection::new(session, options, &outbox);
+    let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
+        biased;
+        denied = session.until_denied() => Err(FoxgloveError::Denied(denied)),
         ended = connection.run(&mut frames) => ended,
         failed = write(&mut sink, &outbox) => Err(FoxgloveError::Socket(failed)),
     };
     drop(connection);
     let farewell = async {
+        if let Err(FoxgloveError::Denied(denied)) = &ended {
+            let reason = CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.told()).into() };
+            return sink.send(Frame::Close(Some(reason))).await;
+        }
         while let Some(answer) = outbox.pop_answer() {
             sink.feed(answer).await?;
         }

@@ -4,17 +4,17 @@
 use std::future::Future;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
-use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
-use sgc_wire::UnixMillis;
 use tokio::sync::watch;
+use tokio::task::AbortHandle;
 use tonic::{Request, Status};
 
 use super::GrpcOptions;
-use super::connection::Connection;
+use super::connection::{Connection, WeakConnection};
 use super::fault::Fault;
-use crate::access::{Access, Admission, Client, Denied};
+use crate::access::{Admission, Client, Denied};
+use crate::access_watch::AccessWatch;
 use crate::budget::Budget;
 use crate::error::GatewayError;
 use crate::feed::{Subscription, SubscriptionEnd};
@@ -24,13 +24,10 @@ use crate::session::Session;
 /// Credentials that may be in use on one connection at a time.
 const CREDENTIALS_MAX: usize = 16;
 
-/// Access as it is at present.
-type Gate = Arc<dyn Fn() -> Access + Send + Sync>;
-
 /// Admits clients.
 pub(super) struct Clients {
     hub: Hub,
-    access: Gate,
+    access: AccessWatch,
     options: GrpcOptions,
     stopping: watch::Receiver<bool>,
 }
@@ -52,10 +49,19 @@ impl Known {
     pub(super) fn client(&self) -> &Client {
         self.guest.session.client()
     }
+
+    pub(super) fn is_admitted(&self) -> bool {
+        !self.guest.has_ended()
+    }
 }
 
 impl Clients {
-    pub(super) fn new(hub: Hub, access: Gate, options: GrpcOptions, stopping: watch::Receiver<bool>) -> Self {
+    pub(super) fn new(
+        hub: Hub,
+        access: AccessWatch,
+        options: GrpcOptions,
+        stopping: watch::Receiver<bool>,
+    ) -> Self {
         Self { hub, access, options, stopping }
     }
 
@@ -89,11 +95,11 @@ impl Clients {
             }),
             origin: origin.map(Box::from),
         };
-        let access = (self.access)();
+        let access = self.access.current();
         let mut known = lock(connection.known());
         if let Some(at) = known.iter().position(|known| known.shown == shown) {
             let guest = &known[at].guest;
-            match still_admits(&access, guest.session.client()) {
+            match access.still_admits(guest.session.client(), self.access.now()) {
                 Ok(()) if !guest.has_ended() => return Ok(Arc::clone(guest)),
                 Ok(()) => drop(known.remove(at)),
                 // By the rules as they are now it may be admitted anew.
@@ -106,7 +112,7 @@ impl Clients {
             origin,
             token,
             certificate: connection.certificate(),
-            now: now(),
+            now: self.access.now(),
         });
         let client = client.map_err(|why| {
             tracing::debug!(%why, peer = %connection.peer(), "a gRPC client is not admitted");
@@ -117,32 +123,24 @@ impl Clients {
             let idle = known.iter().position(|known| Arc::strong_count(&known.guest) == 1);
             known.remove(idle.ok_or(Fault::Credentials { max: CREDENTIALS_MAX })?);
         }
-        let guest = Arc::new(Guest {
-            session: Session::new(&self.hub, client, self.options.session),
-            counts: Counts::default(),
-            ended: watch::Sender::new(None),
-            heard: Mutex::default(),
-            unread: Budget::new(self.options.unread_bytes_max),
-            incoming: Budget::new(self.options.incoming_bytes_max),
+        let session = Session::new(&self.hub, client.clone(), self.options.session);
+        let guest = Arc::new_cyclic(|guest| {
+            let watched =
+                watch_over(guest.clone(), self.access.clone(), client, self.stopping.clone());
+            Guest {
+                session: session.admitted_by(self.access.clone()),
+                connection: connection.waker(),
+                counts: Counts::default(),
+                ended: watch::Sender::new(None),
+                heard: Mutex::default(),
+                unread: Budget::new(self.options.unread_bytes_max),
+                incoming: Budget::new(self.options.incoming_bytes_max),
+                watcher: tokio::spawn(watched).abort_handle(),
+            }
         });
         known.push(Known { shown, guest: Arc::clone(&guest) });
-        tokio::spawn(watch_over(
-            Arc::downgrade(&guest),
-            Arc::clone(&self.access),
-            self.options.judge_interval,
-            self.stopping.clone(),
-        ));
         Ok(guest)
     }
-}
-
-fn now() -> UnixMillis {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    UnixMillis(since.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(u64::MAX)))
-}
-
-fn still_admits(access: &Access, client: &Client) -> Result<(), Denied> {
-    access.still_admits(client, now())
 }
 
 /// The token in a header.
@@ -152,25 +150,27 @@ fn bearer(header: &str) -> Option<&str> {
     (scheme.eq_ignore_ascii_case("bearer") && !token.is_empty()).then_some(token)
 }
 
-/// Ends a guest once it is not admitted any more, or once nobody is.
+/// Ends a guest the moment its right ends, or the front end stops. Ended itself with the guest.
 async fn watch_over(
     guest: Weak<Guest>,
-    access: Gate,
-    interval: Duration,
+    access: AccessWatch,
+    client: Client,
     mut stopping: watch::Receiver<bool>,
 ) {
-    loop {
-        let is_stopping = tokio::select! {
-            () = tokio::time::sleep(interval) => false,
-            _ = stopping.wait_for(|is_stopping| *is_stopping) => true,
-        };
-        let Some(guest) = guest.upgrade() else { return };
-        if is_stopping {
-            return guest.end_with(GatewayError::Stopping.into());
+    let denied = tokio::select! {
+        denied = access.until_denied(&client) => Some(denied),
+        _ = stopping.wait_for(|is_stopping| *is_stopping) => None,
+    };
+    // One that is being made is there in a moment, and one that goes ends this.
+    let guest = loop {
+        match guest.upgrade() {
+            Some(guest) => break guest,
+            None => tokio::task::yield_now().await,
         }
-        if let Err(why) = still_admits(&access(), guest.session.client()) {
-            return guest.end(why);
-        }
+    };
+    match denied {
+        Some(why) => guest.end(why),
+        None => guest.end_with(GatewayError::Stopping.into()),
     }
 }
 
@@ -197,6 +197,9 @@ pub(super) enum Taken {
 /// One credential on one connection.
 pub(super) struct Guest {
     pub(super) session: Session,
+    connection: WeakConnection,
+    /// The task that ends it with its right.
+    watcher: AbortHandle,
     counts: Counts,
     ended: watch::Sender<Option<Fault>>,
     /// Its subscriptions: each is held by a stream, which is not looked at while its client does not read.
@@ -216,6 +219,12 @@ pub(super) struct Place {
 impl Drop for Place {
     fn drop(&mut self) {
         self.guest.count(self.taken).0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Guest {
+    fn drop(&mut self) {
+        self.watcher.abort();
     }
 }
 
@@ -253,6 +262,7 @@ impl Guest {
     fn end_with(&self, why: Fault) {
         self.ended.send_replace(Some(why));
         std::mem::take(&mut *lock(&self.heard)).iter().for_each(SubscriptionEnd::end);
+        self.connection.wake();
     }
 
     fn has_ended(&self) -> bool {

@@ -3,9 +3,10 @@
 use std::fmt;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll};
 
+use futures_util::task::AtomicWaker;
 use sgc_trust::VerifiedPeer;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
@@ -22,17 +23,24 @@ struct Inner {
     is_encrypted: bool,
     certificate: Option<VerifiedPeer>,
     known: Mutex<Vec<Known>>,
+    /// Woken when somebody is admitted no more.
+    serving: AtomicWaker,
 }
 
 impl Connection {
     /// One from there.
     pub fn plain(peer: SocketAddr) -> Self {
-        Self(Arc::new(Inner { peer, is_encrypted: false, certificate: None, known: Mutex::default() }))
+        Self::new(peer, false, None)
     }
 
     /// One over TLS, with what the certificate of its client proves, if it showed one.
     pub fn encrypted(peer: SocketAddr, certificate: Option<VerifiedPeer>) -> Self {
-        Self(Arc::new(Inner { peer, is_encrypted: true, certificate, known: Mutex::default() }))
+        Self::new(peer, true, certificate)
+    }
+
+    fn new(peer: SocketAddr, is_encrypted: bool, certificate: Option<VerifiedPeer>) -> Self {
+        let (known, serving) = (Mutex::default(), AtomicWaker::new());
+        Self(Arc::new(Inner { peer, is_encrypted, certificate, known, serving }))
     }
 
     /// Who is at the other end.
@@ -50,14 +58,33 @@ impl Connection {
         self.0.certificate.as_ref()
     }
 
-    /// What the client is called that was admitted on it first, once one was.
-    pub(crate) fn admitted_name(&self) -> Option<Arc<str>> {
-        lock(&self.0.known).first().map(|known| known.client().name.clone())
+    /// What the client is called that was admitted on it first and is so still. The task is woken once nobody is.
+    pub(crate) fn poll_admitted(&self, cx: &mut Context<'_>) -> Option<Arc<str>> {
+        self.0.serving.register(cx.waker());
+        let known = lock(&self.0.known);
+        known.iter().find(|known| known.is_admitted()).map(|known| Arc::clone(&known.client().name))
+    }
+
+    /// What wakes the task that serves the connection.
+    pub(super) fn waker(&self) -> WeakConnection {
+        WeakConnection(Arc::downgrade(&self.0))
     }
 
     /// Who was admitted on it.
     pub(super) fn known(&self) -> &Mutex<Vec<Known>> {
         &self.0.known
+    }
+}
+
+/// A connection that somebody was admitted on, whether it is there still or not.
+pub(super) struct WeakConnection(Weak<Inner>);
+
+impl WeakConnection {
+    /// Has whoever serves it look who is admitted.
+    pub(super) fn wake(&self) {
+        if let Some(connection) = self.0.upgrade() {
+            connection.serving.wake();
+        }
     }
 }
 

@@ -1,8 +1,8 @@
 //! The gRPC front end: `sgc.gateway.v1`, with reflection and health beside it.
 //!
 //! [`Grpc`] serves streams of bytes that others have accepted, each with what is known of its other end ([`Connection`]).
-//! Whom it
-//! admits, [`Access`] decides, before anything of a request is read, and again and again while streams last. Each connection has one
+//! [`AccessWatch`] decides whom it admits, before anything of a request is read, and ends all that a client has when its right
+//! ends. Each connection has one
 //! [`Session`](crate::Session) for each credential that is shown on it, so bounds are those of a program, however many
 //! streams it has. Reflection and health tell nothing of the network and are for everybody who can connect.
 //!
@@ -49,7 +49,7 @@ use tonic::transport::Server;
 pub use connection::{Accepted, Connection};
 pub use fault::Fault;
 
-use crate::access::Access;
+use crate::access_watch::AccessWatch;
 use crate::hub::Hub;
 use crate::session::SessionLimits;
 use client::Clients;
@@ -89,8 +89,6 @@ pub struct GrpcOptions {
     /// Bytes of long messages that a client may send at a time, on all its streams: from the head of each until it is worked
     /// on. Streams that would send more are refused.
     pub incoming_bytes_max: usize,
-    /// How often it is looked whether clients are still admitted.
-    pub judge_interval: Duration,
 }
 
 impl Default for GrpcOptions {
@@ -99,7 +97,6 @@ impl Default for GrpcOptions {
             session: SessionLimits::default(),
             unread_bytes_max: 4 * MESSAGE_BYTES_MAX,
             incoming_bytes_max: 4 * MESSAGE_BYTES_MAX,
-            judge_interval: Duration::from_secs(1),
         }
     }
 }
@@ -112,11 +109,10 @@ pub struct Grpc {
 }
 
 impl Grpc {
-    /// One on a hub. `access` says whom it admits, as the configuration is at that moment: a client that it does not admit any
-    /// more loses its streams within [`GrpcOptions::judge_interval`].
-    pub fn new(hub: Hub, access: impl Fn() -> Access + Send + Sync + 'static, options: GrpcOptions) -> Self {
+    /// Serves a hub to those whom `access` admits. A client loses its streams the moment its right ends.
+    pub fn new(hub: Hub, access: AccessWatch, options: GrpcOptions) -> Self {
         let stopping = Arc::new(watch::Sender::new(false));
-        let clients = Arc::new(Clients::new(hub, Arc::new(access), options, stopping.subscribe()));
+        let clients = Arc::new(Clients::new(hub, access, options, stopping.subscribe()));
         Self { clients, stopping }
     }
 

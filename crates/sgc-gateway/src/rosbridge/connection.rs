@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
-use tokio::sync::{Notify, oneshot};
+use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
@@ -80,6 +80,8 @@ impl Patience {
 /// What one client has.
 pub(super) struct Connection {
     session: Arc<Session>,
+    /// Told of each session that the client has, one after the other.
+    sessions: watch::Sender<Arc<Session>>,
     options: Arc<RosbridgeOptions>,
     outbox: Outbox,
     is_admitted: bool,
@@ -127,6 +129,7 @@ impl Connection {
     pub(super) fn new(session: Arc<Session>, options: Arc<RosbridgeOptions>, outbox: Outbox) -> Self {
         let fragments = Fragments::new(options.message_bytes_max);
         Self {
+            sessions: watch::Sender::new(Arc::clone(&session)),
             session,
             is_admitted: !options.is_token_needed,
             options,
@@ -150,8 +153,9 @@ impl Connection {
         self.is_admitted
     }
 
-    pub(super) fn session(&self) -> &Session {
-        &self.session
+    /// The session that the client has, and those that it gets by saying who it is.
+    pub(super) fn sessions(&self) -> watch::Receiver<Arc<Session>> {
+        self.sessions.subscribe()
     }
 
     /// Does what a client asks for; only what ends the connection is an error.
@@ -262,6 +266,7 @@ impl Connection {
                 let who = format!("you are {}", client.name);
                 let is_as_before = client.scope == self.session.client().scope;
                 self.session = Arc::new(self.session.again(client));
+                self.sessions.send_replace(Arc::clone(&self.session));
                 self.is_admitted = true;
                 self.outbox.status(Level::Info, &who, op.id.as_ref()).await?;
                 Ok(self.end_what_is_not_permitted(is_as_before).await?)

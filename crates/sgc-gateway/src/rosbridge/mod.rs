@@ -24,16 +24,19 @@ use std::time::Duration;
 
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
 use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::watch;
 use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 
+use crate::access::Denied;
 use crate::session::Session;
+use crate::ws::close_reason;
 use connection::Connection;
 pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
-    ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions, StillAdmits,
+    ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
 use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
 
@@ -62,16 +65,22 @@ where
     let pulse = Pulse::default();
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
+    let denied = until_denied(connection.sessions());
     let ended = {
         let reading = read_all(&mut stream, &mut connection, &pulse, &options);
         let writing = write_all(&mut sink, &mut outgoing, &pulse, options.silence_max);
         tokio::select! {
+            biased;
+            denied = denied => Err(RosbridgeError::Denied(denied)),
             ended = reading => ended,
             error = writing => Err(error),
         }
     };
     drop(connection);
     if let Some((code, why)) = ended.as_ref().err().and_then(RosbridgeError::close) {
+        if matches!(ended, Err(RosbridgeError::Denied(_))) {
+            outgoing.clear();
+        }
         let farewell = farewell(&mut sink, &mut outgoing, code, why);
         let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
         // What the client sent meanwhile is taken from the socket, so that it hears this before the connection is gone.
@@ -81,16 +90,26 @@ where
     ended
 }
 
+/// Waits until the right of the client ends, whoever it has said to be meanwhile.
+async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denied {
+    loop {
+        let session = Arc::clone(&sessions.borrow_and_update());
+        tokio::select! {
+            denied = session.until_denied() => return denied,
+            changed = sessions.changed() => {
+                if changed.is_err() {
+                    return session.until_denied().await;
+                }
+            }
+        }
+    }
+}
+
 async fn farewell<W>(sink: &mut W, outgoing: &mut Outgoing, code: u16, why: String)
 where
     W: futures_util::Sink<Message, Error = tokio_tungstenite::tungstenite::Error> + Unpin,
 {
-    // A close frame has room for 123 bytes of words (RFC 6455, 5.5).
-    let mut end = why.len().min(123);
-    while !why.is_char_boundary(end) {
-        end -= 1;
-    }
-    let reason = why[..end].to_owned();
+    let reason = close_reason(&why).to_owned();
     if write_rest(sink, outgoing).await.is_ok() {
         let close = CloseFrame { code: code.into(), reason: reason.into() };
         let _ = sink.send(Message::Close(Some(close))).await;
@@ -121,7 +140,7 @@ where
                 tokio::select! {
                     message = stream.next() => message,
                     _ = looks.tick() => {
-                        look(connection, pulse, options)?;
+                        look(pulse, options)?;
                         continue;
                     }
                     () = tokio::time::sleep_until(begun + ROSBRIDGE_ADMISSION_MAX), if !connection.is_admitted() => {
@@ -151,14 +170,11 @@ fn ping_interval(silence_max: Duration) -> Duration {
     (silence_max / 4).max(PING_INTERVAL_MIN)
 }
 
-/// Whether the client is there, and may be.
-fn look(connection: &Connection, pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
-    if pulse.unanswered().is_some_and(|since| since.elapsed() >= options.silence_max) {
-        return Err(RosbridgeError::Silent(options.silence_max));
-    }
-    match &options.still_admits {
-        Some(still_admits) if connection.is_admitted() => {
-            still_admits(connection.session().client()).map_err(RosbridgeError::NotAdmitted)
+/// Whether the client is there.
+fn look(pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
+    match pulse.unanswered() {
+        Some(since) if since.elapsed() >= options.silence_max => {
+            Err(RosbridgeError::Silent(options.silence_max))
         }
         _ => Ok(()),
     }

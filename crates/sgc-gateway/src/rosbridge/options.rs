@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
-use crate::access::Client;
+use crate::access::{Client, Denied};
 
 /// Longest message that a client may send, bytes, in one frame or in fragments.
 pub const ROSBRIDGE_MESSAGE_BYTES_MAX: usize = 64 << 20;
@@ -20,8 +20,6 @@ pub const ROSBRIDGE_ADMISSION_MAX: Duration = Duration::from_secs(10);
 
 /// Says who a token is for; else why it is nobody's, in words for its user.
 pub type Authenticate = Arc<dyn Fn(&str) -> Result<Client, String> + Send + Sync>;
-/// Says whether a client that was admitted still is; else why not, in words for its user.
-pub type StillAdmits = Arc<dyn Fn(&Client) -> Result<(), String> + Send + Sync>;
 
 /// Bounds of a connection, and how its client says who it is.
 #[derive(Clone)]
@@ -36,8 +34,6 @@ pub struct RosbridgeOptions {
     pub authenticate: Option<Authenticate>,
     /// Whether nothing but `auth` is taken until a token was shown. The session that it came with is not used then.
     pub is_token_needed: bool,
-    /// Asked whenever the client is pinged.
-    pub still_admits: Option<StillAdmits>,
     /// What `/rosapi/get_ros_version` says.
     pub ros_distro: String,
 }
@@ -50,7 +46,6 @@ impl Default for RosbridgeOptions {
             call_max: ROSBRIDGE_CALL_MAX,
             authenticate: None,
             is_token_needed: false,
-            still_admits: None,
             ros_distro: "unknown".to_owned(),
         }
     }
@@ -96,6 +91,9 @@ pub enum RosbridgeError {
     /// It has not said who it is, not in time or not rightly.
     #[error("the client was not admitted: {0}")]
     NotAdmitted(String),
+    /// Its right has ended.
+    #[error("the client's right has ended: {0}")]
+    Denied(#[source] Denied),
 }
 
 impl RosbridgeError {
@@ -106,6 +104,7 @@ impl RosbridgeError {
             Self::TooLong { max } => (1009, format!("messages of {max} bytes at most")),
             Self::TooManyErrors => (1008, "too many errors".to_owned()),
             Self::NotAdmitted(why) => (1008, why.clone()),
+            Self::Denied(why) => (1008, why.told().to_owned()),
         })
     }
 

@@ -90,6 +90,16 @@ pub(super) struct Outgoing {
     batches: mpsc::Receiver<Vec<Frame>>,
 }
 
+impl Outgoing {
+    /// Forgets what waits to be said.
+    pub(super) fn clear(&mut self) {
+        self.batches.close();
+        self.control.close();
+        while self.batches.try_recv().is_ok() {}
+        while self.control.try_recv().is_ok() {}
+    }
+}
+
 /// The connection has ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Gone;

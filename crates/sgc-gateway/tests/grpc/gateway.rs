@@ -3,14 +3,15 @@
 #![allow(dead_code, reason = "each test program uses a part")]
 
 use std::net::SocketAddr;
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
 use sgc_gateway::grpc::{Accepted, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
-use sgc_gateway::{Access, AccessGrant, AccessRules, Anonymous, ClientRule, Scope, TokenId};
+use sgc_gateway::{
+    Access, AccessGrant, AccessRules, AccessWatch, Anonymous, ClientRule, Scope, TokenId, WallClock,
+};
 use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::UnixMillis;
 use tokio::net::TcpListener;
@@ -30,7 +31,7 @@ pub(crate) struct Gateway {
     pub(crate) grpc: Grpc,
     pub(crate) address: SocketAddr,
     pub(crate) serving: JoinHandle<()>,
-    access: Arc<Mutex<Access>>,
+    pub(crate) access: AccessWatch,
     identity: Identity,
     desk: Identity,
 }
@@ -62,16 +63,14 @@ impl Gateway {
     }
 
     pub(crate) async fn with(options: GrpcOptions) -> Self {
-        let options = GrpcOptions { judge_interval: Duration::from_millis(20), ..options };
         let site = Site::new().await;
         let mut rng = ChaCha20Rng::seed_from_u64(8);
         let began = UnixMillis(now().0 - 1000);
         let mut fleet = Fleet::create("lab".parse().unwrap(), began, &mut rng).unwrap();
         let identity = fleet.enroll(&EnrollRequest::new("robot".parse().unwrap(), began), &mut rng).unwrap();
         let desk = fleet.enroll(&EnrollRequest::new("desk".parse().unwrap(), began), &mut rng).unwrap();
-        let access = Arc::new(Mutex::new(Access::default()));
-        let present = Arc::clone(&access);
-        let grpc = Grpc::new(site.hub.clone(), move || present.lock().unwrap().clone(), options);
+        let access = AccessWatch::new(Access::default(), WallClock::system());
+        let grpc = Grpc::new(site.hub.clone(), access.clone(), options);
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let (send, accepted) = mpsc::channel(1);
@@ -92,7 +91,7 @@ impl Gateway {
 
     /// Has the gateway admit these from now on, and whoever has a token.
     pub(crate) fn admit(&self, anonymous: Anonymous) {
-        *self.access.lock().unwrap() = self.access_of(anonymous, Vec::new());
+        self.access.change(|_| self.access_of(anonymous, Vec::new()));
     }
 
     /// Access for these, for these nodes, and for whoever has a token.

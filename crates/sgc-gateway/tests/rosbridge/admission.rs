@@ -1,7 +1,6 @@
 //! Who a client is, and what it may do.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use serde_json::{Value as Json, json};
@@ -160,25 +159,6 @@ async fn who_says_nothing_is_not_waited_for() {
     let begun = tokio::time::Instant::now();
     assert_eq!(browser.closed().await.0, 1008);
     assert!(begun.elapsed() >= ROSBRIDGE_ADMISSION_MAX && begun.elapsed() < Duration::from_secs(15));
-}
-
-#[tokio::test]
-async fn who_is_admitted_no_more_is_disconnected() {
-    let site = Site::new().await;
-    tokio::time::pause();
-    let is_admitted = Arc::new(AtomicBool::new(true));
-    let still = Arc::clone(&is_admitted);
-    let options = RosbridgeOptions {
-        still_admits: Some(Arc::new(move |_: &Who| match still.load(Ordering::Relaxed) {
-            true => Ok(()),
-            false => Err("the token has expired".to_owned()),
-        })),
-        ..RosbridgeOptions::default()
-    };
-    let mut browser = pipe(site.session("partner"), options, 4096).await;
-    browser.settle().await;
-    is_admitted.store(false, Ordering::Relaxed);
-    assert_eq!(browser.closed().await, (1008, "the token has expired".into()));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

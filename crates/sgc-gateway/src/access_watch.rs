@@ -1,0 +1,72 @@
+//! [`AccessWatch`]: the rules in force, and the moment at which a client's right ends, whatever ends it: revocation, expiry, a
+//! reload, a certificate that was revoked.
+//!
+//! This is the only mechanism that ends sessions for their rights. Every protocol waits for it by
+//! [`Session::until_denied`](crate::Session::until_denied). Nothing is polled: rules tell that they changed, and a timer ends
+//! when a right does.
+
+use std::fmt;
+use std::sync::Arc;
+
+use sgc_wire::UnixMillis;
+use tokio::sync::watch;
+
+use crate::access::{Access, Client, Denied};
+use crate::clock::WallClock;
+
+/// The rules in force. Cloning shares.
+#[derive(Clone)]
+pub struct AccessWatch {
+    rules: Arc<watch::Sender<Access>>,
+    clock: WallClock,
+}
+
+impl fmt::Debug for AccessWatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("AccessWatch").field("clock", &self.clock).finish_non_exhaustive()
+    }
+}
+
+impl AccessWatch {
+    /// These rules, by that clock.
+    pub fn new(access: Access, clock: WallClock) -> Self {
+        Self { rules: Arc::new(watch::Sender::new(access)), clock }
+    }
+
+    /// The rules as they are now.
+    pub fn current(&self) -> Access {
+        self.rules.borrow().clone()
+    }
+
+    /// Other rules from now on: the sessions of clients that these do not admit end.
+    pub fn change(&self, change: impl FnOnce(&Access) -> Access) {
+        self.rules.send_modify(|access| *access = change(access));
+    }
+
+    /// The time by which rights end.
+    pub fn now(&self) -> UnixMillis {
+        self.clock.now()
+    }
+
+    /// Waits until a client's right ends, and says why it has.
+    pub async fn until_denied(&self, client: &Client) -> Denied {
+        let mut rules = self.rules.subscribe();
+        loop {
+            let current = rules.borrow_and_update().clone();
+            if let Err(denied) = current.still_admits(client, self.now()) {
+                return denied;
+            }
+            let expires = async {
+                match client.expires {
+                    Some(end) => self.clock.passes(end).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                // The sender is as old as this.
+                _ = rules.changed() => {}
+                () = expires => {}
+            }
+        }
+    }
+}

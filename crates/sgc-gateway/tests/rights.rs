@@ -1,0 +1,390 @@
+//! Sessions end the moment their right does, whatever protocol they speak and whatever ends the right: through a server's own
+//! sockets, with the libraries that programs use.
+#![allow(clippy::unwrap_used)]
+
+mod support;
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use futures_util::{SinkExt as _, StreamExt as _};
+use rand_chacha::ChaCha20Rng;
+use rand_chacha::rand_core::SeedableRng as _;
+use rustls::pki_types::ServerName;
+use rustls::{ClientConfig, RootCertStore};
+use serde_json::{Value as Json, json};
+use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
+use sgc_gateway::grpc::proto::{SubscribeRequest, SubscribeResponse, WatchGraphRequest};
+use sgc_gateway::{
+    Access, AccessGrant, AccessRules, Anonymous, ClientRule, ListenAt, Protocol, Scope, Server,
+    ServerOptions, SessionLimits, TokenId,
+};
+use sgc_ros::{RosWriter as _, SampleKind};
+use sgc_testkit::FakeWriter;
+use sgc_trust::{EnrollRequest, Fleet, Grantees, Identity};
+use sgc_wire::{Qos, UnixMillis};
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::{WebSocketStream, client_async};
+use tonic::{Code, Request, Status, Streaming};
+
+use support::{STRING, Site, eventually, string};
+
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Far less than any interval at which something could be polled that was not told, and enough for a loaded machine.
+const AT_ONCE: Duration = Duration::from_secs(3);
+const HOUR_MS: u64 = 3_600_000;
+
+fn now() -> UnixMillis {
+    UnixMillis(SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64)
+}
+
+async fn within<T>(work: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, work).await.expect("it should have come by now")
+}
+
+/// A gateway that admits nobody without a token or a certificate.
+struct Place {
+    site: Site,
+    server: Server,
+    fleet: Fleet,
+    robot: Identity,
+    desk: Identity,
+    rng: ChaCha20Rng,
+    _talker: FakeWriter,
+}
+
+impl Place {
+    async fn new() -> Self {
+        let (site, mut rng, began) = (Site::new().await, ChaCha20Rng::seed_from_u64(8), UnixMillis(now().0 - 1000));
+        let mut fleet = Fleet::create("lab".parse().unwrap(), began, &mut rng).unwrap();
+        let mut enroll = |name: &str| {
+            fleet.enroll(&EnrollRequest::new(name.parse().unwrap(), began), &mut rng).unwrap()
+        };
+        let (robot, desk) = (enroll("robot"), enroll("desk"));
+        let at = |protocol, is_encrypted| ListenAt { protocol, is_encrypted, addr: ([127, 0, 0, 1], 0).into() };
+        let options = ServerOptions {
+            name: "robot".into(),
+            listen: vec![
+                at(Protocol::WebSocket, false),
+                at(Protocol::Grpc, false),
+                at(Protocol::WebSocket, true),
+            ],
+            access: rules(&robot, &desk, &[]),
+            key: Some(robot.certified_key()),
+            clients_max: 64,
+            limits: SessionLimits::default(),
+        };
+        let server = Server::start(site.hub.clone(), options).await.unwrap();
+        let _talker = site.writer("/odom", Qos::default());
+        site.knows("/odom").await;
+        Self { site, server, fleet, robot, desk, rng, _talker }
+    }
+
+    fn addr(&self, at: usize) -> SocketAddr {
+        self.server.local()[at].addr
+    }
+
+    /// A token for `/odom` that ends then.
+    fn token(&self, number: u8, expires: UnixMillis) -> String {
+        let grant = AccessGrant {
+            id: TokenId([number; 16]),
+            gateway: self.robot.node_id(),
+            label: format!("token {number}"),
+            scope: Scope { subscribe: vec!["/odom".into()], ..Scope::default() },
+            issued: UnixMillis(now().0 - 1),
+            expires,
+        };
+        grant.sign(&self.robot).unwrap().to_text().to_string()
+    }
+
+    /// Takes these tokens back, as a reload after `sgc token revoke` does.
+    fn revoke(&self, numbers: &[u8]) {
+        let key = self.robot.certified_key();
+        self.server.reconfigure(rules(&self.robot, &self.desk, numbers), Some(&key)).unwrap();
+    }
+
+    async fn web_socket(&self, target: &str, subprotocol: Option<&str>) -> WebSocketStream<TcpStream> {
+        let stream = TcpStream::connect(self.addr(0)).await.unwrap();
+        let mut request = format!("ws://{}{target}", self.addr(0)).into_client_request().unwrap();
+        if let Some(name) = subprotocol {
+            request.headers_mut().insert("sec-websocket-protocol", name.parse().unwrap());
+        }
+        within(client_async(request, stream)).await.unwrap().0
+    }
+
+    /// A client of rosbridge that has shown its token within the session.
+    async fn rosbridge(&self, token: &str, first: &str) -> WebSocketStream<TcpStream> {
+        let mut socket = self.web_socket(&format!("/?token={first}"), None).await;
+        say(&mut socket, &json!({"op": "set_level", "level": "info"})).await;
+        say(&mut socket, &json!({"op": "auth", "token": token})).await;
+        while !hear(&mut socket).await["msg"].as_str().is_some_and(|said| said.starts_with("you are ")) {}
+        say(&mut socket, &json!({"op": "subscribe", "topic": "/odom", "type": STRING})).await;
+        socket
+    }
+
+    async fn foxglove(&self, token: &str) -> WebSocketStream<TcpStream> {
+        let mut socket = self.web_socket(&format!("/?token={token}"), Some("foxglove.sdk.v1")).await;
+        while hear(&mut socket).await["op"] != "advertise" {}
+        say(&mut socket, &json!({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1}]})).await;
+        socket
+    }
+
+    /// Two long streams of one client of gRPC.
+    async fn grpc(&self, token: &str) -> (Streaming<SubscribeResponse>, impl Future<Output = Status> + use<>) {
+        let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{}", self.addr(1))).unwrap();
+        let header: tonic::metadata::AsciiMetadataValue = format!("Bearer {token}").parse().unwrap();
+        let bearer = move |mut request: Request<()>| {
+            request.metadata_mut().insert("authorization", header.clone());
+            Ok(request)
+        };
+        let channel = within(endpoint.connect()).await.unwrap();
+        let mut client = GatewayClient::with_interceptor(channel, bearer);
+        let wanted = SubscribeRequest { topic: "/odom".into(), ..SubscribeRequest::default() };
+        let heard = within(client.subscribe(wanted)).await.unwrap().into_inner();
+        let mut graph = within(client.watch_graph(WatchGraphRequest::default())).await.unwrap().into_inner();
+        within(graph.message()).await.unwrap();
+        let watched = async move {
+            loop {
+                if let Err(ended) = graph.message().await {
+                    return ended;
+                }
+            }
+        };
+        (heard, watched)
+    }
+}
+
+fn rules(robot: &Identity, desk: &Identity, revoked: &[u8]) -> Access {
+    let scope = Scope { subscribe: vec!["/odom".into()], ..Scope::default() };
+    let who = Grantees { nodes: [desk.node_id()].into(), ..Grantees::default() };
+    Access::new(AccessRules {
+        anonymous: Anonymous::None,
+        clients: vec![ClientRule { who, scope }],
+        gateway: Some(robot.as_peer().clone()),
+        anchors: Some(robot.anchors().clone()),
+        revoked: revoked.iter().map(|number| TokenId([*number; 16])).collect::<BTreeSet<_>>(),
+        ..AccessRules::default()
+    })
+}
+
+async fn say<S>(socket: &mut WebSocketStream<S>, op: &Json)
+where
+    S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+{
+    within(socket.send(Message::text(op.to_string()))).await.unwrap();
+}
+
+async fn hear<S>(socket: &mut WebSocketStream<S>) -> Json
+where
+    S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+{
+    loop {
+        match within(socket.next()).await.unwrap().unwrap() {
+            Message::Text(text) => return serde_json::from_str(&text).unwrap(),
+            Message::Close(why) => panic!("closed: {why:?}"),
+            _ => {}
+        }
+    }
+}
+
+/// Waits for the end, and has the code and the reason.
+async fn close<S>(mut socket: WebSocketStream<S>) -> (u16, String)
+where
+    S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+{
+    loop {
+        match within(socket.next()).await.expect("a close frame comes first").unwrap() {
+            Message::Close(Some(why)) => return (why.code.into(), why.reason.to_string()),
+            Message::Close(None) => panic!("no reason was said"),
+            _ => {}
+        }
+    }
+}
+
+async fn end(mut heard: Streaming<SubscribeResponse>) -> Status {
+    loop {
+        match within(heard.message()).await {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("no reason was said"),
+            Err(status) => return status,
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_is_revoked_ends_sessions_of_all_protocols_at_once() {
+    let place = Place::new().await;
+    let ends = UnixMillis(now().0 + HOUR_MS);
+    let [first, second, other] = [1, 2, 3].map(|number| place.token(number, ends));
+    // One that came with another token than that which it shows within.
+    let rosbridge = place.rosbridge(&second, &first).await;
+    let foxglove = place.foxglove(&second).await;
+    let (heard, watched) = place.grpc(&second).await;
+    let mut stays = place.rosbridge(&other, &second).await;
+    eventually(|| place.server.status().clients.len() == 4).await;
+    // Also a client that never reads, whose way is full.
+    let (unread, _watched) = place.grpc(&second).await;
+    let mut number = 0;
+    let mut talk = |text: &str| {
+        number += 1;
+        place._talker.write(SampleKind::Write, number, string(text)).unwrap();
+    };
+    (0..200).for_each(|_| talk(&"x".repeat(50_000)));
+    let began = Instant::now();
+    place.revoke(&[2]);
+    let told = "not admitted: the token was revoked";
+    let rosbridge = tokio::spawn(close(rosbridge));
+    let foxglove = tokio::spawn(close(foxglove));
+    assert_eq!(rosbridge.await.unwrap(), (1008, told.to_owned()));
+    assert_eq!(foxglove.await.unwrap(), (1008, told.to_owned()));
+    for ended in [end(heard).await, within(watched).await] {
+        assert_eq!((ended.code(), ended.message()), (Code::Unauthenticated, told));
+    }
+    assert!(began.elapsed() < AT_ONCE, "{:?}", began.elapsed());
+    // What they had is gone, and so are they, whether they read that or not.
+    let names = || place.server.status().clients.into_iter().map(|client| client.name).collect::<Vec<_>>();
+    eventually(|| names() == ["token 3"]).await;
+    eventually(|| place.site.hub.readers() == 1).await;
+    drop(unread);
+    // Who has become another by another token stays, though the one that it came with was revoked.
+    talk("still here");
+    while hear(&mut stays).await["msg"]["data"] != "still here" {}
+    assert_eq!(place.server.status().refused["no longer admitted"], 4);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_token_that_expires_ends_sessions_of_all_protocols_in_that_moment() {
+    let place = Place::new().await;
+    let first = place.token(1, UnixMillis(now().0 + HOUR_MS));
+    let began = Instant::now();
+    let expires = UnixMillis(now().0 + 4000);
+    let second = place.token(2, expires);
+    let rosbridge = place.rosbridge(&second, &first).await;
+    let foxglove = place.foxglove(&second).await;
+    let (heard, watched) = place.grpc(&second).await;
+    assert!(began.elapsed() < Duration::from_secs(4), "the machine is too slow for this test");
+    let told = "not admitted: the token has ended";
+    let rosbridge = tokio::spawn(close(rosbridge));
+    let foxglove = tokio::spawn(close(foxglove));
+    let (heard, watched) = (end(heard).await, within(watched).await);
+    for ended in [heard, watched] {
+        assert_eq!((ended.code(), ended.message()), (Code::Unauthenticated, told));
+    }
+    assert_eq!(rosbridge.await.unwrap(), (1008, told.to_owned()));
+    assert_eq!(foxglove.await.unwrap(), (1008, told.to_owned()));
+    let over = now();
+    assert!(over > expires && over.0 < expires.0 + AT_ONCE.as_millis() as u64, "{over} {expires}");
+    assert!(place.server.status().clients.is_empty() || place.server.status().clients.len() == 1);
+    eventually(|| place.server.status().clients.is_empty()).await;
+}
+
+/// A client's TLS, which shows a certificate and believes that fleet.
+fn connector(own: Option<&Identity>, believed: &Identity) -> TlsConnector {
+    let mut roots = RootCertStore::empty();
+    believed.anchors().certificates().for_each(|ca| roots.add(ca.clone()).unwrap());
+    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+    let builder = ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(Anyone));
+    let config = match own {
+        Some(own) => builder.with_client_cert_resolver(Arc::new(rustls::sign::SingleCertAndKey::from(own.certified_key()))),
+        None => builder.with_no_client_auth(),
+    };
+    TlsConnector::from(Arc::new(config))
+}
+
+/// Believes any server: whom it shows is looked at by the tests.
+#[derive(Debug)]
+struct Anyone;
+
+impl rustls::client::danger::ServerCertVerifier for Anyone {
+    fn verify_server_cert(
+        &self,
+        _: &rustls::pki_types::CertificateDer<'_>,
+        _: &[rustls::pki_types::CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: rustls::pki_types::UnixTime,
+    ) -> Result<rustls::client::danger::ServerCertVerified, rustls::Error> {
+        Ok(rustls::client::danger::ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &rustls::pki_types::CertificateDer<'_>,
+        _: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        Ok(rustls::client::danger::HandshakeSignatureValid::assertion())
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        _: &[u8],
+        _: &rustls::pki_types::CertificateDer<'_>,
+        _: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        Ok(rustls::client::danger::HandshakeSignatureValid::assertion())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
+        rustls::crypto::aws_lc_rs::default_provider().signature_verification_algorithms.supported_schemes()
+    }
+}
+
+type Wss = WebSocketStream<tokio_rustls::client::TlsStream<TcpStream>>;
+
+impl Place {
+    async fn wss(&self, connector: &TlsConnector, token: Option<&str>) -> Wss {
+        let stream = TcpStream::connect(self.addr(2)).await.unwrap();
+        let name = ServerName::try_from("robot").unwrap();
+        let stream = within(connector.connect(name, stream)).await.unwrap();
+        let target = token.map(|token| format!("?token={token}")).unwrap_or_default();
+        let request = format!("wss://robot/{target}").into_client_request().unwrap();
+        within(client_async(request, stream)).await.unwrap().0
+    }
+}
+
+fn shown(socket: &Wss) -> Vec<rustls::pki_types::CertificateDer<'static>> {
+    socket.get_ref().get_ref().1.peer_certificates().unwrap().to_vec()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_certificate_that_is_revoked_ends_its_session_at_once() {
+    let mut place = Place::new().await;
+    let mut socket = place.wss(&connector(Some(&place.desk), &place.robot), None).await;
+    say(&mut socket, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
+    assert_eq!(hear(&mut socket).await["values"]["topics"], json!(["/odom"]));
+    let at = now();
+    place.fleet.revoke(&["desk".parse().unwrap()], at).unwrap();
+    let crl = place.fleet.revocation_list(at).unwrap();
+    let anchors = place.robot.anchors().with_crl(&crl, at).unwrap().unwrap();
+    let began = Instant::now();
+    place.server.set_anchors(anchors);
+    assert_eq!(close(socket).await, (1008, "not admitted: the certificate was revoked".to_owned()));
+    assert!(began.elapsed() < AT_ONCE);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_renewed_certificate_is_shown_to_new_connections_and_tokens_go_on() {
+    let mut place = Place::new().await;
+    let token = place.token(1, UnixMillis(now().0 + HOUR_MS));
+    let connector = connector(None, &place.robot);
+    let mut before = place.wss(&connector, Some(&token)).await;
+    assert_eq!(shown(&before), place.robot.chain());
+    let another = EnrollRequest::new("robot-2".parse().unwrap(), UnixMillis(now().0 - 1000));
+    let another = place.fleet.enroll(&another, &mut place.rng).unwrap();
+    assert!(place.server.show(&another.certified_key()).is_ok());
+    let after = place.wss(&connector, Some(&token)).await;
+    assert_eq!(shown(&after), another.chain());
+    // Who was there stays.
+    say(&mut before, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
+    assert_eq!(hear(&mut before).await["id"], "1");
+}
