@@ -1,5 +1,5 @@
-//! [`AccessWatch`]: the rules in force, and the moment at which a client's right ends, whatever ends it: revocation, expiry, a
-//! reload, a certificate that was revoked.
+//! [`AccessWatch`]: the rules in force, and the moment at which a client's right ends: by revocation, by expiry, by a reload, or by
+//! the revocation of a certificate.
 //!
 //! This is the only mechanism that ends sessions for their rights. Every protocol waits for it by
 //! [`Session::until_denied`](crate::Session::until_denied). Nothing is polled: rules tell that they changed, and a timer ends
@@ -28,22 +28,22 @@ impl fmt::Debug for AccessWatch {
 }
 
 impl AccessWatch {
-    /// These rules, by that clock.
+    /// Creates a watch of these rules, by that clock.
     pub fn new(access: Access, clock: WallClock) -> Self {
         Self { rules: Arc::new(watch::Sender::new(access)), clock }
     }
 
-    /// The rules as they are now.
+    /// Returns the rules as they are now.
     pub fn current(&self) -> Access {
         self.rules.borrow().clone()
     }
 
-    /// Other rules from now on: the sessions of clients that these do not admit end.
+    /// Replaces the rules. Sessions of clients that the new rules do not admit end.
     pub fn change(&self, change: impl FnOnce(&Access) -> Access) {
         self.rules.send_modify(|access| *access = change(access));
     }
 
-    /// The time by which rights end.
+    /// Returns the time by which rights end.
     pub fn now(&self) -> UnixMillis {
         self.clock.now()
     }

@@ -23,6 +23,7 @@ use crate::error::GatewayError;
 use crate::feed::Subscription;
 use crate::hub::{Shared, lock};
 use crate::publisher::Publication;
+use crate::quota::{Charge, Quota, Resource};
 use crate::service::{Caller, Replier, Request, Serving};
 use crate::session::{Session, Subscribe};
 use crate::types::InterfaceType;
@@ -116,6 +117,8 @@ pub struct Goal {
     id: GoalId,
     result: Arc<Layout>,
     get_result: Arc<Caller>,
+    quota: Quota,
+    _charge: Arc<Charge>,
 }
 
 /// What a server tells of a goal while it works on it.
@@ -154,6 +157,8 @@ impl Session {
     ) -> Result<(Goal, Feedback), GatewayError> {
         self.check(Right::Call, action)?;
         let of = self.action_type(action, type_name)?;
+        let charge = self.quota().take(Resource::Calls, self.limits())?;
+        let quota = self.quota().clone();
         let shared = &self.hub().shared;
         let (name, service) = (of.clone(), action.to_owned());
         let (layouts, send, get_result) = shared
@@ -179,7 +184,7 @@ impl Session {
         let goal = goal.value(&layouts.goal)?;
         let request = record([("goal_id", uuid(&id)), ("goal", goal)]);
         let payload = write(&send.halves.request, &request, Form::Cdr)?;
-        let reply = send.call(payload, ANSWER_MAX).await?;
+        let reply = send.call(payload, ANSWER_MAX, &quota).await?;
         let reply = send.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
         if reply.at("accepted") != Some(Value::Bool(true)) {
             return Err(GatewayError::GoalRejected { name: action.to_owned() });
@@ -191,6 +196,8 @@ impl Session {
             id,
             result: layouts.result,
             get_result,
+            quota,
+            _charge: Arc::new(charge),
         };
         Ok((goal, feedback))
     }
@@ -203,7 +210,8 @@ impl Session {
     ) -> Result<ActionServing, GatewayError> {
         self.check(Right::Serve, action)?;
         let of = self.action_type(action, type_name)?;
-        ActionServing::new(&self.hub().shared, action, &of).await
+        let charge = self.quota().take(Resource::Servings, self.limits())?;
+        ActionServing::new(&self.hub().shared, action, &of, (self.quota().clone(), charge)).await
     }
 }
 
@@ -217,7 +225,7 @@ impl Goal {
     pub async fn outcome(&self, form: Form, max: Duration) -> Result<Outcome, GatewayError> {
         let request = record([("goal_id", uuid(&self.id))]);
         let payload = write(&self.get_result.halves.request, &request, Form::Cdr)?;
-        let reply = self.get_result.call(payload, max).await?;
+        let reply = self.get_result.call(payload, max, &self.quota).await?;
         aside_if_long(reply.len(), || {
             let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
             let status = GoalStatus::of(integer(&reply, "status"));
@@ -234,7 +242,7 @@ impl Goal {
         let info = record([("goal_id", uuid(&self.id)), ("stamp", stamp(0))]);
         let request = record([("goal_info", info)]);
         let payload = write(&caller.halves.request, &request, Form::Cdr)?;
-        let reply = caller.call(payload, ANSWER_MAX).await?;
+        let reply = caller.call(payload, ANSWER_MAX, &self.quota).await?;
         let reply = caller.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
         Ok(match integer(&reply, "return_code") {
             0 => CancelAnswer::Taken,
@@ -355,20 +363,27 @@ struct Served {
 }
 
 impl ActionServing {
-    async fn new(shared: &Arc<Shared>, action: &str, of: &str) -> Result<Self, GatewayError> {
+    async fn new(
+        shared: &Arc<Shared>,
+        action: &str,
+        of: &str,
+        (quota, charge): (Quota, Charge),
+    ) -> Result<Self, GatewayError> {
         let name = of.to_owned();
         let layouts = shared.run(move |shared| Layouts::find(shared, &name)).await?;
         let part = |part: &str| format!("{action}/_action/{part}");
-        let goals = Serving::new(shared, part("send_goal"), format!("{of}_SendGoal")).await?;
-        let results = Serving::new(shared, part("get_result"), format!("{of}_GetResult")).await?;
-        let cancels =
-            Serving::new(shared, part("cancel_goal"), "action_msgs/srv/CancelGoal".to_owned()).await?;
+        let goals = Serving::new(shared, part("send_goal"), format!("{of}_SendGoal"), Some(charge)).await?;
+        let results = Serving::new(shared, part("get_result"), format!("{of}_GetResult"), None).await?;
+        let cancel_type = "action_msgs/srv/CancelGoal".to_owned();
+        let cancels = Serving::new(shared, part("cancel_goal"), cancel_type, None).await?;
         let feedback_type = format!("{of}_FeedbackMessage");
-        let feedback = Publication::new(shared, part("feedback"), feedback_type, Qos::default()).await?;
+        let feedback =
+            Publication::new(shared, part("feedback"), feedback_type, Qos::default(), (quota.clone(), None))
+                .await?;
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
-        let status = Publication::new(shared, part("status"), status_type, latched).await?;
+        let status = Publication::new(shared, part("status"), status_type, latched, (quota, None)).await?;
         let server = Arc::new(ActionServer {
             action: action.to_owned(),
             layouts,

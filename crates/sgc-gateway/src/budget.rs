@@ -6,15 +6,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::error::GatewayError;
+use crate::quota::{Permits, Quota};
 
 /// Messages up to that length need no room, since they are counted; that of longer ones is in multiples of it.
-const UNIT_BYTES: usize = 64 << 10;
+pub(crate) const UNIT_BYTES: usize = 64 << 10;
 
 /// Room for long messages.
 #[derive(Debug)]
 pub(crate) struct Budget {
     room: Arc<Semaphore>,
     units: usize,
+    /// The bounds that the client shares with others.
+    quota: Quota,
     /// Of replies that are there, and wait for room.
     waiting_units: AtomicUsize,
 }
@@ -30,12 +33,15 @@ impl Drop for Waits<'_> {
 
 /// What a message takes of it, until it is dropped.
 #[derive(Debug)]
-pub(crate) struct Room(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit);
+pub(crate) struct Room(
+    #[expect(dead_code, reason = "they are for their end")] (OwnedSemaphorePermit, Permits),
+);
 
 impl Budget {
-    pub(crate) fn new(bytes_max: usize) -> Self {
+    /// Creates room for so many bytes of one client, within its quota.
+    pub(crate) fn new(bytes_max: usize, quota: Quota) -> Self {
         let units = (bytes_max / UNIT_BYTES).clamp(1, Semaphore::MAX_PERMITS);
-        Self { room: Arc::new(Semaphore::new(units)), units, waiting_units: AtomicUsize::new(0) }
+        Self { room: Arc::new(Semaphore::new(units)), units, quota, waiting_units: AtomicUsize::new(0) }
     }
 
     /// Waits for room for a message; one that is longer than all there is waits for all. Short ones need none.
@@ -44,7 +50,8 @@ impl Budget {
             return None;
         }
         let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
-        Arc::clone(&self.room).acquire_many_owned(units).await.ok().map(Room)
+        let own = Arc::clone(&self.room).acquire_many_owned(units).await.ok()?;
+        Some(Room((own, self.quota.room(units).await?)))
     }
 
     /// The same for a reply, which nobody holds back while it waits: of those no more wait than there is room in all.
@@ -70,9 +77,11 @@ impl Budget {
         let units = u32::try_from(self.units_of(bytes)).unwrap_or(u32::MAX);
         let taken = Arc::clone(&self.room).try_acquire_many_owned(units);
         let max = self.units * UNIT_BYTES;
-        taken
-            .map(|room| Some(Room(room)))
-            .map_err(|_| GatewayError::TooMany { what: "bytes of requests that come or are worked on", max })
+        let own = taken.map_err(|_| GatewayError::TooMany {
+            what: "bytes of requests that come or are worked on",
+            max,
+        })?;
+        Ok(Some(Room((own, self.quota.room_at_once(units)?))))
     }
 
     fn units_of(&self, bytes: usize) -> usize {
@@ -88,7 +97,8 @@ mod tests {
 
     #[tokio::test]
     async fn long_messages_wait_for_room_and_short_ones_do_not() {
-        let budget = Budget::new(1 << 20);
+        let quotas: Arc<crate::quota::Quotas> = Arc::default();
+        let budget = Budget::new(1 << 20, quotas.quota(&crate::access::Client::own("test")));
         let first = budget.take(900 << 10).await.unwrap();
         assert!(budget.take(1000).await.is_none());
         let waits = tokio::time::timeout(Duration::from_millis(20), budget.take(200 << 10)).await;

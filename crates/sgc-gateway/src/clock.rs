@@ -17,7 +17,7 @@ use tokio::task::AbortHandle;
 
 /// Longest sleep, where the system says when the clock is set. A longer wait is several sleeps.
 const SLEEP_MAX: Duration = Duration::from_secs(86_400);
-/// The same where the system does not say so: a clock that was set is noticed this late.
+/// Longest sleep where the system does not say so: a clock that was set is noticed this late.
 const SLEEP_BLIND_MAX: Duration = Duration::from_secs(60);
 /// Seconds from the epoch at which the timer would end that hears of the clock: about the year 5138.
 const NEVER_SECS: i64 = 100_000_000_000;
@@ -28,7 +28,7 @@ type Now = Arc<dyn Fn() -> UnixMillis + Send + Sync>;
 #[derive(Clone)]
 pub struct WallClock {
     now: Now,
-    /// Changes whenever the clock was set; none if nobody says so.
+    /// Changes whenever somebody sets the clock; none if the system does not say so.
     sets: Option<watch::Receiver<u64>>,
     _listener: Option<Arc<Listener>>,
 }
@@ -49,7 +49,7 @@ impl fmt::Debug for WallClock {
 }
 
 impl WallClock {
-    /// The system's clock. Has to be called within a runtime.
+    /// Returns the system's clock. Needs a runtime.
     pub fn system() -> Self {
         let (set, sets) = watch::channel(0);
         let heard = sets_of_the_system();
@@ -71,7 +71,7 @@ impl WallClock {
         Self { now: Arc::new(now), sets, _listener }
     }
 
-    /// A clock that shows `now`; `sets` changes whenever it was set.
+    /// Creates a clock that shows `now`; `sets` changes whenever somebody sets it.
     pub fn new(
         now: impl Fn() -> UnixMillis + Send + Sync + 'static,
         sets: Option<watch::Receiver<u64>>,
@@ -79,7 +79,7 @@ impl WallClock {
         Self { now: Arc::new(now), sets, _listener: None }
     }
 
-    /// What it shows.
+    /// Returns the time that it shows.
     pub fn now(&self) -> UnixMillis {
         (self.now)()
     }
@@ -138,7 +138,7 @@ async fn next_set(timer: &Receiver) -> io::Result<()> {
     }
 }
 
-/// What the system's clock shows.
+/// Returns the time of the system's clock.
 fn now() -> UnixMillis {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     UnixMillis(since.map_or(0, |since| since.as_millis().try_into().unwrap_or(u64::MAX)))

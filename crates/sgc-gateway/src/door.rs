@@ -2,26 +2,35 @@
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll};
+use std::time::Instant;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_trust::{TrustAnchors, VerifiedPeer};
+use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors, VerifiedPeer};
 use sgc_wire::UnixMillis;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
-use crate::access::{Access, Admission, Client, Denied};
+use crate::access::{Access, Admission, Client, Credential, Denied};
 use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
+use crate::error::GatewayError;
 use crate::hub::lock;
+use crate::quota::Pool;
 
 /// Connections of other hosts that may be in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
-/// The same of one of them.
+/// Handshakes of one source: an IPv4 address, or an IPv6 network.
 const HANDSHAKES_OF_HOST_MAX: usize = 16;
 /// The same of programs of this host: nobody else takes these.
 const HANDSHAKES_LOCAL_MAX: usize = 128;
+/// Part of the places of clients that is kept for programs of this host.
+const LOCAL_PART: usize = 8;
+/// Part of those of other hosts' clients that one credential may have.
+const CREDENTIAL_PART: usize = 4;
 /// Longest token that is looked at, bytes.
 const TOKEN_BYTES_MAX: usize = 32 << 10;
 
@@ -64,10 +73,18 @@ pub(crate) struct Arrival {
 #[derive(Debug)]
 pub(crate) struct Door {
     access: AccessWatch,
-    clients: Mutex<BTreeMap<u64, ClientStatus>>,
+    clients: Mutex<BTreeMap<u64, Entered>>,
     refused: Mutex<BTreeMap<&'static str, u64>>,
     next: AtomicU64,
     clients_max: usize,
+}
+
+/// A client that has a place.
+#[derive(Debug)]
+struct Entered {
+    status: ClientStatus,
+    credential: Option<Credential>,
+    is_local: bool,
 }
 
 /// A place at the gateway; free again when dropped.
@@ -75,6 +92,23 @@ pub(crate) struct Door {
 pub(crate) struct Place {
     door: Arc<Door>,
     number: u64,
+}
+
+impl Place {
+    /// Gives the place to another client, unless the places of that client's credential are taken.
+    pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
+        let mut clients = lock(&self.door.clients);
+        if let Err(pool) = self.door.check_places(&clients, client, Some(self.number)) {
+            drop(clients);
+            self.door.count(no_place(pool));
+            return Err(GatewayError::Crowded { what: "clients", max: self.door.places_max(pool), pool });
+        }
+        if let Some(entered) = clients.get_mut(&self.number) {
+            entered.status.name = client.name.to_string();
+            (entered.credential, entered.is_local) = (client.credential(), client.is_local());
+        }
+        Ok(())
+    }
 }
 
 impl Drop for Place {
@@ -90,7 +124,7 @@ impl Door {
         Arc::new(Self { access, clients, refused, next, clients_max })
     }
 
-    /// The rules in force.
+    /// Returns the rules in force.
     pub(crate) fn rules(&self) -> &AccessWatch {
         &self.access
     }
@@ -137,22 +171,68 @@ impl Door {
     }
 
     /// A place for a client, if there is one.
-    pub(crate) fn enter(self: &Arc<Self>, name: &str, protocol: &str, peer: SocketAddr) -> Option<Place> {
+    pub(crate) fn enter(
+        self: &Arc<Self>,
+        client: &Client,
+        protocol: &str,
+        peer: SocketAddr,
+    ) -> Option<Place> {
+        let number = self.next.fetch_add(1, Ordering::Relaxed);
         let mut clients = lock(&self.clients);
-        if clients.len() >= self.clients_max {
+        if let Err(pool) = self.check_places(&clients, client, None) {
             drop(clients);
-            self.count("too many clients");
+            self.count(no_place(pool));
             return None;
         }
-        let number = self.next.fetch_add(1, Ordering::Relaxed);
-        let (name, protocol) = (name.to_owned(), protocol.to_owned());
-        let status = ClientStatus { name, protocol, address: peer.to_string(), since: now().0 };
-        clients.insert(number, status);
+        let status = ClientStatus {
+            name: client.name.to_string(),
+            protocol: protocol.to_owned(),
+            address: peer.to_string(),
+            since: now().0,
+        };
+        clients
+            .insert(number, Entered { status, credential: client.credential(), is_local: client.is_local() });
+        drop(clients);
         Some(Place { door: Arc::clone(self), number })
     }
 
+    /// Returns the number of places that the clients of a pool have.
+    fn places_max(&self, pool: Pool) -> usize {
+        let remote = (self.clients_max - self.clients_max / LOCAL_PART).max(1);
+        match pool {
+            Pool::Total => self.clients_max,
+            Pool::Remote => remote,
+            Pool::Credential => (remote / CREDENTIAL_PART).max(1),
+        }
+    }
+
+    /// Refuses a client if the places of its credential, of other hosts or of all are taken. `except` is the place that it
+    /// has already.
+    fn check_places(
+        &self,
+        clients: &BTreeMap<u64, Entered>,
+        client: &Client,
+        except: Option<u64>,
+    ) -> Result<(), Pool> {
+        let count = |is_counted: &dyn Fn(&Entered) -> bool| {
+            let others = clients.iter().filter(|(number, _)| Some(**number) != except);
+            others.filter(|(_, entered)| is_counted(entered)).count()
+        };
+        if count(&|_| true) >= self.clients_max {
+            return Err(Pool::Total);
+        }
+        if !client.is_local() && count(&|entered| !entered.is_local) >= self.places_max(Pool::Remote) {
+            return Err(Pool::Remote);
+        }
+        let own = client.credential().filter(|credential| *credential != Credential::Local);
+        if own.is_some() && count(&|entered| entered.credential == own) >= self.places_max(Pool::Credential) {
+            return Err(Pool::Credential);
+        }
+        Ok(())
+    }
+
     pub(crate) fn clients(&self) -> Vec<ClientStatus> {
-        lock(&self.clients).values().cloned().collect()
+        lock(&self.clients).values().map(|entered| entered.status.clone()).collect()
     }
 
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
@@ -164,58 +244,119 @@ impl Door {
     }
 }
 
-/// How many connections have not shown yet who they are: of this host, of others, and of each of those.
+/// Returns the name under which a refusal for want of a place is counted.
+fn no_place(pool: Pool) -> &'static str {
+    match pool {
+        Pool::Credential => "too many clients of one credential",
+        Pool::Remote => "too many clients of other hosts",
+        Pool::Total => "too many clients",
+    }
+}
+
+/// Connections that have not shown yet who they are: of this host, and of others, where the heaviest source gives way.
 #[derive(Debug)]
 pub(crate) struct Handshakes {
     local: Arc<Semaphore>,
-    others: Arc<Semaphore>,
-    of_host: Mutex<BTreeMap<IpAddr, usize>>,
+    others: Mutex<Places<Holder>>,
+    next: AtomicU64,
+}
+
+/// A handle by which a handshake of another host is ended.
+#[derive(Debug)]
+struct Holder {
+    number: u64,
+    /// `true` once bytes have come.
+    is_engaged: Arc<AtomicBool>,
+    /// Tells by its end that another handshake has the place.
+    _evict: oneshot::Sender<()>,
 }
 
 /// One connection of these, until dropped.
 #[derive(Debug)]
 pub(crate) struct Handshake {
     handshakes: Arc<Handshakes>,
-    /// Whose, if not this host's.
-    host: Option<IpAddr>,
-    _permit: OwnedSemaphorePermit,
+    place: HandshakePlace,
+}
+
+/// A flag that says whether bytes have come in a handshake.
+#[derive(Debug)]
+pub(crate) struct Engagement(Arc<AtomicBool>);
+
+impl Engagement {
+    /// Says that they have: the handshake keeps its place for a moment longer.
+    pub(crate) fn begin(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+#[derive(Debug)]
+enum HandshakePlace {
+    /// One of this host's.
+    Local(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit),
+    /// One of the others'.
+    Other { number: u64, is_engaged: Arc<AtomicBool>, evicted: oneshot::Receiver<()> },
 }
 
 impl Default for Handshakes {
     fn default() -> Self {
-        let [local, others] = [HANDSHAKES_LOCAL_MAX, HANDSHAKES_MAX].map(|max| Arc::new(Semaphore::new(max)));
-        Self { local, others, of_host: Mutex::default() }
+        let limits = PlaceLimits { all: HANDSHAKES_MAX, per_prefix: HANDSHAKES_OF_HOST_MAX };
+        let local = Arc::new(Semaphore::new(HANDSHAKES_LOCAL_MAX));
+        Self { local, others: Mutex::new(Places::new(limits)), next: AtomicU64::new(0) }
     }
 }
 
 impl Handshakes {
-    /// Counts one from there, unless there are too many.
+    /// Counts one from there, unless there are too many and none gives way.
     pub(crate) fn begin(this: &Arc<Self>, from: IpAddr) -> Option<Handshake> {
-        let from = from.to_canonical();
         let handshakes = Arc::clone(this);
-        if from.is_loopback() {
-            let _permit = Arc::clone(&this.local).try_acquire_owned().ok()?;
-            return Some(Handshake { handshakes, host: None, _permit });
+        if from.to_canonical().is_loopback() {
+            let permit = Arc::clone(&this.local).try_acquire_owned().ok()?;
+            return Some(Handshake { handshakes, place: HandshakePlace::Local(permit) });
         }
-        let mut of_host = lock(&this.of_host);
-        if of_host.get(&from).is_some_and(|count| *count >= HANDSHAKES_OF_HOST_MAX) {
+        let (prefix, now) = (AddressPrefix::from(from), Instant::now());
+        let mut others = lock(&this.others);
+        let room = others.make_room(prefix, now, |holder| holder.is_engaged.load(Ordering::Relaxed));
+        // One that gives way ends with what it held.
+        if matches!(room, PlaceDecision::Refuse(_)) {
             return None;
         }
-        let _permit = Arc::clone(&this.others).try_acquire_owned().ok()?;
-        *of_host.entry(from).or_default() += 1;
-        Some(Handshake { handshakes, host: Some(from), _permit })
+        let (evict, evicted) = oneshot::channel();
+        let (number, is_engaged) = (this.next.fetch_add(1, Ordering::Relaxed), Arc::<AtomicBool>::default());
+        let holder = Holder { number, is_engaged: Arc::clone(&is_engaged), _evict: evict };
+        others.take(prefix, now, holder);
+        drop(others);
+        let place = HandshakePlace::Other { number, is_engaged, evicted };
+        Some(Handshake { handshakes, place })
+    }
+}
+
+impl Handshake {
+    /// Returns the flag by which the reader says that bytes have come.
+    pub(crate) fn engagement(&self) -> Engagement {
+        Engagement(match &self.place {
+            HandshakePlace::Local(_) => Arc::default(),
+            HandshakePlace::Other { is_engaged, .. } => Arc::clone(is_engaged),
+        })
+    }
+
+    /// Is ready once another handshake has its place.
+    pub(crate) fn poll_evicted(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        match &mut self.place {
+            HandshakePlace::Local(_) => Poll::Pending,
+            HandshakePlace::Other { evicted, .. } => Pin::new(evicted).poll(cx).map(drop),
+        }
+    }
+
+    /// Waits until another handshake has its place.
+    pub(crate) async fn evicted(&mut self) {
+        std::future::poll_fn(|cx| self.poll_evicted(cx)).await;
     }
 }
 
 impl Drop for Handshake {
     fn drop(&mut self) {
-        let Some(host) = self.host else { return };
-        let mut of_host = lock(&self.handshakes.of_host);
-        let left = of_host.get(&host).map_or(0, |count| count.saturating_sub(1));
-        if left == 0 {
-            of_host.remove(&host);
-        } else {
-            of_host.insert(host, left);
+        if let HandshakePlace::Other { number, .. } = &self.place {
+            lock(&self.handshakes.others).retain(|holder| holder.number != *number);
         }
     }
 }
@@ -228,27 +369,69 @@ pub(crate) fn now() -> UnixMillis {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::access::{AccessRules, Anonymous};
+
+    fn client(access: &Access, peer: SocketAddr) -> Client {
+        let admission =
+            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now: now() };
+        access.admit(&admission).unwrap()
+    }
 
     #[test]
     fn silent_hosts_lock_out_neither_others_nor_programs_of_this_one() {
         let handshakes: Arc<Handshakes> = Arc::default();
-        let host = |n: u8| IpAddr::from([192, 0, 2, n]);
-        let begin = |from| Handshakes::begin(&handshakes, from);
-        let mut held: Vec<_> = std::iter::from_fn(|| begin(host(1))).collect();
-        assert_eq!(held.len(), HANDSHAKES_OF_HOST_MAX);
-        held.pop();
-        held.push(begin("::ffff:192.0.2.1".parse().unwrap()).unwrap());
-        assert!(begin(host(1)).is_none());
-        for n in 2.. {
-            let of_host: Vec<_> = std::iter::from_fn(|| begin(host(n))).collect();
-            if of_host.is_empty() {
-                break;
+        let begin = |from: IpAddr| Handshakes::begin(&handshakes, from);
+        // A host of IPv6 has as many addresses as it likes: it is one source, and displaces itself alone.
+        let host = |n: u128| IpAddr::from(std::net::Ipv6Addr::from_bits(0x2001_0db8 << 96 | n));
+        let silent: Vec<_> = (0..1000).map(|n| begin(host(n)).unwrap()).collect();
+        assert_eq!(lock(&handshakes.others).len(), HANDSHAKES_OF_HOST_MAX);
+        // Those who do more than connect are not displaced at once, not by others of the same address either.
+        silent.iter().for_each(|handshake| handshake.engagement().begin());
+        assert!(begin(host(1001)).is_none());
+        let mut honest = begin([192, 0, 2, 7].into()).unwrap();
+        honest.engagement().begin();
+        // Many networks, of which each has all that it may: the heaviest makes room, and not who has one.
+        let mut held = Vec::new();
+        for network in 1..=20u128 {
+            for n in 0..HANDSHAKES_OF_HOST_MAX as u128 {
+                held.extend(begin(host(network << 64 | n)));
             }
-            held.extend(of_host);
         }
-        assert_eq!(held.len(), HANDSHAKES_MAX);
+        assert_eq!(lock(&handshakes.others).len(), HANDSHAKES_MAX);
+        let _late = begin([192, 0, 2, 8].into()).unwrap();
+        assert_eq!(lock(&handshakes.others).len(), HANDSHAKES_MAX);
+        let waker = futures_util::task::noop_waker();
+        assert!(honest.poll_evicted(&mut Context::from_waker(&waker)).is_pending());
         assert!(begin([127, 0, 0, 1].into()).is_some() && begin("::1".parse().unwrap()).is_some());
-        held.clear();
-        assert!(begin(host(200)).is_some() && lock(&handshakes.of_host).is_empty());
+        drop((silent, held, honest, _late));
+        assert!(lock(&handshakes.others).is_empty());
+    }
+
+    #[tokio::test]
+    async fn one_credential_and_other_hosts_leave_places() {
+        let all = || Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
+        let (access, door) = (all(), Door::new(all(), 64));
+        let enter = |peer: &str| {
+            let peer = peer.parse().unwrap();
+            door.enter(&client(&access, peer), "rosbridge", peer)
+        };
+        // Of 64 places 8 are kept for this host, and one credential has a quarter of the others.
+        let mut held: Vec<_> = std::iter::from_fn(|| enter("[2001:db8::1]:1")).collect();
+        assert_eq!(held.len(), 14);
+        assert!(enter("[2001:db8::2]:1").is_none(), "it is the same host");
+        for n in 1..=4 {
+            held.extend(std::iter::from_fn(|| enter(&format!("10.0.0.{n}:1"))));
+        }
+        assert_eq!(held.len(), 56);
+        let local: Vec<_> = std::iter::from_fn(|| enter("127.0.0.1:1")).collect();
+        assert_eq!(local.len(), 8);
+        let counted = door.refused();
+        assert!(counted["too many clients of one credential"] >= 2, "{counted:?}");
+        assert!(counted["too many clients of other hosts"] >= 1, "{counted:?}");
+        assert_eq!(counted["too many clients"], 1);
+        drop(local);
+        assert!(enter("10.0.0.9:1").is_none() && enter("127.0.0.1:1").is_some());
+        held.pop();
+        assert!(enter("10.0.0.9:1").is_some());
     }
 }

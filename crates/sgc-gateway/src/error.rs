@@ -4,6 +4,7 @@ use sgc_cdr::{DecodeError, TypeError, ValueError};
 use sgc_ros::RosError;
 
 use crate::access::Right;
+use crate::quota::Pool;
 
 /// Why a client does not get what it asks for.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -81,6 +82,22 @@ pub enum GatewayError {
         /// The bound.
         max: usize,
     },
+    /// Clients that share a bound have reached it.
+    #[error("{max} {what} at most for {pool}")]
+    Crowded {
+        /// Of what.
+        what: &'static str,
+        /// The bound.
+        max: usize,
+        /// Whose it is.
+        pool: Pool,
+    },
+    /// Nothing in the client's view of the graph has the type, whether there is such a type or not.
+    #[error("nothing that this client may use has type {name}")]
+    TypeNotSeen {
+        /// The type.
+        name: String,
+    },
     /// Something is asked for twice.
     #[error("{name} is {what} by this client already")]
     Twice {
@@ -155,9 +172,12 @@ impl GatewayError {
             Self::Name { .. } | Self::TypeName { .. } | Self::OtherType { .. } | Self::Value(_) => {
                 ErrorKind::Invalid
             }
-            Self::TypeUnknown { .. } | Self::Definition(_) | Self::NotThere { .. } => ErrorKind::NotFound,
+            Self::TypeUnknown { .. }
+            | Self::TypeNotSeen { .. }
+            | Self::Definition(_)
+            | Self::NotThere { .. } => ErrorKind::NotFound,
             Self::Denied { .. } | Self::OtherClient { .. } => ErrorKind::Denied,
-            Self::TooLong { .. } | Self::TooMany { .. } => ErrorKind::Exhausted,
+            Self::TooLong { .. } | Self::TooMany { .. } | Self::Crowded { .. } => ErrorKind::Exhausted,
             Self::Twice { .. } => ErrorKind::Exists,
             Self::NoServer { .. } | Self::Stopping => ErrorKind::Unavailable,
             Self::GoalRejected { .. } => ErrorKind::Refused,

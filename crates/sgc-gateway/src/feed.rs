@@ -1,7 +1,6 @@
 //! [`Feed`]: a reader of a topic, and all who hear it. Each topic is read once for everybody who takes it as it is offered.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
@@ -19,6 +18,7 @@ use crate::graph::Graph;
 use crate::hub::Shared;
 use crate::message::Message;
 use crate::queue::{Overflow, Queue};
+use crate::quota::{Charge, Waiting};
 use crate::ros::LocalReader;
 use crate::session::Waits;
 
@@ -42,6 +42,8 @@ pub(crate) struct FeedKey {
 pub(crate) struct Feed {
     pub(crate) key: FeedKey,
     hub: Weak<Shared>,
+    /// The charge of the client for which the reader was made, for as long as the reader is there.
+    _charge: Charge,
     outlets: Mutex<Outlets>,
     /// The reader, and what it requests. Locked by who changes it, which may take a while.
     reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
@@ -131,9 +133,9 @@ impl HandleSamples for Intake {
 }
 
 impl Feed {
-    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>) -> Arc<Self> {
+    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>, charge: Charge) -> Arc<Self> {
         let (outlets, reader) = (Mutex::default(), Mutex::new(None));
-        Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
+        Arc::new(Self { key, hub: Arc::downgrade(hub), _charge: charge, outlets, reader })
     }
 
     fn outlets(&self) -> MutexGuard<'_, Outlets> {
@@ -280,16 +282,19 @@ pub struct Delivery {
 }
 
 /// How much one subscriber takes.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(crate) struct Intaking {
     pub(crate) depth: usize,
+    /// Bytes that may wait of one that is waited for: it does not share its bound, since nobody else makes room for it.
     pub(crate) bytes_max: usize,
     /// Bytes that wait for the client in all its subscriptions.
-    pub(crate) waiting: Arc<AtomicUsize>,
+    pub(crate) waiting: Arc<Waiting>,
     pub(crate) interval_min: Option<Duration>,
     pub(crate) overflow: Overflow,
     /// Its place among those that are waited for, if it is.
     pub(crate) waits: Option<Waits>,
+    /// Its place among the subscriptions of its client's credential.
+    pub(crate) charge: Charge,
 }
 
 /// What one client hears of a topic; ends when dropped.
@@ -300,6 +305,7 @@ pub struct Subscription {
     interval_min: Option<Duration>,
     not_before: Option<Instant>,
     _waits: Option<Waits>,
+    _charge: Charge,
 }
 
 impl Subscription {
@@ -313,6 +319,7 @@ impl Subscription {
             interval_min: taking.interval_min,
             not_before: None,
             _waits: taking.waits,
+            _charge: taking.charge,
         }
     }
 

@@ -14,6 +14,7 @@ use tokio::task::JoinHandle;
 use crate::error::GatewayError;
 use crate::feed::{Feed, FeedKey, Intaking, Subscription};
 use crate::graph::{Graph, GraphState};
+use crate::quota::{Charge, Quotas};
 use crate::ros::LocalRos;
 use crate::service::Caller;
 use crate::types::Types;
@@ -22,8 +23,6 @@ use crate::types::Types;
 const SETTLE: Duration = Duration::from_millis(20);
 /// How long a reader that nobody uses is kept: a page that is loaded again finds it.
 const LINGER: Duration = Duration::from_secs(2);
-/// Threads that wait at a time for local programs, so that others are left for everything else.
-const WAITS_MAX: usize = 64;
 /// Writers at their end that are waited for at a time.
 const FAREWELLS_MAX: usize = 32;
 /// Clients of services that are kept for further calls.
@@ -89,8 +88,8 @@ pub(crate) struct Shared {
     feeds: Mutex<Feeds>,
     unused: Notify,
     callers: Mutex<VecDeque<Arc<Caller>>>,
-    /// Calls and writes that may wait, each of which takes a thread.
-    pub(crate) waits: Semaphore,
+    /// Counts of all that clients have, and the threads on which calls and writes may wait.
+    pub(crate) quotas: Arc<Quotas>,
     /// Writers that wait for acknowledgements before they end.
     pub(crate) farewells: Arc<Semaphore>,
 }
@@ -124,7 +123,7 @@ impl Hub {
             feeds: Mutex::default(),
             unused: Notify::new(),
             callers: Mutex::default(),
-            waits: Semaphore::new(WAITS_MAX),
+            quotas: Arc::default(),
             farewells: Arc::new(Semaphore::new(FAREWELLS_MAX)),
         });
         let weak = Arc::downgrade(&shared);
@@ -291,11 +290,12 @@ impl Shared {
         done.unwrap_or(Err(GatewayError::Stopping))
     }
 
-    /// Subscribes, with the reader that others have if there is one.
+    /// Subscribes, with the reader that others have if there is one; `charge` pays for a new one.
     pub(crate) async fn subscribe(
         self: &Arc<Self>,
         key: FeedKey,
         taking: Intaking,
+        charge: impl FnOnce() -> Result<Charge, GatewayError> + Send + 'static,
     ) -> Result<Subscription, GatewayError> {
         self.run(move |shared| {
             let layout = shared.layout_of(&key)?;
@@ -306,11 +306,14 @@ impl Shared {
                 }
                 // A subscriber that is waited for has a reader of its own.
                 let known = feeds.all.iter().find(|feed| !key.waits && feed.key == key).map(Arc::clone);
-                let feed = known.unwrap_or_else(|| {
-                    let feed = Feed::new(key, shared);
-                    feeds.all.push(Arc::clone(&feed));
-                    feed
-                });
+                let feed = match known {
+                    Some(feed) => feed,
+                    None => {
+                        let feed = Feed::new(key, shared, charge()?);
+                        feeds.all.push(Arc::clone(&feed));
+                        feed
+                    }
+                };
                 // Before anybody finds it unused, and before a new reader hears what is for who made it.
                 (Arc::clone(&feed), Subscription::new(feed, layout, taking))
             };

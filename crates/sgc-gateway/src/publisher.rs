@@ -16,6 +16,7 @@ use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::hub::{Shared, lock};
+use crate::quota::{Charge, Quota};
 
 /// How long readers may take to acknowledge what was written last before its writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
@@ -42,6 +43,9 @@ pub struct Publication {
     bytes_at_once_max: usize,
     /// Whether a write may wait for readers, since one before it may: they keep their order.
     may_block: AtomicBool,
+    /// The quota of its client.
+    quota: Quota,
+    _charge: Option<Charge>,
 }
 
 /// A writer, and what waits to be written by a thread that may wait.
@@ -94,6 +98,7 @@ impl Publication {
         topic: String,
         type_name: String,
         qos: Qos,
+        (quota, charge): (Quota, Option<Charge>),
     ) -> Result<Self, GatewayError> {
         shared
             .run(move |shared| {
@@ -117,7 +122,17 @@ impl Publication {
                 let bytes_at_once_max = bytes_at_once_max(&spec);
                 let may_block = AtomicBool::new(bytes_at_once_max == 0);
                 let shared = Arc::clone(shared);
-                Ok(Self { shared, line, layout, topic, type_name, bytes_at_once_max, may_block })
+                Ok(Self {
+                    shared,
+                    line,
+                    layout,
+                    topic,
+                    type_name,
+                    bytes_at_once_max,
+                    may_block,
+                    quota,
+                    _charge: charge,
+                })
             })
             .await
     }
@@ -191,7 +206,7 @@ impl Publication {
         if !self.has_ahead() {
             return Ok(());
         }
-        let _place = self.shared.waits.acquire().await.map_err(|_| GatewayError::Stopping)?;
+        let _thread = self.quota.thread().await?;
         let line = Arc::clone(&self.line);
         self.shared.blocking(move |_| line.write_out()).await
     }
@@ -220,6 +235,10 @@ impl Publication {
             if matched >= readers || left.is_zero() {
                 return matched;
             }
+            let Ok(Ok(_thread)) = tokio::time::timeout(left, self.quota.thread()).await else {
+                return matched;
+            };
+            let left = until.saturating_duration_since(Instant::now()).min(MATCH_WAIT_MAX);
             let line = Arc::clone(&self.line);
             let waited = self.shared.blocking(move |_| Ok(line.writer.wait_matched(readers, left)));
             if waited.await.is_err() {

@@ -7,6 +7,10 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 
 use crate::message::Message;
+use crate::quota::Waiting;
+
+/// Bytes that a message costs beside its payload: queues of very short messages are not free.
+pub(crate) const MESSAGE_COST_BYTES: usize = 256;
 
 /// What is done with a message that there is no room for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -37,13 +41,14 @@ pub(crate) struct Queue {
     depth: AtomicUsize,
     bytes_max: usize,
     /// Bytes that wait in all queues of the client, this one among them.
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
     overflow: Overflow,
 }
 
 impl Queue {
-    /// `bytes_max` is for all queues that share `waiting`; of a full one it is for each alone, since nobody else makes room.
-    pub(crate) fn new(depth: usize, bytes_max: usize, waiting: Arc<AtomicUsize>, overflow: Overflow) -> Self {
+    /// Creates one of the queues that share `waiting`. `bytes_max` bounds a queue whose reader waits: nobody else makes room
+    /// for it.
+    pub(crate) fn new(depth: usize, bytes_max: usize, waiting: Arc<Waiting>, overflow: Overflow) -> Self {
         let (state, filled, room) = (Mutex::default(), Notify::new(), Condvar::new());
         let depth = AtomicUsize::new(depth.max(1));
         Self { state, filled, room, depth, bytes_max, waiting, overflow }
@@ -59,12 +64,12 @@ impl Queue {
     }
 
     fn has_room(&self, state: &State, bytes: usize) -> bool {
-        let waiting = match self.overflow {
-            Overflow::DropOldest => self.waiting.load(Ordering::Relaxed),
-            Overflow::Wait => state.bytes,
+        let has_bytes = match self.overflow {
+            Overflow::DropOldest => self.waiting.has_room(bytes),
+            Overflow::Wait => state.bytes.saturating_add(bytes) <= self.bytes_max,
         };
         let depth = self.depth.load(Ordering::Relaxed);
-        let fits = state.messages.len() < depth && waiting.saturating_add(bytes) <= self.bytes_max;
+        let fits = state.messages.len() < depth && has_bytes;
         // One that is longer than the bound alone passes alone.
         fits || state.messages.is_empty()
     }
@@ -75,7 +80,7 @@ impl Queue {
             return false;
         }
         let state = self.lock();
-        !state.is_closed && !state.lets_pass && !self.has_room(&state, bytes)
+        !state.is_closed && !state.lets_pass && !self.has_room(&state, bytes + MESSAGE_COST_BYTES)
     }
 
     /// Whether what there is no room for comes all the same, rather than waiting.
@@ -86,7 +91,7 @@ impl Queue {
 
     /// Puts a message behind the others.
     pub(crate) fn push(&self, message: &Arc<Message>) {
-        let bytes = message.payload.len();
+        let bytes = cost(message);
         let mut state = self.lock();
         while !state.is_closed && !self.has_room(&state, bytes) {
             match self.overflow {
@@ -94,8 +99,8 @@ impl Queue {
                 Overflow::Wait => state = self.room.wait(state).unwrap_or_else(PoisonError::into_inner),
                 Overflow::DropOldest => {
                     if let Some(oldest) = state.messages.pop_front() {
-                        state.bytes -= oldest.payload.len();
-                        self.waiting.fetch_sub(oldest.payload.len(), Ordering::Relaxed);
+                        state.bytes -= cost(&oldest);
+                        self.waiting.sub(cost(&oldest));
                         state.dropped += 1;
                     }
                 }
@@ -105,7 +110,7 @@ impl Queue {
             return;
         }
         state.bytes += bytes;
-        self.waiting.fetch_add(bytes, Ordering::Relaxed);
+        self.waiting.add(bytes);
         state.messages.push_back(Arc::clone(message));
         drop(state);
         self.filled.notify_one();
@@ -120,8 +125,8 @@ impl Queue {
     pub(crate) fn pop(&self) -> Option<(Arc<Message>, u64)> {
         let mut state = self.lock();
         let message = state.messages.pop_front()?;
-        state.bytes -= message.payload.len();
-        self.waiting.fetch_sub(message.payload.len(), Ordering::Relaxed);
+        state.bytes -= cost(&message);
+        self.waiting.sub(cost(&message));
         let dropped = state.dropped;
         drop(state);
         if self.overflow == Overflow::Wait {
@@ -151,7 +156,7 @@ impl Queue {
     /// Forgets what waits.
     pub(crate) fn clear(&self) {
         let mut state = self.lock();
-        self.waiting.fetch_sub(state.bytes, Ordering::Relaxed);
+        self.waiting.sub(state.bytes);
         (state.messages, state.bytes) = (VecDeque::new(), 0);
     }
 
@@ -166,13 +171,20 @@ impl Queue {
 impl Drop for Queue {
     fn drop(&mut self) {
         let bytes = self.lock().bytes;
-        self.waiting.fetch_sub(bytes, Ordering::Relaxed);
+        self.waiting.sub(bytes);
     }
+}
+
+fn cost(message: &Message) -> usize {
+    message.payload.len() + MESSAGE_COST_BYTES
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Room for 100 bytes in two messages.
+    const ROOM: usize = 100 + 2 * MESSAGE_COST_BYTES;
 
     fn message(bytes: usize) -> Arc<Message> {
         Arc::new(Message::new(vec![0; bytes].into(), None, 0))
@@ -180,23 +192,23 @@ mod tests {
 
     #[test]
     fn queues_of_a_client_share_what_may_wait() {
-        let waiting: Arc<AtomicUsize> = Arc::default();
-        let queue = || Queue::new(9, 100, Arc::clone(&waiting), Overflow::DropOldest);
+        let waiting = Waiting::of_own(ROOM);
+        let queue = || Queue::new(9, ROOM, Arc::clone(&waiting), Overflow::DropOldest);
         let (one, other) = (queue(), queue());
         one.push(&message(80));
         for _ in 0..3 {
             other.push(&message(30));
         }
         // One message each is there in any case.
-        assert_eq!((one.dropped(), other.dropped(), waiting.load(Ordering::Relaxed)), (0, 2, 110));
+        assert_eq!((one.dropped(), other.dropped(), waiting.bytes()), (0, 2, 110 + 2 * MESSAGE_COST_BYTES));
         drop(one);
         other.push(&message(30));
-        assert_eq!((other.dropped(), waiting.load(Ordering::Relaxed)), (2, 60));
+        assert_eq!((other.dropped(), waiting.bytes()), (2, 60 + 2 * MESSAGE_COST_BYTES));
     }
 
     #[tokio::test]
     async fn the_oldest_gives_way_and_is_counted() {
-        let queue = Queue::new(2, 100, Arc::default(), Overflow::DropOldest);
+        let queue = Queue::new(2, ROOM, Waiting::of_own(ROOM), Overflow::DropOldest);
         for bytes in [10, 20, 30] {
             queue.push(&message(bytes));
         }
@@ -214,7 +226,7 @@ mod tests {
 
     #[test]
     fn who_waits_for_room_goes_on_when_there_is_some_or_the_end() {
-        let queue = Arc::new(Queue::new(1, 100, Arc::default(), Overflow::Wait));
+        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
         queue.push(&message(1));
         assert!(queue.would_wait(1));
         let pusher = {
@@ -232,7 +244,7 @@ mod tests {
 
     #[test]
     fn who_waits_for_room_is_let_pass() {
-        let queue = Arc::new(Queue::new(1, 100, Arc::default(), Overflow::Wait));
+        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
         queue.push(&message(1));
         let pusher = {
             let queue = queue.clone();

@@ -1,4 +1,4 @@
-//! [`Quota`]: what a client's credential has in all sessions together, beside the bounds of each session.
+//! [`Quota`]: the bounds of a credential over all its sessions, beside the bounds of each session.
 //!
 //! One credential, with however many connections, has [`CREDENTIAL_SHARE`] times what one session may have; all clients of
 //! other hosts together have [`REMOTE_SHARE`] times as much, and all clients of this gateway [`TOTAL_SHARE`] times. The
@@ -30,7 +30,7 @@ const THREADS: [usize; 3] = [16, 48, 64];
 /// hosts, in all.
 const LONG_BYTES: [usize; 3] = [512 << 20, 1536 << 20, 2048 << 20];
 
-/// Something of which there are only so many.
+/// Something that a quota bounds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Resource {
     Subscriptions,
@@ -57,7 +57,7 @@ impl Resource {
         }
     }
 
-    /// How many one session may have.
+    /// Returns how many one session may have.
     fn session_max(self, limits: &SessionLimits) -> usize {
         match self {
             Self::Subscriptions | Self::Readers => limits.subscriptions_max,
@@ -69,7 +69,7 @@ impl Resource {
     }
 }
 
-/// Whose bound was reached.
+/// Clients that share a bound.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Pool {
     /// All clients that show the same token or certificate, or come without one from the same address.
@@ -90,7 +90,7 @@ impl fmt::Display for Pool {
     }
 }
 
-/// What the clients of a pool have.
+/// Counts of all that the clients of a pool have.
 #[derive(Debug)]
 struct Counts {
     pool: Pool,
@@ -122,13 +122,13 @@ impl Counts {
     }
 }
 
-/// What all clients of a hub have.
+/// Counts of all that the clients of a hub have.
 #[derive(Debug)]
 pub(crate) struct Quotas {
     total: Arc<Counts>,
     remote: Arc<Counts>,
     of: Mutex<BTreeMap<Credential, Weak<Counts>>>,
-    /// How often something was refused, and whose bound it was.
+    /// Refusals, by the pool whose bound it was.
     refused: Mutex<BTreeMap<Pool, u64>>,
 }
 
@@ -140,24 +140,25 @@ impl Default for Quotas {
 }
 
 impl Quotas {
-    /// The quota that a client has with all who show what it shows.
+    /// Returns the quota that a client shares with all that have its credential.
     pub(crate) fn quota(self: &Arc<Self>, client: &Client) -> Quota {
-        let own = client.credential().filter(|credential| *credential != Credential::Local).map(|credential| {
-            let mut of = lock(&self.of);
-            of.retain(|_, counts| counts.strong_count() > 0);
-            let known = of.get(&credential).and_then(Weak::upgrade);
-            known.unwrap_or_else(|| {
-                let counts = Counts::new(Pool::Credential);
-                of.insert(credential, Arc::downgrade(&counts));
-                counts
-            })
-        });
+        let own =
+            client.credential().filter(|credential| *credential != Credential::Local).map(|credential| {
+                let mut of = lock(&self.of);
+                of.retain(|_, counts| counts.strong_count() > 0);
+                let known = of.get(&credential).and_then(Weak::upgrade);
+                known.unwrap_or_else(|| {
+                    let counts = Counts::new(Pool::Credential);
+                    of.insert(credential, Arc::downgrade(&counts));
+                    counts
+                })
+            });
         let remote = (!client.is_local()).then(|| Arc::clone(&self.remote));
         let pools = [own, remote, Some(Arc::clone(&self.total))].into_iter().flatten().collect();
         Quota { quotas: Arc::clone(self), pools }
     }
 
-    /// How often something was refused for the bound of a pool.
+    /// Returns the number of refusals for the bound of each pool.
     pub(crate) fn refused(&self) -> BTreeMap<Pool, u64> {
         lock(&self.refused).clone()
     }
@@ -167,15 +168,15 @@ impl Quotas {
     }
 }
 
-/// What a client's credential has. Clones are the same one.
+/// The quota of a client's credential. Clones are the same one.
 #[derive(Clone, Debug)]
 pub(crate) struct Quota {
     quotas: Arc<Quotas>,
-    /// Those that the client is of, the smallest first.
+    /// The pools of the client, the smallest first.
     pools: Arc<[Arc<Counts>]>,
 }
 
-/// One of something, until dropped.
+/// One unit of a resource, until dropped.
 #[derive(Debug)]
 pub(crate) struct Charge {
     quota: Quota,
@@ -189,7 +190,7 @@ impl Drop for Charge {
 }
 
 impl Quota {
-    /// Takes one of something, of which one session may have as many as `limits` say.
+    /// Takes one unit of a resource, of which one session may have as many as `limits` say.
     pub(crate) fn take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, GatewayError> {
         for (at, counts) in self.pools.iter().enumerate() {
             let max = resource.session_max(limits).saturating_mul(counts.share());
@@ -243,7 +244,7 @@ impl Quota {
 #[derive(Debug)]
 pub(crate) struct Permits(#[expect(dead_code, reason = "they are for their end")] Vec<OwnedSemaphorePermit>);
 
-/// Takes places of all, the smallest pool first: who waits for one of a larger holds nothing that its members need.
+/// Takes permits of all pools, the smallest first: a client that waits for its own pool holds nothing of a larger one.
 async fn acquire<'a>(pools: impl Iterator<Item = &'a Arc<Semaphore>>, permits: u32) -> Option<Permits> {
     let mut held = Vec::new();
     for semaphore in pools {
@@ -265,18 +266,18 @@ impl Waiting {
         Self { bytes: AtomicUsize::new(0), bytes_max, quota }
     }
 
-    /// How many there are.
+    /// Returns the number of bytes that wait.
     pub(crate) fn bytes(&self) -> usize {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Whether there is room for so many more.
+    /// Returns `true` if there is room for so many more.
     pub(crate) fn has_room(&self, bytes: usize) -> bool {
         let fits = |now: &AtomicUsize, max| now.load(Ordering::Relaxed).saturating_add(bytes) <= max;
         fits(&self.bytes, self.bytes_max) && self.pools_have_room(bytes)
     }
 
-    /// The same of the pools alone.
+    /// Returns `true` if the pools have room for so many more.
     pub(crate) fn pools_have_room(&self, bytes: usize) -> bool {
         self.quota.pools.iter().all(|counts| {
             let max = self.bytes_max.saturating_mul(counts.share());
@@ -286,12 +287,16 @@ impl Waiting {
 
     pub(crate) fn add(&self, bytes: usize) {
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        self.quota.pools.iter().for_each(|counts| drop(counts.bytes.fetch_add(bytes, Ordering::Relaxed)));
+        for counts in &*self.quota.pools {
+            counts.bytes.fetch_add(bytes, Ordering::Relaxed);
+        }
     }
 
     pub(crate) fn sub(&self, bytes: usize) {
         self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-        self.quota.pools.iter().for_each(|counts| drop(counts.bytes.fetch_sub(bytes, Ordering::Relaxed)));
+        for counts in &*self.quota.pools {
+            counts.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        }
     }
 }
 

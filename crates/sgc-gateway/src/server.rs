@@ -1,5 +1,6 @@
 //! [`Server`]: the gateway's sockets. Accepts, ends TLS, finds out who it is and what it speaks, and hands it on.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::io;
 use std::net::SocketAddr;
@@ -20,20 +21,21 @@ use tokio_rustls::TlsAcceptor;
 use tokio_stream::wrappers::ReceiverStream;
 
 use crate::access::{Access, Denied};
-use crate::door::{Arrival, Door, GatewayStatus, Handshake, Handshakes, Place};
+use crate::door::{Arrival, Door, Engagement, GatewayStatus, Handshake, Handshakes, Place};
 use crate::foxglove::{self, FoxgloveError};
 use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
+use crate::inflow::{Inflow, Metered};
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
-use crate::ws::{UpgradeError, upgrade};
+use crate::ws::{UpgradeError, Upgraded, upgrade};
 
 /// How long TLS and the upgrade may take together; of gRPC, TLS and the first call that is admitted.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
 /// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
-/// How long a connection of gRPC stays on which nobody is admitted any more: its streams say why they end.
+/// Time for the last words on a gRPC connection on which no client is admitted any more.
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
 /// Connections that wait to be served by gRPC.
 const GRPC_WAITING_MAX: usize = 64;
@@ -139,7 +141,7 @@ struct Placed {
 /// How far a client of gRPC has come.
 enum Standing {
     /// It has not shown yet who it is, and has until then to do so.
-    Unproven { deadline: Pin<Box<Sleep>>, _handshake: Handshake },
+    Unproven { deadline: Pin<Box<Sleep>>, handshake: Handshake },
     /// It was admitted.
     Proven(#[expect(dead_code, reason = "it is for its end")] Place),
     /// Nobody is admitted on it any more. It has until then to hear so, or to show something else.
@@ -157,7 +159,7 @@ impl Placed {
         handshake: Handshake,
     ) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(deadline));
-        Self { stream, door, connection, standing: Standing::Unproven { deadline, _handshake: handshake } }
+        Self { stream, door, connection, standing: Standing::Unproven { deadline, handshake } }
     }
 
     /// Fails once the client may not stay. To be asked before reading as before writing: who does not read what it is
@@ -173,17 +175,21 @@ impl Placed {
                 self.standing = Standing::Denied { deadline };
                 return self.check(cx);
             }
-            (_, Some(name)) => match self.door.enter(&name, "grpc", self.connection.peer()) {
+            (_, Some(client)) => match self.door.enter(&client, "grpc", self.connection.peer()) {
                 Some(place) => (Standing::Proven(place), Ok(())),
                 None => (Standing::Refused, Err(io::Error::other("too many clients"))),
             },
-            (Standing::Unproven { deadline, .. }, None) => match deadline.as_mut().poll(cx) {
-                Poll::Pending => return Ok(()),
-                Poll::Ready(()) => {
+            (Standing::Unproven { deadline, handshake }, None) => {
+                if handshake.poll_evicted(cx).is_ready() {
+                    self.door.count("handshake gave way");
+                    (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into()))
+                } else if deadline.as_mut().poll(cx).is_ready() {
                     self.door.count("handshake too slow");
                     (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
+                } else {
+                    return Ok(());
                 }
-            },
+            }
             (Standing::Denied { deadline }, None) => match deadline.as_mut().poll(cx) {
                 Poll::Pending => return Ok(()),
                 Poll::Ready(()) => (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into())),
@@ -308,14 +314,14 @@ impl Server {
         Ok(())
     }
 
-    /// Shows new connections another certificate; those that there are stay.
+    /// Shows another certificate to new connections; present ones stay.
     pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
         let tls = tls_of(Some(key), &self.shared.door.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
     }
 
-    /// Verifies tokens with the certificate of this peer from now on: the gateway's own, renewed.
+    /// Verifies tokens with this certificate of the gateway from now on.
     pub fn set_gateway(&self, gateway: VerifiedPeer) {
         self.shared.door.rules().change(|access| access.clone().with_gateway(gateway));
     }
@@ -330,9 +336,17 @@ impl Server {
         GatewayStatus {
             listen: self.local.iter().map(ToString::to_string).collect(),
             clients: self.shared.door.clients(),
-            refused: self.shared.door.refused(),
+            refused: self.refused(),
             readers: self.shared.hub.readers(),
         }
+    }
+
+    /// Returns the number of refusals by their reasons.
+    fn refused(&self) -> BTreeMap<String, u64> {
+        let mut refused = self.shared.door.refused();
+        let crowded = self.shared.hub.shared.quotas.refused();
+        refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
+        refused
     }
 
     /// The hub.
@@ -368,29 +382,78 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>
 }
 
 async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Shared>) {
-    let Some(handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
-        shared.door.count("too many handshakes");
-        return;
+    let door = &shared.door;
+    let Some(mut handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
+        return door.count("too many handshakes");
     };
     let deadline = Instant::now() + HANDSHAKE_MAX;
-    if !at.is_encrypted {
-        let arrival = Arrival { peer, is_encrypted: false, certificate: None };
-        return speak(stream, arrival, at, &shared, deadline, handshake).await;
+    let engagement = handshake.engagement();
+    let arriving = arrive(stream, peer, at, &shared, &engagement);
+    let arrived = tokio::select! {
+        arrived = tokio::time::timeout_at(deadline, arriving) => arrived,
+        () = handshake.evicted() => return door.count("handshake gave way"),
+    };
+    let (stream, arrival) = match arrived {
+        Ok(Some(arrived)) => arrived,
+        Ok(None) => return,
+        Err(_) => return door.count("handshake too slow"),
+    };
+    match at.protocol {
+        Protocol::Grpc => {
+            // Its clients say who they are with each call.
+            let Arrival { peer, is_encrypted, certificate } = arrival;
+            let connection =
+                if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
+            let placed = Placed::new(stream, Arc::clone(door), connection.clone(), deadline, handshake);
+            let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
+        }
+        Protocol::WebSocket => {
+            let inflow: Arc<Inflow> = Arc::default();
+            let stream = Metered::new(stream, Arc::clone(&inflow));
+            let upgraded = tokio::select! {
+                upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS)) => upgraded,
+                () = handshake.evicted() => return door.count("handshake gave way"),
+            };
+            drop(handshake);
+            match upgraded {
+                Ok(Ok(upgraded)) => speak(upgraded, arrival, inflow, &shared).await,
+                Ok(Err(UpgradeError::NotAdmitted)) => {}
+                Ok(Err(UpgradeError::Socket(error))) => {
+                    tracing::debug!(%peer, %error, "no WebSocket");
+                    door.count("no WebSocket");
+                }
+                Err(_) => door.count("handshake too slow"),
+            }
+        }
     }
-    let tls = shared.tls.borrow().clone();
-    let Some(tls) = tls else { return };
+}
+
+/// Waits for the first bytes, and ends TLS.
+async fn arrive(
+    stream: TcpStream,
+    peer: SocketAddr,
+    at: ListenAt,
+    shared: &Shared,
+    engagement: &Engagement,
+) -> Option<(Box<dyn Bytes>, Arrival)> {
+    // In all that is spoken here the client speaks first.
+    stream.readable().await.ok()?;
+    engagement.begin();
+    if !at.is_encrypted {
+        return Some((Box::new(stream), Arrival { peer, is_encrypted: false, certificate: None }));
+    }
+    let tls = shared.tls.borrow().clone()?;
     let config = match at.protocol {
         Protocol::WebSocket => tls.ws,
         Protocol::Grpc => tls.grpc,
     };
-    let stream = match tokio::time::timeout_at(deadline, TlsAcceptor::from(config).accept(stream)).await {
-        Ok(Ok(stream)) => stream,
-        Ok(Err(error)) => {
+    let stream = match TlsAcceptor::from(config).accept(stream).await {
+        Ok(stream) => stream,
+        Err(error) => {
             shared.door.count("TLS failed");
             tracing::debug!(%peer, %error, "a client's TLS failed");
-            return;
+            return None;
         }
-        Err(_) => return shared.door.count("handshake too slow"),
     };
     let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
     let access = shared.door.access();
@@ -402,58 +465,36 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
             None
         }
     };
-    let arrival = Arrival { peer, is_encrypted: true, certificate };
-    speak(stream, arrival, at, &shared, deadline, handshake).await;
+    Some((Box::new(stream), Arrival { peer, is_encrypted: true, certificate }))
 }
 
-/// Finds out what it speaks, and has it served until it goes or may no longer stay.
-async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
-    stream: S,
+/// Serves a client until it goes, or its right ends.
+async fn speak(
+    upgraded: Upgraded<Metered<Box<dyn Bytes>>>,
     arrival: Arrival,
-    at: ListenAt,
-    shared: &Arc<Shared>,
-    deadline: Instant,
-    handshake: Handshake,
+    inflow: Arc<Inflow>,
+    shared: &Shared,
 ) {
-    if at.protocol == Protocol::Grpc {
-        // Its clients say who they are with each call.
-        let Arrival { peer, is_encrypted, certificate } = arrival;
-        let connection =
-            if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
-        let door = Arc::clone(&shared.door);
-        let placed = Placed::new(Box::new(stream), door, connection.clone(), deadline, handshake);
-        let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
-        return;
-    }
-    let (door, peer) = (&shared.door, arrival.peer);
-    let upgraded = upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS);
-    let upgraded = match tokio::time::timeout_at(deadline, upgraded).await {
-        Ok(Ok(upgraded)) => upgraded,
-        Ok(Err(UpgradeError::NotAdmitted)) => return,
-        Ok(Err(UpgradeError::Socket(error))) => {
-            tracing::debug!(%peer, %error, "no WebSocket");
-            return door.count("no WebSocket");
-        }
-        Err(_) => return door.count("handshake too slow"),
-    };
-    drop(handshake);
-    let client = upgraded.client;
+    let (door, peer, client) = (&shared.door, arrival.peer, upgraded.client);
     let protocol = if upgraded.subprotocol.is_some() { "foxglove" } else { "rosbridge" };
-    let Some(_place) = door.enter(&client.name, protocol, peer) else { return };
+    let Some(place) = door.enter(&client, protocol, peer) else { return };
+    let place = Arc::new(place);
     let name = Arc::clone(&client.name);
     let session = Session::new(&shared.hub, client, shared.limits).admitted_by(door.rules().clone());
+    let session = session.metered_by(inflow);
     let ended = if upgraded.subprotocol.is_some() {
         let served = foxglove::serve(upgraded.socket, Arc::new(session), shared.foxglove.clone());
         served.await.map_err(Ended::from)
     } else {
-        let asked = Arc::clone(door);
+        let (asked, place) = (Arc::clone(door), Arc::clone(&place));
         // A token that comes later than the upgrade says who the client is from then on.
         let authenticate: Authenticate = Arc::new(move |token| {
             let admitted = asked.admit(&arrival, None, Some(token));
-            admitted.map_err(|denied| denied.told().to_owned())
+            let client = admitted.map_err(|denied| denied.told().to_owned())?;
+            place.rename(&client).map_err(|why| why.to_string())?;
+            Ok(client)
         });
-        let options =
-            RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
+        let options = RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
         let served = rosbridge::serve(upgraded.socket, Arc::new(session), options);
         served.await.map_err(Ended::from)
     };

@@ -17,6 +17,7 @@ use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::hub::{Shared, lock};
+use crate::quota::{Charge, Quota};
 
 /// Replies that came before it was known what they answer.
 const EARLY_MAX: usize = 64;
@@ -145,11 +146,16 @@ impl Caller {
     }
 
     /// Asks, and waits for the reply.
-    pub(crate) async fn call(self: &Arc<Self>, payload: Bytes, max: Duration) -> Result<Bytes, GatewayError> {
+    pub(crate) async fn call(
+        self: &Arc<Self>,
+        payload: Bytes,
+        max: Duration,
+        quota: &Quota,
+    ) -> Result<Bytes, GatewayError> {
         let shared = self.shared.upgrade().ok_or(GatewayError::Stopping)?;
         let caller = Arc::clone(self);
         let asked = {
-            let _place = shared.waits.acquire().await.map_err(|_| GatewayError::Stopping)?;
+            let _thread = quota.thread().await?;
             shared.blocking(move |_| caller.ask(payload)).await
         };
         let (_asked, reply) = match asked {
@@ -194,6 +200,7 @@ pub struct Serving {
     halves: Halves,
     requests: mpsc::Receiver<Request>,
     service: String,
+    _charge: Option<Charge>,
 }
 
 /// Answers requests of a [`Serving`], wherever they are worked on.
@@ -239,6 +246,7 @@ impl Serving {
         shared: &Arc<Shared>,
         service: String,
         type_name: String,
+        charge: Option<Charge>,
     ) -> Result<Self, GatewayError> {
         shared
             .run(move |shared| {
@@ -251,7 +259,8 @@ impl Serving {
                 let [reader, writer] = server.guids();
                 shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.request));
                 shared.know(own_endpoint(EndpointKind::Writer, writer, &spec.reply));
-                Ok(Self { shared: Arc::clone(shared), server, halves, requests, service })
+                let shared = Arc::clone(shared);
+                Ok(Self { shared, server, halves, requests, service, _charge: charge })
             })
             .await
     }

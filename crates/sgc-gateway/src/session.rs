@@ -1,27 +1,33 @@
 //! [`Session`]: one client's part in the hub, within its scope and its bounds.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
+use sgc_cdr::{Library, TypeName};
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
 use sgc_wire::Qos;
 
-use crate::access::{Client, Denied, Right};
+use crate::access::{Client, Denied, Right, Scope};
 use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
 use crate::error::GatewayError;
 use crate::feed::{FeedKey, Intaking, Subscription};
 use crate::graph::Graph;
 use crate::hub::Hub;
+use crate::inflow::Inflow;
 use crate::publisher::Publication;
 use crate::queue::Overflow;
+use crate::quota::{Charge, Quota, Resource, Waiting};
 use crate::service::Serving;
 use crate::types::InterfaceType;
 
 /// How small a part of a client's bytes a subscription has that the local network waits for.
 const WAITING_PARTS: usize = 16;
+/// Messages that may wait for one subscription, whatever its client says.
+const DEPTH_MAX: usize = 10_000;
 
 /// What one client may have at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,24 +92,28 @@ pub struct Advertise {
 pub struct Session {
     hub: Hub,
     client: Client,
-    /// What ends its right; none of a part of this program.
+    /// The rules that end its right; none for a part of this program.
     access: Option<AccessWatch>,
     limits: SessionLimits,
     calls: Arc<AtomicUsize>,
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
     waits: Arc<AtomicUsize>,
+    /// The quota of its credential.
+    quota: Quota,
+    /// Bytes of messages that are still to come in full, where the protocol counts them.
+    inflow: Arc<Inflow>,
 }
 
 /// A subscription that is waited for, counted while it lasts.
-#[derive(Clone, Debug)]
-pub(crate) struct Waits(#[expect(dead_code, reason = "it is for its end")] Arc<CountedWaits>);
-
 #[derive(Debug)]
-struct CountedWaits(Arc<AtomicUsize>);
+pub(crate) struct Waits {
+    waits: Arc<AtomicUsize>,
+    _charge: Charge,
+}
 
-impl Drop for CountedWaits {
+impl Drop for Waits {
     fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
+        self.waits.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -119,22 +129,38 @@ impl Drop for Counted<'_> {
 impl Session {
     /// A client's.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
+        let quota = hub.shared.quotas.quota(&client);
         Self {
             hub: hub.clone(),
             client,
             access: None,
             limits,
             calls: Arc::default(),
-            waiting: Arc::default(),
+            waiting: Arc::new(Waiting::new(limits.waiting_bytes_max, quota.clone())),
             waits: Arc::default(),
+            quota,
+            inflow: Arc::default(),
         }
     }
 
-    /// The same, by these rules, which end the client's right.
+    /// Has these rules end the client's right.
     #[must_use]
     pub fn admitted_by(mut self, access: AccessWatch) -> Self {
         self.access = Some(access);
         self
+    }
+
+    /// Has incoming messages take room of the client's quota.
+    #[must_use]
+    pub(crate) fn metered_by(mut self, inflow: Arc<Inflow>) -> Self {
+        inflow.admit(&self.quota);
+        self.inflow = inflow;
+        self
+    }
+
+    /// Gives back the room of a message that is done.
+    pub(crate) fn message_is_done(&self) {
+        self.inflow.done();
     }
 
     /// Waits until the client's right ends, and says why it has. Whoever serves the client ends all that it has then.
@@ -148,8 +174,10 @@ impl Session {
     /// The same program's, now that it is another client: what it has already counts against its bounds.
     pub fn again(&self, client: Client) -> Self {
         let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
-        let [calls, waiting, waits] = [&self.calls, &self.waiting, &self.waits].map(Arc::clone);
-        Self { hub, client, access, limits, calls, waiting, waits }
+        let [calls, waits] = [&self.calls, &self.waits].map(Arc::clone);
+        let (waiting, quota) = (Arc::clone(&self.waiting), self.hub.shared.quotas.quota(&client));
+        let inflow = Arc::clone(&self.inflow);
+        Self { hub, client, access, limits, calls, waiting, waits, quota, inflow }
     }
 
     /// Who it is.
@@ -164,7 +192,12 @@ impl Session {
 
     /// Bytes of messages that wait for it in all its subscriptions.
     pub fn waiting_bytes(&self) -> usize {
-        self.waiting.load(Ordering::Relaxed)
+        self.waiting.bytes()
+    }
+
+    /// Returns the quota of its credential.
+    pub(crate) fn quota(&self) -> &Quota {
+        &self.quota
     }
 
     /// What it may have. Protocols count what they hold by [`Session::check_count`].
@@ -178,11 +211,45 @@ impl Session {
         let any = |rights: [Right; 2], name: &str| rights.iter().any(|right| scope.permits(*right, name));
         self.hub.graph().filtered(
             |topic| {
+                let action = action_of(topic);
                 any([Right::Subscribe, Right::Publish], topic)
-                    || any([Right::Call, Right::Serve], action_of(topic))
+                    || (action != topic && any([Right::Call, Right::Serve], action))
             },
             |service| any([Right::Call, Right::Serve], action_of(service)),
         )
+    }
+
+    /// Refuses types that the client does not see: they would tell of others on the network. A client sees types that ship
+    /// with ROS 2, types of topics, services and actions in its scope that others have, and types within these. May read
+    /// files.
+    pub fn check_type(&self, type_name: &str) -> Result<(), GatewayError> {
+        if *self.client.scope == Scope::everything() {
+            return Ok(());
+        }
+        let not_seen =
+            || GatewayError::TypeNotSeen { name: type_name.chars().take(TOPIC_BYTES_MAX).collect() };
+        let file = |name: &str| {
+            let name: TypeName = name.parse().ok()?;
+            TypeName::new(name.package(), name.kind(), name.file_stem())
+        };
+        let wanted = file(type_name).ok_or_else(not_seen)?;
+        if Library::shipped(&wanted).is_some() {
+            return Ok(());
+        }
+        let graph = self.graph();
+        let own = Some(self.hub.node_name());
+        let others = |nodes: &[Option<String>]| nodes.iter().any(|node| node.as_deref() != own);
+        let ends = graph.topics.values().flat_map(|info| info.publishers.iter().chain(&info.subscribers));
+        let of_topics = ends.filter(|end| !end.is_own).map(|end| &end.type_name);
+        let services = graph.services.values().filter(|info| others(&info.servers) || others(&info.clients));
+        let actions = graph.actions.values().filter(|info| others(&info.servers) || others(&info.clients));
+        let seen =
+            of_topics.chain(services.map(|info| &info.type_name)).chain(actions.map(|info| &info.type_name));
+        let seen: BTreeSet<TypeName> = seen.filter_map(|name| file(name)).collect();
+        let contains = |name: &TypeName| {
+            Library::shipped(name).is_none() && self.hub.types().files_of(name).contains(&wanted)
+        };
+        if seen.contains(&wanted) || seen.iter().any(contains) { Ok(()) } else { Err(not_seen()) }
     }
 
     /// Refuses what is beyond a bound of [`SessionLimits`].
@@ -258,27 +325,28 @@ impl Session {
     /// Subscribes to what belongs to something that the client may use.
     pub(crate) async fn subscribe_checked(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
+        let charge = self.quota.take(Resource::Subscriptions, &self.limits)?;
         let waits = if wanted.waits { Some(self.take_wait()?) } else { None };
         let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
         let taking = Intaking {
-            depth: wanted.depth,
-            // Those that are waited for do not share their bound: nobody else makes room for them.
-            bytes_max: match wanted.waits {
-                true => self.limits.waiting_bytes_max / WAITING_PARTS,
-                false => self.limits.waiting_bytes_max,
-            },
+            depth: wanted.depth.min(DEPTH_MAX),
+            bytes_max: self.limits.waiting_bytes_max / WAITING_PARTS,
             waiting: Arc::clone(&self.waiting),
             interval_min: wanted.interval_min,
             overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
             waits,
+            charge,
         };
-        self.hub.shared.subscribe(key, taking).await
+        let (quota, limits) = (self.quota.clone(), self.limits);
+        let reader = move || quota.take(Resource::Readers, &limits);
+        self.hub.shared.subscribe(key, taking, reader).await
     }
 
     /// A place for one more subscription that is waited for.
     fn take_wait(&self) -> Result<Waits, GatewayError> {
+        let charge = self.quota.take(Resource::Waits, &self.limits)?;
         let before = self.waits.fetch_add(1, Ordering::Relaxed);
-        let place = Waits(Arc::new(CountedWaits(Arc::clone(&self.waits))));
+        let place = Waits { waits: Arc::clone(&self.waits), _charge: charge };
         self.check_count("subscriptions that are waited for", before, self.limits.waits_max)?;
         Ok(place)
     }
@@ -292,7 +360,9 @@ impl Session {
     /// Becomes a publisher of what belongs to something that the client may serve.
     pub(crate) async fn advertise_checked(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
-        Publication::new(&self.hub.shared, wanted.topic, type_name, wanted.qos).await
+        let charge = self.quota.take(Resource::Publications, &self.limits)?;
+        let quota = (self.quota.clone(), Some(charge));
+        Publication::new(&self.hub.shared, wanted.topic, type_name, wanted.qos, quota).await
     }
 
     /// Calls a service and waits for its reply, which comes in the form that is asked for.
@@ -310,10 +380,11 @@ impl Session {
         self.check_count("calls under way", self.calls.load(Ordering::Relaxed), self.limits.calls_max)?;
         self.calls.fetch_add(1, Ordering::Relaxed);
         let _counted = Counted(&self.calls);
+        let _charge = self.quota.take(Resource::Calls, &self.limits)?;
         let name = service.to_owned();
         let caller = self.hub.shared.run(move |shared| shared.caller(&name, &type_name)).await?;
         let payload = request.to_cdr(&caller.halves.request)?;
-        let reply = caller.call(payload, max).await?;
+        let reply = caller.call(payload, max, &self.quota).await?;
         convert(&caller.halves.reply, &reply, form)
     }
 
@@ -322,7 +393,8 @@ impl Session {
         self.check_name(service)?;
         self.check(Right::Serve, action_of(service))?;
         let type_name = self.service_type(service, type_name)?;
-        Serving::new(&self.hub.shared, service.to_owned(), type_name).await
+        let charge = self.quota.take(Resource::Servings, &self.limits)?;
+        Serving::new(&self.hub.shared, service.to_owned(), type_name, Some(charge)).await
     }
 }
 

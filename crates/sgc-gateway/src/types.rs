@@ -1,6 +1,6 @@
 //! [`Types`]: what messages look like, by the names of their types.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -143,6 +143,26 @@ impl Types {
         let file = TypeName::new(name.package(), name.kind(), name.file_stem());
         let file = file.ok_or_else(|| unknown(name.clone()))?;
         aside(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
+    }
+
+    /// Returns the file that defines an interface and the files that its parts need. May read them.
+    pub(crate) fn files_of(&self, file: &TypeName) -> BTreeSet<TypeName> {
+        let parts: &[&str] = match file.kind() {
+            "srv" => &["_Request", "_Response"],
+            "action" => &["_Goal", "_Result", "_Feedback"],
+            _ => &[""],
+        };
+        let mut files = BTreeSet::from([file.clone()]);
+        let mut library = Library::empty();
+        for part in parts {
+            let Ok(part) = format!("{file}{part}").parse() else { continue };
+            // What is known as it was described alone has no files.
+            let _ = library.layout(&part, &mut |needed| {
+                files.insert(needed.clone());
+                self.text(&needed.to_string()).ok()
+            });
+        }
+        files
     }
 
     fn lock(&self) -> MutexGuard<'_, Known> {

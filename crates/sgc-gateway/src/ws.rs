@@ -89,7 +89,7 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     Ok(Upgraded { socket, client, subprotocol })
 }
 
-/// What of a reason fits into a close frame, which has room for 123 bytes of words (RFC 6455, 5.5).
+/// Returns the part of a reason that fits into a close frame, which has room for 123 bytes of words (RFC 6455, 5.5).
 pub(crate) fn close_reason(why: &str) -> &str {
     let mut end = why.len().min(123);
     while !why.is_char_boundary(end) {

@@ -3,9 +3,10 @@
 //! A table with a bound: what an attacker with many addresses can do is make it forget others.
 
 use std::collections::BTreeMap;
-use std::net::{IpAddr, Ipv6Addr};
+use std::net::IpAddr;
 use std::time::Duration;
 
+use sgc_trust::AddressPrefix;
 use sgc_wire::UnixMillis;
 
 /// Tokens of one address that may fail within [`WINDOW_MS`].
@@ -18,7 +19,7 @@ pub(super) const ADDRESSES_MAX: usize = 1024;
 /// Failures, by address. Those of IPv6 count by their network of 64 bits, of which one host has all addresses.
 #[derive(Debug, Default)]
 pub(super) struct Attempts {
-    of: BTreeMap<IpAddr, Failures>,
+    of: BTreeMap<AddressPrefix, Failures>,
 }
 
 #[derive(Debug)]
@@ -30,7 +31,7 @@ struct Failures {
 impl Attempts {
     /// Whether a token of this address is looked at; else how long it is not.
     pub(super) fn check(&mut self, address: IpAddr, now: UnixMillis) -> Result<(), Duration> {
-        let key = network(address);
+        let key = AddressPrefix::from(address);
         let Some(Failures { count, since }) = self.of.get(&key) else { return Ok(()) };
         // A clock that was set back must not keep anybody out.
         let left = match now.0.checked_sub(since.0) {
@@ -45,20 +46,13 @@ impl Attempts {
 
     /// A token of this address did not hold.
     pub(super) fn fail(&mut self, address: IpAddr, now: UnixMillis) {
-        let key = network(address);
+        let key = AddressPrefix::from(address);
         if !self.of.contains_key(&key) && self.of.len() >= ADDRESSES_MAX {
             let oldest = self.of.iter().min_by_key(|(_, failures)| failures.since).map(|(key, _)| *key);
             oldest.map(|oldest| self.of.remove(&oldest));
         }
         let failures = self.of.entry(key).or_insert(Failures { count: 0, since: now });
         failures.count = failures.count.saturating_add(1);
-    }
-}
-
-fn network(address: IpAddr) -> IpAddr {
-    match address.to_canonical() {
-        IpAddr::V4(v4) => IpAddr::V4(v4),
-        IpAddr::V6(v6) => IpAddr::V6(Ipv6Addr::from_bits(v6.to_bits() >> 64 << 64)),
     }
 }
 
@@ -103,6 +97,6 @@ mod tests {
             attempts.fail(IpAddr::V4(n.into()), UnixMillis(NOW.0 + u64::from(n)));
         }
         assert_eq!(attempts.of.len(), ADDRESSES_MAX);
-        assert!(!attempts.of.contains_key(&address("0.0.0.0")));
+        assert!(!attempts.of.contains_key(&address("0.0.0.0").into()));
     }
 }

@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use sgc_trust::{Grantees, TrustAnchors, VerifiedPeer};
+use sgc_trust::{AddressPrefix, Grantees, TrustAnchors, VerifiedPeer};
 use sgc_wire::{NodeId, UnixMillis};
 
 pub use origin::{ORIGIN_BYTES_MAX, PageOrigin, PageOriginError};
@@ -70,7 +70,7 @@ pub struct AccessRules {
     pub names: BTreeMap<NodeId, String>,
 }
 
-/// Hears of each token that is refused: where it was shown, and why.
+/// Hears of refused tokens: the address, and the reason. It hears of at most ten a minute for one address.
 pub type HearRefusals = Arc<dyn Fn(SocketAddr, &Denied) + Send + Sync>;
 
 /// Who may connect, and what they may do. Cloning shares.
@@ -119,6 +119,21 @@ pub struct Client {
     /// Because of what it is admitted.
     pub how: AdmittedBy,
     evidence: Evidence,
+    /// `true` if the connection comes from a loopback address.
+    is_local: bool,
+}
+
+/// The proof by which sessions were admitted. Sessions with the same one share a quota.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Credential {
+    /// Programs of this host without a token.
+    Local,
+    /// Programs of another host without a token.
+    Address(AddressPrefix),
+    /// Whoever shows this token.
+    Token(TokenId),
+    /// Whoever shows a certificate of this node.
+    Certificate(NodeId),
 }
 
 /// Because of what a client is admitted.
@@ -162,7 +177,24 @@ impl Client {
             token: None,
             how: AdmittedBy::Anonymous,
             evidence: Evidence::Own,
+            is_local: true,
         }
+    }
+
+    /// Returns the proof by which it was admitted; none for a part of this program.
+    pub(crate) fn credential(&self) -> Option<Credential> {
+        Some(match &self.evidence {
+            Evidence::Own => return None,
+            Evidence::Anonymous { ip, .. } if ip.is_loopback() => Credential::Local,
+            Evidence::Anonymous { ip, .. } => Credential::Address((*ip).into()),
+            Evidence::Certificate { peer, .. } => Credential::Certificate(peer.node_id),
+            Evidence::Token { id, .. } => Credential::Token(*id),
+        })
+    }
+
+    /// `true` if the connection comes from a loopback address.
+    pub(crate) fn is_local(&self) -> bool {
+        self.is_local
     }
 
     /// Whether it holds this right to the interface of this full name.
@@ -219,7 +251,7 @@ impl Access {
         self
     }
 
-    /// The same with another certificate of this node.
+    /// Returns the same rules with another certificate of this node.
     #[must_use]
     pub fn with_gateway(mut self, gateway: VerifiedPeer) -> Self {
         Arc::make_mut(&mut self.rules).gateway = Some(gateway);
@@ -251,8 +283,10 @@ impl Access {
 
     fn judge(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
         if let Some(token) = admission.token {
+            // Whoever goes on trying has been heard often enough: the log is for others, too.
+            let is_heard = self.attempts().check(admission.peer.ip(), admission.now).is_ok();
             return self.admit_token(token, admission).inspect_err(|denied| {
-                if let Some(hears) = &self.hears {
+                if let Some(hears) = self.hears.as_ref().filter(|_| is_heard) {
                     hears(admission.peer, denied);
                 }
             });
@@ -272,6 +306,7 @@ impl Access {
                         token: None,
                         how: AdmittedBy::Certificate(peer.node_id),
                         evidence,
+                        is_local: ip.is_loopback(),
                     });
                 }
                 // One that permits nothing is like none: without it the same program may be admitted.
@@ -305,13 +340,14 @@ impl Access {
     fn admit_token(&self, text: &str, admission: &Admission<'_>) -> Result<Client, Denied> {
         let ip = admission.peer.ip().to_canonical();
         let is_exposed = !admission.encrypted && !ip.is_loopback();
-        if is_exposed && !self.rules.plain {
-            return Err(Denied::PlainToken);
-        }
         // This host is not locked out: behind a proxy of it are many.
         if !ip.is_loopback() {
             let checked = self.attempts().check(ip, admission.now);
             checked.map_err(|wait| Denied::TooManyAttempts { ip, wait })?;
+        }
+        if is_exposed && !self.rules.plain {
+            self.attempts().fail(ip, admission.now);
+            return Err(Denied::PlainToken);
         }
         let result = AccessToken::parse(text).map_err(Denied::Token).and_then(|token| {
             let gateway = self.rules.gateway.as_ref().ok_or(Denied::NoTokens)?;
@@ -327,6 +363,7 @@ impl Access {
             token: Some(grant.id),
             how: AdmittedBy::Token(grant.id),
             evidence: Evidence::Token { id: grant.id, is_exposed },
+            is_local: ip.is_loopback(),
         })
     }
 
@@ -373,6 +410,7 @@ impl Access {
             token: None,
             how: AdmittedBy::Anonymous,
             evidence: Evidence::Anonymous { ip, origin },
+            is_local: ip.is_loopback(),
         })
     }
 

@@ -18,7 +18,7 @@ const FILE: &str = "file://";
 pub struct PageOrigin(Box<str>);
 
 impl PageOrigin {
-    /// Returns `true` for pages that a host serves to itself: to the host of the browser, whichever that is.
+    /// Returns `true` for pages that a host serves to itself: the host of the browser, whichever that is.
     pub fn is_loopback(&self) -> bool {
         let Some((scheme, authority)) = self.0.split_once("://") else { return false };
         let host = host_and_port(authority).map(|(host, _)| host);

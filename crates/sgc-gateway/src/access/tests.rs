@@ -121,7 +121,8 @@ fn a_page_of_another_hosts_localhost_is_no_page_of_this_host() {
     let listed = Access::new(AccessRules { origins, ..all.clone() });
     let all = Access::new(all);
     for certificate in [None, Some(cast.desk.as_peer())] {
-        for origin in ["http://localhost", "http://127.0.0.1:3000", "https://[::1]", "http://localhost:5173"] {
+        for origin in ["http://localhost", "http://127.0.0.1:3000", "https://[::1]", "http://localhost:5173"]
+        {
             let page = |peer| Admission { origin: Some(origin), certificate, ..from(peer) };
             let refused = Denied::Origin { origin: origin.to_owned() };
             for peer in [ELSEWHERE, "[2001:db8::7]:1", "[::ffff:10.0.0.9]:1"] {
@@ -362,6 +363,24 @@ fn who_keeps_the_log_hears_of_tokens_that_are_refused_and_of_nothing_else() {
     assert!(!show(&access, Some("x")) && !show(&revoked, Some(&good)));
     let wanted = [Denied::Token(AccessTokenError::Prefix), Denied::TokenRevoked { id: cast.grant().id }];
     assert_eq!(*heard.lock().unwrap(), wanted.map(|denied| (HERE.to_owned(), denied)));
+}
+
+#[test]
+fn one_address_does_not_fill_the_log() {
+    let heard: Arc<Mutex<Vec<String>>> = Arc::default();
+    let log = Arc::clone(&heard);
+    let access = Access::new(cast().rules())
+        .heard_by(Arc::new(move |peer, _| log.lock().unwrap().push(peer.ip().to_string())));
+    // A page in a browser of this host may try as often as it likes, and so may whoever shows one in the clear.
+    for (peer, encrypted) in [(HERE, true), (ELSEWHERE, true), ("10.0.0.10:1", false)] {
+        for _ in 0..1000 {
+            let admission = Admission { token: Some("sgc-access-1:AAAA"), encrypted, ..from(peer) };
+            assert!(access.admit(&admission).is_err());
+        }
+        let ip = from(peer).peer.ip().to_string();
+        assert_eq!(heard.lock().unwrap().iter().filter(|heard| **heard == ip).count(), 10, "{peer}");
+    }
+    assert_eq!(access.denied(), 3000);
 }
 
 #[test]

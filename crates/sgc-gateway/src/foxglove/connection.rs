@@ -192,7 +192,10 @@ impl<'o> Connection<'o> {
                     came_at = Instant::now();
                     match frame {
                         None | Some(Ok(Frame::Close(_))) => return Ok(()),
-                        Some(Ok(frame)) => self.frame(frame).await,
+                        Some(Ok(frame)) => {
+                            self.frame(frame).await;
+                            self.session.message_is_done();
+                        }
                         Some(Err(error)) => {
                             self.status(Level::Error, &error.to_string(), None);
                             return Err(error.into());

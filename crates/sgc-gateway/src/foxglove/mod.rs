@@ -30,6 +30,7 @@ use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 use crate::access::Denied;
+use crate::quota::Waiting;
 use crate::session::Session;
 use crate::ws::close_reason;
 
@@ -106,7 +107,8 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let (mut sink, mut frames) = socket.split();
-    let outbox = Outbox::new(session.limits().waiting_bytes_max);
+    let waiting = Waiting::new(session.limits().waiting_bytes_max, session.quota().clone());
+    let outbox = Outbox::new(waiting);
     let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
         biased;

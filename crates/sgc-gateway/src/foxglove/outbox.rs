@@ -8,6 +8,8 @@ use tokio::sync::Notify;
 use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::message::Message;
+use crate::queue::MESSAGE_COST_BYTES;
+use crate::quota::Waiting;
 
 use super::protocol::message_data;
 
@@ -17,8 +19,6 @@ const ANSWERS_MAX: usize = 256;
 const ANSWER_BYTES_MAX: usize = 4 << 20;
 /// Messages that may wait for one subscription.
 pub(super) const LANE_MESSAGES_MAX: usize = 1024;
-/// What a message counts for beside its payload, bytes.
-const MESSAGE_COST_BYTES: usize = 256;
 
 /// What waits for one client.
 #[derive(Debug)]
@@ -35,15 +35,20 @@ struct State {
     answers: VecDeque<Frame>,
     answer_bytes: usize,
     /// Messages in the order in which they came.
-    messages: BTreeMap<u64, Waiting>,
+    messages: BTreeMap<u64, Queued>,
     lanes: BTreeMap<u32, Lane>,
     next: u64,
-    message_bytes: usize,
-    message_bytes_max: usize,
+    message_bytes: Waiting,
+}
+
+impl Drop for State {
+    fn drop(&mut self) {
+        self.message_bytes.sub(self.message_bytes.bytes());
+    }
 }
 
 #[derive(Debug)]
-struct Waiting {
+struct Queued {
     subscription: u32,
     message: Arc<Message>,
 }
@@ -57,15 +62,15 @@ struct Lane {
 }
 
 impl Outbox {
-    pub(super) fn new(message_bytes_max: usize) -> Self {
+    /// Creates an outbox whose messages wait within that.
+    pub(super) fn new(message_bytes: Waiting) -> Self {
         let state = State {
             answers: VecDeque::new(),
             answer_bytes: 0,
             messages: BTreeMap::new(),
             lanes: BTreeMap::new(),
             next: 0,
-            message_bytes: 0,
-            message_bytes_max,
+            message_bytes,
         };
         Self { state: Mutex::new(state), filled: Notify::new(), drained: Notify::new() }
     }
@@ -103,7 +108,7 @@ impl Outbox {
         if state.lanes.get(&subscription).is_some_and(|lane| lane.numbers.len() >= LANE_MESSAGES_MAX) {
             state.drop_oldest(subscription);
         }
-        while state.message_bytes + cost > state.message_bytes_max {
+        while !state.message_bytes.has_room(cost) {
             let most = state.lanes.iter().max_by_key(|(_, lane)| lane.bytes);
             match most.filter(|(_, lane)| lane.bytes > 0).map(|(fullest, _)| *fullest) {
                 Some(fullest) => state.drop_oldest(fullest),
@@ -113,11 +118,11 @@ impl Outbox {
         }
         let number = state.next;
         state.next += 1;
-        state.message_bytes += cost;
+        state.message_bytes.add(cost);
         let lane = state.lanes.entry(subscription).or_default();
         lane.numbers.push_back(number);
         lane.bytes += cost;
-        state.messages.insert(number, Waiting { subscription, message });
+        state.messages.insert(number, Queued { subscription, message });
         drop(state);
         self.filled.notify_one();
     }
@@ -126,7 +131,7 @@ impl Outbox {
     pub(super) fn forget(&self, subscription: u32) {
         let mut state = self.lock();
         let Some(lane) = state.lanes.remove(&subscription) else { return };
-        state.message_bytes -= lane.bytes;
+        state.message_bytes.sub(lane.bytes);
         for number in lane.numbers {
             state.messages.remove(&number);
         }
@@ -146,9 +151,9 @@ impl Outbox {
             self.drained.notify_one();
             return Some(answer);
         }
-        let (_, Waiting { subscription, message }) = state.messages.pop_first()?;
+        let (_, Queued { subscription, message }) = state.messages.pop_first()?;
         let cost = cost(&message);
-        state.message_bytes -= cost;
+        state.message_bytes.sub(cost);
         if let Some(lane) = state.lanes.get_mut(&subscription) {
             lane.numbers.pop_front();
             lane.bytes -= cost;
@@ -179,7 +184,7 @@ impl State {
         if let Some(waiting) = self.messages.remove(&number) {
             let cost = cost(&waiting.message);
             lane.bytes -= cost;
-            self.message_bytes -= cost;
+            self.message_bytes.sub(cost);
         }
     }
 }
@@ -196,6 +201,12 @@ mod tests {
         Arc::new(Message::new(vec![0; bytes].into(), None, 0))
     }
 
+    fn outbox(message_bytes_max: usize) -> Outbox {
+        let quotas: Arc<crate::quota::Quotas> = Arc::default();
+        let quota = quotas.quota(&crate::access::Client::own("test"));
+        Outbox::new(Waiting::new(message_bytes_max, quota))
+    }
+
     fn popped(outbox: &Outbox) -> Option<(u8, usize)> {
         outbox.pop().map(|frame| {
             let bytes = frame.into_data();
@@ -205,7 +216,7 @@ mod tests {
 
     #[test]
     fn messages_go_in_the_order_in_which_they_came_and_answers_before_them() {
-        let outbox = Outbox::new(10_000);
+        let outbox = outbox(10_000);
         outbox.message(1, message(10));
         outbox.message(2, message(20));
         outbox.message(1, message(30));
@@ -214,12 +225,12 @@ mod tests {
         assert_eq!([popped(&outbox), popped(&outbox)], [Some((1, 10)), Some((2, 20))]);
         outbox.forget(1);
         assert_eq!(outbox.pop(), None);
-        assert_eq!(outbox.lock().message_bytes, 0);
+        assert_eq!(outbox.lock().message_bytes.bytes(), 0);
     }
 
     #[test]
     fn who_waits_with_the_most_gives_way() {
-        let outbox = Outbox::new(4 * (1000 + MESSAGE_COST_BYTES));
+        let outbox = outbox(4 * (1000 + MESSAGE_COST_BYTES));
         outbox.message(7, message(10));
         for _ in 0..5 {
             outbox.message(1, message(1000));
@@ -234,7 +245,7 @@ mod tests {
 
     #[test]
     fn one_subscription_has_so_many_at_most() {
-        let outbox = Outbox::new(usize::MAX);
+        let outbox = outbox(usize::MAX);
         for _ in 0..LANE_MESSAGES_MAX + 3 {
             outbox.message(1, message(0));
         }
@@ -243,7 +254,7 @@ mod tests {
 
     #[tokio::test]
     async fn answers_that_nobody_takes_leave_no_room_until_they_are() {
-        let outbox = Outbox::new(1);
+        let outbox = outbox(1);
         for _ in 0..ANSWERS_MAX {
             outbox.answer(Frame::text("x"));
         }

@@ -13,7 +13,7 @@ use tonic::{Request, Status};
 use super::GrpcOptions;
 use super::connection::{Connection, WeakConnection};
 use super::fault::Fault;
-use crate::access::{Admission, Client, Denied};
+use crate::access::{Admission, Client, Denied, ORIGIN_BYTES_MAX};
 use crate::access_watch::AccessWatch;
 use crate::budget::Budget;
 use crate::error::GatewayError;
@@ -23,6 +23,8 @@ use crate::session::Session;
 
 /// Credentials that may be in use on one connection at a time.
 const CREDENTIALS_MAX: usize = 16;
+/// Streams on which one client hears of the graph at a time: each makes its view of it anew with every change.
+const WATCHES_MAX: usize = 16;
 
 /// Admits clients.
 pub(super) struct Clients {
@@ -32,7 +34,7 @@ pub(super) struct Clients {
     stopping: watch::Receiver<bool>,
 }
 
-/// What was shown: of a token its hash, so that none is kept.
+/// What was shown: of a token its hash, so that none is kept. Beside a token the origin says nothing, and is not looked at.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Shown {
     token: Option<[u8; 32]>,
@@ -87,13 +89,16 @@ impl Clients {
         };
         // One that is no text is one all the same, and of nobody.
         let origin = text("origin").map(|origin| origin.unwrap_or("?"));
+        if token.is_none() && origin.is_some_and(|origin| origin.len() > ORIGIN_BYTES_MAX) {
+            return Err(Fault::Origin { max: ORIGIN_BYTES_MAX });
+        }
         let shown = Shown {
+            origin: origin.filter(|_| token.is_none()).map(Box::from),
             token: token.map(|token| {
                 let mut hash = [0; 32];
                 hash.copy_from_slice(digest(&SHA256, token.as_bytes()).as_ref());
                 hash
             }),
-            origin: origin.map(Box::from),
         };
         let access = self.access.current();
         let mut known = lock(connection.known());
@@ -125,17 +130,16 @@ impl Clients {
         }
         let session = Session::new(&self.hub, client.clone(), self.options.session);
         let guest = Arc::new_cyclic(|guest| {
-            let watched =
-                watch_over(guest.clone(), self.access.clone(), client, self.stopping.clone());
+            let watched = watch_over(guest.clone(), self.access.clone(), client, self.stopping.clone());
             Guest {
-                session: session.admitted_by(self.access.clone()),
                 connection: connection.waker(),
                 counts: Counts::default(),
                 ended: watch::Sender::new(None),
                 heard: Mutex::default(),
-                unread: Budget::new(self.options.unread_bytes_max),
-                incoming: Budget::new(self.options.incoming_bytes_max),
+                unread: Budget::new(self.options.unread_bytes_max, session.quota().clone()),
+                incoming: Budget::new(self.options.incoming_bytes_max, session.quota().clone()),
                 watcher: tokio::spawn(watched).abort_handle(),
+                session: session.admitted_by(self.access.clone()),
             }
         });
         known.push(Known { shown, guest: Arc::clone(&guest) });
@@ -150,7 +154,7 @@ fn bearer(header: &str) -> Option<&str> {
     (scheme.eq_ignore_ascii_case("bearer") && !token.is_empty()).then_some(token)
 }
 
-/// Ends a guest the moment its right ends, or the front end stops. Ended itself with the guest.
+/// Ends a guest the moment its right ends, or the front end stops. The guest aborts this task when it is dropped.
 async fn watch_over(
     guest: Weak<Guest>,
     access: AccessWatch,
@@ -182,6 +186,7 @@ struct Counts {
     servings: AtomicUsize,
     goals: AtomicUsize,
     calls: AtomicUsize,
+    watches: AtomicUsize,
 }
 
 /// Of which of its bounds a stream takes one.
@@ -192,6 +197,7 @@ pub(super) enum Taken {
     Serving,
     Goal,
     Call,
+    Watching,
 }
 
 /// One credential on one connection.
@@ -239,6 +245,7 @@ impl Guest {
         match taken {
             Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
             Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            Taken::Watching => (&self.counts.watches, "watches of the graph", WATCHES_MAX),
             Taken::Call => (&self.counts.calls, "calls under way", limits.calls_max),
             Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
             Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),

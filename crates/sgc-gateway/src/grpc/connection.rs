@@ -12,6 +12,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
 use super::client::Known;
+use crate::access::Client;
 use crate::hub::lock;
 
 /// A connection, as whoever accepted it knows it. Clones are the same one.
@@ -23,7 +24,7 @@ struct Inner {
     is_encrypted: bool,
     certificate: Option<VerifiedPeer>,
     known: Mutex<Vec<Known>>,
-    /// Woken when somebody is admitted no more.
+    /// Woken when the right of a client on it ends.
     serving: AtomicWaker,
 }
 
@@ -58,14 +59,14 @@ impl Connection {
         self.0.certificate.as_ref()
     }
 
-    /// What the client is called that was admitted on it first and is so still. The task is woken once nobody is.
-    pub(crate) fn poll_admitted(&self, cx: &mut Context<'_>) -> Option<Arc<str>> {
+    /// Returns the first client on it whose right has not ended. The task is woken when one ends.
+    pub(crate) fn poll_admitted(&self, cx: &mut Context<'_>) -> Option<Client> {
         self.0.serving.register(cx.waker());
         let known = lock(&self.0.known);
-        known.iter().find(|known| known.is_admitted()).map(|known| Arc::clone(&known.client().name))
+        known.iter().find(|known| known.is_admitted()).map(|known| known.client().clone())
     }
 
-    /// What wakes the task that serves the connection.
+    /// Returns a handle that wakes the task which serves the connection.
     pub(super) fn waker(&self) -> WeakConnection {
         WeakConnection(Arc::downgrade(&self.0))
     }
@@ -76,11 +77,11 @@ impl Connection {
     }
 }
 
-/// A connection that somebody was admitted on, whether it is there still or not.
+/// A handle of a connection, which may be gone.
 pub(super) struct WeakConnection(Weak<Inner>);
 
 impl WeakConnection {
-    /// Has whoever serves it look who is admitted.
+    /// Wakes the task that serves the connection.
     pub(super) fn wake(&self) {
         if let Some(connection) = self.0.upgrade() {
             connection.serving.wake();

@@ -14,6 +14,12 @@ pub enum Fault {
     /// Metadata that are no text of that form.
     #[error("`authorization` is not of the form `Bearer TOKEN`")]
     Authorization,
+    /// An `origin` that no browser sends.
+    #[error("`origin` has {max} bytes at most")]
+    Origin {
+        /// The bound.
+        max: usize,
+    },
     /// Too many credentials are in use on one connection.
     #[error("{max} credentials at most are used on one connection at a time")]
     Credentials {
@@ -90,7 +96,7 @@ pub enum Fault {
 impl Fault {
     fn code(&self) -> Code {
         match self {
-            Self::Denied(_) | Self::Authorization => Code::Unauthenticated,
+            Self::Denied(_) | Self::Authorization | Self::Origin { .. } => Code::Unauthenticated,
             Self::Credentials { .. } => Code::ResourceExhausted,
             Self::Order { .. }
             | Self::Enumeration { .. }

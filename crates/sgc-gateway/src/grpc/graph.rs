@@ -8,7 +8,7 @@ use futures_util::stream;
 use tokio::sync::watch;
 use tonic::Status;
 
-use super::client::Guest;
+use super::client::{Guest, Place};
 use super::proto::watch_graph_response::Gone;
 use super::proto::{self, GetGraphResponse, WatchGraphResponse};
 use super::qos;
@@ -41,19 +41,19 @@ pub(super) fn graph(guest: &Guest, with_hidden: bool) -> GetGraphResponse {
 
 /// A client that is told of changes.
 struct Watching {
-    guest: Arc<Guest>,
+    place: Place,
     with_hidden: bool,
     changes: watch::Receiver<u64>,
     told: Option<Graph>,
 }
 
 /// All of it, and then what changes.
-pub(super) fn watch(guest: Arc<Guest>, with_hidden: bool) -> Responses<WatchGraphResponse> {
-    let changes = guest.session.hub().graph_changes();
-    let watching = Watching { guest, with_hidden, changes, told: None };
+pub(super) fn watch(place: Place, with_hidden: bool) -> Responses<WatchGraphResponse> {
+    let changes = place.guest.session.hub().graph_changes();
+    let watching = Watching { place, with_hidden, changes, told: None };
     Box::pin(stream::unfold(Some(watching), |watching| async {
         let mut watching = watching?;
-        let guest = Arc::clone(&watching.guest);
+        let guest = Arc::clone(&watching.place.guest);
         tokio::select! {
             biased;
             why = guest.ended() => Some((Err(Status::from(why)), None)),
@@ -70,7 +70,7 @@ impl Watching {
                 tokio::time::sleep(CHANGES_INTERVAL_MIN).await;
             }
             self.changes.mark_unchanged();
-            let now = seen(&self.guest, self.with_hidden);
+            let now = seen(&self.place.guest, self.with_hidden);
             let (is_first, before) = (self.told.is_none(), self.told.take().unwrap_or_default());
             let change =
                 WatchGraphResponse { changed: Some(changed(&before, &now)), gone: Some(gone(&before, &now)) };

@@ -128,7 +128,8 @@ mod tests {
     #[test]
     fn room_is_taken_by_the_head_and_given_back_with_the_message() {
         const LONG: usize = 600 << 10;
-        let budget = Budget::new(1 << 20);
+        let quotas: Arc<crate::quota::Quotas> = Arc::default();
+        let budget = Budget::new(1 << 20, quotas.quota(&crate::access::Client::own("test")));
         let (mut first, mut second) = (Messages::default(), Messages::default());
         // A head in two parts, and nothing of its message.
         let long = head(LONG);

@@ -1,6 +1,7 @@
 //! [`Service`]: the calls of `gateway.proto`, each handed to what does it.
 
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio_stream::Stream;
@@ -54,14 +55,18 @@ impl Gateway for Service {
         request: Request<WatchGraphRequest>,
     ) -> Result<Response<Self::WatchGraphStream>, Status> {
         let guest = Guest::of(&request)?;
-        Ok(Response::new(graph::watch(guest, request.get_ref().include_hidden)))
+        let place = guest.take(Taken::Watching)?;
+        Ok(Response::new(graph::watch(place, request.get_ref().include_hidden)))
     }
 
     async fn get_type(&self, request: Request<GetTypeRequest>) -> Result<Response<GetTypeResponse>, Status> {
         let guest = Guest::of(&request)?;
-        let shared = &guest.session.hub().shared;
-        let name = request.into_inner().r#type;
-        let described = shared.run(move |shared| Ok(types::describe(&shared.types, &name))).await;
+        let (asked, name) = (Arc::clone(&guest), request.into_inner().r#type);
+        let described = guest.session.hub().shared.run(move |shared| {
+            asked.session.check_type(&name)?;
+            Ok(types::describe(&shared.types, &name))
+        });
+        let described = described.await;
         Ok(Response::new(described.map_err(Fault::from)??))
     }
 

@@ -80,7 +80,7 @@ impl Patience {
 /// What one client has.
 pub(super) struct Connection {
     session: Arc<Session>,
-    /// Told of each session that the client has, one after the other.
+    /// Holds the present session of the client.
     sessions: watch::Sender<Arc<Session>>,
     options: Arc<RosbridgeOptions>,
     outbox: Outbox,
@@ -153,13 +153,19 @@ impl Connection {
         self.is_admitted
     }
 
-    /// The session that the client has, and those that it gets by saying who it is.
+    /// Returns a watch of the client's session, which changes with each `auth`.
     pub(super) fn sessions(&self) -> watch::Receiver<Arc<Session>> {
         self.sessions.subscribe()
     }
 
     /// Does what a client asks for; only what ends the connection is an error.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
+        let taken = self.take_op(text).await;
+        self.session.message_is_done();
+        taken
+    }
+
+    async fn take_op(&mut self, text: &str) -> Result<(), RosbridgeError> {
         while let Some(ended) = self.tasks.try_join_next() {
             let Ok((number, goal)) = ended else { continue };
             self.under_way.remove(&number);

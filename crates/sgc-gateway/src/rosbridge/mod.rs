@@ -61,7 +61,7 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let options = Arc::new(options);
-    let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max);
+    let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max, session.quota().clone());
     let pulse = Pulse::default();
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
@@ -90,7 +90,7 @@ where
     ended
 }
 
-/// Waits until the right of the client ends, whoever it has said to be meanwhile.
+/// Waits until the right of the client ends: the right by which it was admitted last.
 async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denied {
     loop {
         let session = Arc::clone(&sessions.borrow_and_update());
@@ -170,7 +170,7 @@ fn ping_interval(silence_max: Duration) -> Duration {
     (silence_max / 4).max(PING_INTERVAL_MIN)
 }
 
-/// Whether the client is there.
+/// Refuses a client that leaves pings without an answer.
 fn look(pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
     match pulse.unanswered() {
         Some(since) if since.elapsed() >= options.silence_max => {

@@ -19,6 +19,7 @@ use super::op::OpId;
 use super::options::RosbridgeError;
 use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
+use crate::quota::Quota;
 
 /// Replies, requests and status that wait.
 const CONTROL_MAX: usize = 64;
@@ -106,11 +107,11 @@ pub(super) struct Gone;
 
 impl Outbox {
     /// One whose long replies and requests have so many bytes.
-    pub(super) fn new(bytes_max: usize) -> (Self, Outgoing) {
+    pub(super) fn new(bytes_max: usize, quota: Quota) -> (Self, Outgoing) {
         let (control, control_out) = mpsc::channel(CONTROL_MAX);
         let (batches, batches_out) = mpsc::channel(BATCHES_MAX);
         let level = Arc::new(AtomicU8::new(Level::Error as u8));
-        let (room, turns) = (Arc::new(Budget::new(bytes_max)), Arc::default());
+        let (room, turns) = (Arc::new(Budget::new(bytes_max, quota)), Arc::default());
         (
             Self { control, batches, level, room, turns },
             Outgoing { control: control_out, batches: batches_out },

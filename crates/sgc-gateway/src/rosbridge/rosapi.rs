@@ -112,7 +112,10 @@ impl RosApi<'_> {
 
     fn typedefs(&self, of: InterfaceType, type_name: &str, part: &str) -> Result<Json, String> {
         let full = of.full_name(type_name).map_err(|error| error.to_string())?;
-        let found = aside(|| typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}")));
+        let found = aside(|| {
+            self.session.check_type(&full)?;
+            typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}"))
+        });
         found.map(|typedefs| json!({ "typedefs": typedefs })).map_err(|error| error.to_string())
     }
 

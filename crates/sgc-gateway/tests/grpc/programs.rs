@@ -187,7 +187,8 @@ async fn python_comes_over_tls_with_the_certificate_of_a_node_or_a_token() {
     let server = Server::start(scene.gateway.site.hub.clone(), options).await.unwrap();
     let mut python = python();
     python.env("PYTHONPATH", wheel(dir.path()).await).arg("-B");
-    python.arg(repository("clients/python/tests/over_tls.py")).args([&ca, &identity]);
+    python.arg(repository("clients/python/tests/over_tls.py"));
+    python.args([&ca, &identity, &dir.path().join("partner.token")]);
     let said = scene.run_at(server.local()[0].addr.port(), python).await;
     assert!(said.ends_with("all is well\n"), "{said}");
 }

@@ -24,9 +24,14 @@ pub(crate) struct Site {
 
 impl Site {
     pub(crate) async fn new() -> Self {
+        Self::with_types(Types::new(Shipped)).await
+    }
+
+    /// One whose gateway knows these types.
+    pub(crate) async fn with_types(types: Types) -> Self {
         let domain = FakeDomain::default();
         let own = Arc::new(domain.join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let hub = Hub::start(own, types, HubOptions::default()).await.unwrap();
         Self { hub, ros: domain.join(false), domain }
     }
 

@@ -1,0 +1,146 @@
+//! [`Inflow`]: bytes of WebSocket messages that are not done yet. They take room of their client's quota from the first byte on, so
+//! that many connections which each begin a message of the longest kind take no more memory than the quota has.
+//!
+//! gRPC has its own way to do this (`grpc::incoming`), since its messages say their length first.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, OnceLock};
+use std::task::{Context, Poll, ready};
+
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+
+use crate::budget::UNIT_BYTES;
+use crate::error::GatewayError;
+use crate::hub::lock;
+use crate::quota::{Permits, Quota};
+
+/// Bytes of messages that are not done yet.
+#[derive(Debug, Default)]
+pub(crate) struct Inflow {
+    /// The quota of the client, once it was admitted. The upgrade bounds all that comes before.
+    quota: OnceLock<Quota>,
+    held: Mutex<Held>,
+}
+
+#[derive(Debug, Default)]
+struct Held {
+    bytes: usize,
+    /// One for each [`UNIT_BYTES`] beyond the first.
+    room: Vec<Permits>,
+}
+
+impl Inflow {
+    /// Takes room of this quota from now on.
+    pub(crate) fn admit(&self, quota: &Quota) {
+        let _ = self.quota.set(quota.clone());
+    }
+
+    /// Takes room for bytes that came.
+    fn add(&self, bytes: usize) -> Result<(), GatewayError> {
+        let Some(quota) = self.quota.get() else { return Ok(()) };
+        let mut held = lock(&self.held);
+        held.bytes += bytes;
+        while held.room.len() < (held.bytes.saturating_sub(1)) / UNIT_BYTES {
+            let room = quota.room_at_once(1)?;
+            held.room.push(room);
+        }
+        Ok(())
+    }
+
+    /// Gives back the room of a message that is done.
+    pub(crate) fn done(&self) {
+        *lock(&self.held) = Held::default();
+    }
+}
+
+/// A stream of bytes whose reader takes room for what it reads.
+#[derive(Debug)]
+pub(crate) struct Metered<S> {
+    stream: S,
+    inflow: Arc<Inflow>,
+}
+
+impl<S> Metered<S> {
+    pub(crate) fn new(stream: S, inflow: Arc<Inflow>) -> Self {
+        Self { stream, inflow }
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buf: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let before = buf.filled().len();
+        ready!(Pin::new(&mut self.stream).poll_read(cx, buf))?;
+        let added = self.inflow.add(buf.filled().len() - before);
+        Poll::Ready(added.map_err(io::Error::other))
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Metered<S> {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(cx, buf)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(cx)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bufs: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(cx, bufs)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::AsyncReadExt as _;
+
+    use super::*;
+    use crate::access::Client;
+    use crate::quota::{Pool, Quotas};
+
+    #[tokio::test]
+    async fn messages_that_do_not_end_take_no_more_than_the_quota_has() {
+        const BEGUN: usize = 60 << 20;
+        let quotas: Arc<Quotas> = Arc::default();
+        let quota = quotas.quota(&Client::own("test"));
+        let mut begun = Vec::new();
+        let refused = loop {
+            let inflow = Inflow::default();
+            inflow.admit(&quota);
+            let added = inflow.add(BEGUN);
+            begun.push(inflow);
+            if let Err(refused) = added {
+                break refused;
+            }
+            assert!(begun.len() < 1000, "nothing stops it");
+        };
+        assert!(matches!(refused, GatewayError::Crowded { pool: Pool::Total, .. }), "{refused}");
+        assert_eq!(begun.len(), (2048 << 20) / BEGUN + 1);
+        // What is short needs none, and what is done gives its room back.
+        let short = Inflow::default();
+        short.admit(&quota);
+        short.add(UNIT_BYTES).unwrap();
+        assert!(short.add(1 << 20).is_err());
+        short.done();
+        begun.iter().for_each(Inflow::done);
+        let mut stream = Metered::new(&[7; 200_000][..], Arc::new(short));
+        assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 200_000);
+        assert_eq!(lock(&stream.inflow.held).room.len(), (200_000 - 1) / UNIT_BYTES);
+    }
+}

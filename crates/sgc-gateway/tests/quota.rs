@@ -1,0 +1,135 @@
+//! What one credential has with however many connections, what all other hosts have together, and what stays for programs of
+//! this host.
+#![allow(clippy::unwrap_used)]
+
+mod support;
+
+use std::net::SocketAddr;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use sgc_gateway::{
+    Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Session,
+    SessionLimits, Subscribe,
+};
+use sgc_wire::{History, Qos, UnixMillis};
+
+use support::{STRING, Site, eventually};
+
+const LIMITS: SessionLimits = SessionLimits {
+    waiting_bytes_max: 1 << 20,
+    subscriptions_max: 2,
+    publications_max: 2,
+    servings_max: 2,
+    calls_max: 2,
+    waits_max: 2,
+};
+/// Sessions' worth of one credential, of all other hosts, and in all.
+const SHARES: [usize; 3] = [4, 12, 16];
+
+/// A connection of its own, from there.
+fn session(site: &Site, peer: &str) -> Session {
+    let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
+    let peer: SocketAddr = peer.parse().unwrap();
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64;
+    let admission = Admission {
+        peer,
+        encrypted: true,
+        origin: None,
+        token: None,
+        certificate: None,
+        now: UnixMillis(now),
+    };
+    Session::new(&site.hub, access.admit(&admission).unwrap(), LIMITS)
+}
+
+/// Makes readers of its own by asking for another quality of service each time, on a connection of its own each time.
+async fn flood(site: &Site, peer: &str) -> (Vec<sgc_gateway::Subscription>, GatewayError) {
+    let mut held = Vec::new();
+    loop {
+        let depth = held.len() as u32 + 1;
+        let qos = Some(Qos { history: History::KeepLast(depth), ..Qos::default() });
+        let topic = format!("/of/h{}", peer.split(':').next().unwrap().replace(['.', '['], "_"));
+        let wanted =
+            Subscribe { topic, type_name: Some(STRING.into()), qos, depth: 1, ..Subscribe::default() };
+        match session(site, peer).subscribe(wanted).await {
+            Ok(subscription) => held.push(subscription),
+            Err(why) => return (held, why),
+        }
+        assert!(held.len() <= 1000, "nothing stops it");
+    }
+}
+
+fn is_of(why: &GatewayError, wanted: Pool) -> bool {
+    matches!(why, GatewayError::Crowded { pool, .. } if *pool == wanted)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn many_connections_of_one_host_have_no_more_readers_than_a_few() {
+    let site = Site::new().await;
+    let (held, why) = flood(&site, "10.0.0.1:1").await;
+    assert_eq!(held.len(), SHARES[0] * LIMITS.subscriptions_max);
+    assert!(is_of(&why, Pool::Credential), "{why}");
+    assert_eq!(site.hub.readers(), held.len());
+    // Readers that are left are there for a moment, and count for as long: coming and going makes no more of them.
+    drop(held);
+    let (again, why) = flood(&site, "10.0.0.1:1").await;
+    assert!(is_of(&why, Pool::Credential), "{why}");
+    assert!(site.hub.readers() <= SHARES[0] * LIMITS.subscriptions_max, "{}", site.hub.readers());
+    drop(again);
+    eventually(|| site.hub.readers() == 0).await;
+    // Other hosts have their own, and all of them leave something for this one.
+    let mut all = Vec::new();
+    for n in 2..=9 {
+        let (held, why) = flood(&site, &format!("10.0.0.{n}:1")).await;
+        all.push(held);
+        if is_of(&why, Pool::Remote) {
+            break;
+        }
+    }
+    let (held, why) = flood(&site, "10.0.0.77:1").await;
+    assert!(held.is_empty() && is_of(&why, Pool::Remote), "{why}");
+    let (held, why) = flood(&site, "127.0.0.1:1").await;
+    assert!(held.len() >= (SHARES[2] - SHARES[1]) * LIMITS.subscriptions_max, "{}", held.len());
+    assert!(is_of(&why, Pool::Total), "{why}");
+    let told = "readers on the local network at most for all clients";
+    assert!(
+        why.to_string().ends_with(told) || why.to_string().ends_with("subscriptions at most for all clients")
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn topics_services_and_calls_of_one_host_are_bounded_over_its_connections() {
+    let site = Site::new().await;
+    let at = |n: usize| format!("[2001:db8::{n:x}]:1");
+    let share = SHARES[0] * LIMITS.publications_max;
+    let (mut topics, mut services, mut calls) = (Vec::new(), Vec::new(), Vec::new());
+    let of = Some("std_srvs/srv/SetBool");
+    let mut silent = site.session("program").serve("/silent", of).await.unwrap();
+    for n in 0..share {
+        let host = session(&site, &at(n));
+        let wanted =
+            Advertise { topic: format!("/t{n}"), type_name: Some(STRING.into()), qos: Qos::default() };
+        topics.push(host.advertise(wanted).await.unwrap());
+        services.push(host.serve(&format!("/s{n}"), of).await.unwrap());
+        calls.push(tokio::spawn(async move {
+            let request = Content::json(r#"{"data": true}"#);
+            host.call("/silent", of, &request, Form::Json, Duration::from_secs(60)).await
+        }));
+        silent.next().await.unwrap();
+    }
+    let host = session(&site, &at(share));
+    let wanted = Advertise { topic: "/more".into(), type_name: Some(STRING.into()), qos: Qos::default() };
+    let request = Content::json(r#"{"data": true}"#);
+    let refused = [
+        host.advertise(wanted.clone()).await.unwrap_err(),
+        host.serve("/more", of).await.unwrap_err(),
+        host.call("/silent", of, &request, Form::Json, Duration::from_secs(1)).await.unwrap_err(),
+    ];
+    assert!(refused.iter().all(|why| is_of(why, Pool::Credential)), "{refused:?}");
+    // Another host is another matter, and what ends makes room.
+    let other = session(&site, "[2001:db8:0:1::1]:1");
+    other.advertise(wanted.clone()).await.unwrap();
+    topics.pop();
+    host.advertise(wanted).await.unwrap();
+    calls.iter().for_each(tokio::task::JoinHandle::abort);
+}
