@@ -7,6 +7,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, MutexGuard, PoisonError};
 
 use rustls::sign::CertifiedKey;
@@ -50,7 +51,7 @@ impl FindDefinitions for NodeDefinitions {
 pub(crate) struct Sockets {
     pub(crate) listen: Vec<ListenAt>,
     pub(crate) access: Access,
-    pub(crate) key: Arc<CertifiedKey>,
+    pub(crate) key: ShownKey,
     pub(crate) clients_max: usize,
     pub(crate) client_bytes_max: usize,
 }
@@ -66,8 +67,10 @@ pub(crate) struct Gateway {
     node: String,
     hub: OnceCell<Hub>,
     server: std::sync::Mutex<Option<Arc<Server>>>,
-    /// The certificates that are shown.
+    /// The certificates that are shown. Held by whoever changes them, so that a reload does not undo a renewal.
     shown: std::sync::Mutex<Vec<CertificateDer<'static>>>,
+    /// `true` if these are the node's own, and not those of files that the configuration names.
+    shows_own: AtomicBool,
 }
 
 impl Gateway {
@@ -80,8 +83,9 @@ impl Gateway {
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
         let (types, hub, server) =
             (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
-        let (name, shown) = (node_name.to_owned(), std::sync::Mutex::default());
-        Arc::new(Self { open, types, name, node, hub, server, shown })
+        let (name, shown, shows_own) =
+            (node_name.to_owned(), std::sync::Mutex::default(), AtomicBool::default());
+        Arc::new(Self { open, types, name, node, hub, server, shown, shows_own })
     }
 
     /// The hub, which joins the local network if it has not yet.
@@ -111,28 +115,55 @@ impl Gateway {
             SessionLimits { waiting_bytes_max: sockets.client_bytes_max, ..SessionLimits::default() };
         let Sockets { listen, access, key, clients_max, .. } = sockets;
         let name = format!("sgc {}", self.name);
-        self.show(&key);
+        let key = {
+            let mut shown = self.lock_shown();
+            self.shows_own.store(matches!(key, ShownKey::Own(_)), Ordering::Relaxed);
+            let key = key.certified();
+            shown.clone_from(&key.cert);
+            key
+        };
         let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
         *self.lock() = Some(Arc::new(server));
         Ok(())
     }
 
-    /// Other rules and another certificate from now on; says whether it is another.
-    pub(crate) fn reconfigure(&self, access: Access, key: &Arc<CertifiedKey>) -> Result<bool, ServerError> {
+    /// Replaces the rules and the certificate; returns `true` if the certificate is another one. `key` is called in the moment
+    /// in which the certificate is replaced.
+    pub(crate) fn reconfigure(
+        &self,
+        access: Access,
+        key: impl FnOnce() -> ShownKey,
+    ) -> Result<bool, ServerError> {
         let Some(server) = self.server() else { return Ok(false) };
-        server.reconfigure(access, Some(key))?;
-        Ok(self.show(key))
+        let mut shown = self.lock_shown();
+        let key = key();
+        let shows_own = matches!(key, ShownKey::Own(_));
+        let key = key.certified();
+        server.reconfigure(access, Some(&key))?;
+        self.shows_own.store(shows_own, Ordering::Relaxed);
+        let is_other = *shown != key.cert;
+        shown.clone_from(&key.cert);
+        Ok(is_other)
     }
 
-    /// Keeps which certificates are shown; says whether they are others.
-    fn show(&self, key: &CertifiedKey) -> bool {
-        let mut shown = self.shown.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_other = *shown != key.cert;
-        if is_other {
-            shown.clone_from(&key.cert);
+    /// Takes a renewed certificate of the node: new connections are shown it, unless the configuration names another.
+    pub(crate) fn set_identity(&self, identity: &Identity) {
+        let Some(server) = self.server() else { return };
+        let mut shown = self.lock_shown();
+        server.set_gateway(identity.as_peer().clone());
+        if !self.shows_own.load(Ordering::Relaxed) {
+            return;
         }
-        is_other
+        let key = identity.certified_key();
+        match server.show(&key) {
+            Ok(()) => shown.clone_from(&key.cert),
+            Err(error) => tracing::warn!(%error, "the gateway cannot show the renewed certificate"),
+        }
+    }
+
+    fn lock_shown(&self) -> MutexGuard<'_, Vec<CertificateDer<'static>>> {
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What goes on, if there are sockets.
@@ -191,18 +222,33 @@ pub enum GatewayStartError {
     },
 }
 
-/// What the gateway shows within TLS: what the configuration names, else the node's own certificate. Reads files.
-pub(crate) fn key_of(
-    config: &GatewayConfig,
-    identity: &Identity,
-) -> Result<Arc<CertifiedKey>, GatewayStartError> {
-    let Some(tls) = &config.tls else { return Ok(identity.certified_key()) };
+/// The certificate that the gateway shows within TLS.
+pub(crate) enum ShownKey {
+    /// The one that the configuration names.
+    Files(Arc<CertifiedKey>),
+    /// The certificate of the node itself.
+    Own(Arc<Identity>),
+}
+
+impl ShownKey {
+    fn certified(self) -> Arc<CertifiedKey> {
+        match self {
+            Self::Files(key) => key,
+            Self::Own(identity) => identity.certified_key(),
+        }
+    }
+}
+
+/// The certificate and the key that the configuration names; none if the node's own are shown. Reads files.
+pub(crate) fn key_of_files(config: &GatewayConfig) -> Result<Option<Arc<CertifiedKey>>, GatewayStartError> {
+    let Some(tls) = &config.tls else { return Ok(None) };
     let read = |path: &Path| {
         fs::read(path).map_err(|source| GatewayStartError::File { path: path.to_owned(), source })
     };
     let (certificate, key) = (read(&tls.certificate)?, Zeroizing::new(read(&tls.key)?));
-    certified_key(&certificate, &key)
-        .map_err(|source| GatewayStartError::Certificate { path: tls.certificate.clone(), source })
+    let key = certified_key(&certificate, &key)
+        .map_err(|source| GatewayStartError::Certificate { path: tls.certificate.clone(), source })?;
+    Ok(Some(key))
 }
 
 /// Where to listen, as the gateway has it.
@@ -223,22 +269,44 @@ mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
     use sgc_gateway::Shipped;
+    use sgc_testkit::FakeDomain;
     use sgc_trust::{EnrollRequest, Fleet};
     use sgc_wire::UnixMillis;
 
     use super::*;
 
-    #[test]
-    fn a_reload_says_whether_another_certificate_is_shown() {
+    #[tokio::test]
+    async fn a_renewed_certificate_is_shown_and_a_reload_does_not_undo_it() {
         let (rng, now) = (&mut ChaCha20Rng::seed_from_u64(8), UnixMillis(1_795_000_000_000));
         let mut fleet = Fleet::create("lab".parse().unwrap(), now, rng).unwrap();
-        let mut key = |name: &str| {
-            let request = EnrollRequest::new(name.parse().unwrap(), now);
-            fleet.enroll(&request, rng).unwrap().certified_key()
+        let mut enroll = |name: &str| {
+            Arc::new(fleet.enroll(&EnrollRequest::new(name.parse().unwrap(), now), rng).unwrap())
         };
-        let (one, other) = (key("one"), key("other"));
-        let gateway = Gateway::new(None, "arm-1", Shipped);
-        assert!(gateway.show(&one) && !gateway.show(&one));
-        assert!(gateway.show(&other) && gateway.show(&one));
+        let (first, renewed, file) = (enroll("one"), enroll("two"), enroll("file"));
+        let domain = FakeDomain::default();
+        let open: OpenLocalRos = Arc::new(move || Ok(Arc::new(domain.join(false)) as Arc<dyn LocalRos>));
+        let gateway = Gateway::new(Some(open), "arm-1", Shipped);
+        let at =
+            ListenAt { protocol: Protocol::WebSocket, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
+        let sockets = Sockets {
+            listen: vec![at],
+            access: Access::default(),
+            key: ShownKey::Own(Arc::clone(&first)),
+            clients_max: 8,
+            client_bytes_max: 1 << 20,
+        };
+        gateway.listen(sockets).await.unwrap();
+        let shown = || gateway.lock_shown().clone();
+        assert_eq!(shown(), first.chain());
+        gateway.set_identity(&renewed);
+        assert_eq!(shown(), renewed.chain());
+        let reload = |key: ShownKey| gateway.reconfigure(Access::default(), || key).unwrap();
+        assert!(!reload(ShownKey::Own(Arc::clone(&renewed))), "it is the same");
+        // Where the configuration names a certificate that of the node is not shown.
+        assert!(reload(ShownKey::Files(file.certified_key())));
+        gateway.set_identity(&first);
+        assert_eq!(shown(), file.chain());
+        assert!(reload(ShownKey::Own(first)));
+        gateway.stop().await;
     }
 }

@@ -32,7 +32,9 @@ use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
 use crate::file_watch::FileWatch;
 use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
-use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, key_of, listen_at};
+use crate::gateway::{
+    Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at,
+};
 use crate::heart::Patience;
 use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
@@ -375,7 +377,10 @@ pub async fn run_on<N: RosNetwork>(
             .listen(Sockets {
                 listen: listen_at(wanted),
                 access: access.unwrap_or_default().heard_by(refused_tokens(audit.clone())),
-                key: key_of(wanted, &identity)?,
+                key: match key_of_files(wanted)? {
+                    Some(key) => ShownKey::Files(key),
+                    None => ShownKey::Own(identity.clone()),
+                },
                 clients_max: wanted.clients_max,
                 client_bytes_max: wanted.client_bytes_max.try_into().unwrap_or(usize::MAX),
             })

@@ -23,7 +23,7 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::config::{Config, ConfigErrors, GatewayConfig};
 use crate::core::{CoreEvent, now};
 use crate::credentials::with_kept_crls;
-use crate::gateway::{Gateway, key_of};
+use crate::gateway::{Gateway, ShownKey, key_of_files};
 use crate::message_keys::{MessageKeys, make_for};
 use crate::node::NodeError;
 use crate::rules::Rules;
@@ -76,8 +76,8 @@ struct Prepared {
     /// Whom to believe; nothing if that is as it was.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
-    /// Who may connect to the gateway, and what it shows them; nothing if there is none.
-    gateway: Option<(Access, Arc<CertifiedKey>)>,
+    /// Who may connect to the gateway, and what it shows them if not the node's own certificate; nothing if there is none.
+    gateway: Option<(Access, Option<Arc<CertifiedKey>>)>,
 }
 
 impl Reloader {
@@ -131,7 +131,8 @@ impl Reloader {
 
     /// Carries out `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
-        let (identity, state) = (self.identity.clone(), self.state.clone());
+        // As it is now: it may have been renewed.
+        let (identity, state) = (self.credentials.identity(), self.state.clone());
         let (mut wanted, own, suites) =
             (config.clone(), self.identity.anchors().clone(), running.suites.clone());
         let running_gateway = running.config.gateway.clone();
@@ -153,7 +154,7 @@ impl Reloader {
             wanted.gateway = wanted.gateway.or(running_gateway);
             let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
             let gateway = match access.zip(wanted.gateway.as_ref()) {
-                Some((access, gateway)) => Some((access, key_of(gateway, &identity)?)),
+                Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
                 None => None,
             };
             Ok(Prepared { rules, anchors, message_keys, gateway })
@@ -176,9 +177,13 @@ impl Reloader {
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())?;
         // The control task knows the newest revocation lists.
-        if let Some((access, key)) = gateway {
+        if let Some((access, files)) = gateway {
             let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
-            if self.gateway.reconfigure(access, &key).map_err(|error| error.to_string())? {
+            let key = || match files {
+                Some(key) => ShownKey::Files(key),
+                None => ShownKey::Own(self.credentials.identity()),
+            };
+            if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
                 report.changed.push("who connects to the gateway is shown another certificate".to_owned());
             }
             if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {

@@ -166,6 +166,8 @@ impl<N: RosNetwork> Core<N> {
             routes.set_secret(newest.secret.clone());
         }
         self.credentials.set_identity(identity.clone());
+        // It asks the credentials for the present identity when it is reloaded.
+        self.gateway.set_identity(&identity);
         self.router.set_identity(now, identity.clone());
         self.endpoint.set_identity(now, identity);
         if shows_another {
