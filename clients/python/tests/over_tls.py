@@ -1,4 +1,4 @@
-"""The client over TLS: python over_tls.py CA IDENTITY PORT TOKEN
+"""The client over TLS: python over_tls.py CA IDENTITY TOKEN-FILE PORT TOKEN
 
 CA is that of a gateway called localhost, which lets the node of IDENTITY hear /chatter, and TOKEN whatever it says.
 """
@@ -10,10 +10,17 @@ import sys
 import sgc
 
 
-def main(ca: str, identity: str, port: str, token: str) -> None:
+def main(ca: str, identity: str, token_file: str, port: str, token: str) -> None:
     address = f"grpcs://localhost:{port}"
     # An identity file has both, the certificate and its key.
-    ways = [{"certificate": identity, "key": identity}, {"token": token}]
+    with open(token_file, "w", encoding="ascii") as file:
+        file.write(f"{token}\n")
+    ways = [{"certificate": identity, "key": identity}, {"token": token}, {"token_file": token_file}]
+    try:
+        sgc.connect(address, ca=ca, token=token, token_file=token_file)
+        raise AssertionError("one of the two is enough")
+    except ValueError:
+        pass
     for way in ways:
         with sgc.connect(address, ca=ca, **way) as robot:
             assert next(robot.subscribe("/chatter")).data.startswith("hello ")
@@ -36,4 +43,4 @@ def main(ca: str, identity: str, port: str, token: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:5])
+    main(*sys.argv[1:6])

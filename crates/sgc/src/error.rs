@@ -214,6 +214,13 @@ pub(crate) enum CliError {
     /// A text that is no token.
     #[error("the token cannot be used: {0}")]
     Token(#[from] TokenError),
+    /// A token stands on the command line.
+    #[error(
+        "a token on the command line is shown to every user of this host, and the shell remembers it: give it on standard \
+         input (`sgc use -`), or name a file of mode 0600 that holds it; if others use this host, have its owner \
+         withdraw it and make another"
+    )]
+    TokenShown,
     /// What was asked for cannot be right.
     #[error("{reason}")]
     Cannot {
@@ -346,6 +353,7 @@ impl CliError {
             | Self::Access(_)
             | Self::AccessToken(_)
             | Self::Token(_)
+            | Self::TokenShown
             | Self::Cannot { .. } => EXIT_USAGE,
             Self::Node(NodeError::Listen { .. } | NodeError::Ros(_) | NodeError::Randomness(_)) => {
                 EXIT_FAILURE

@@ -21,7 +21,7 @@ const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
 
 /// Hand one topic to a partner of another fleet.
 ///
-/// The token is printed once and not kept: bring it to the partner on a private way; there, `sgc use TOKEN` takes it. It
+/// The token is printed once and not kept: bring it to the partner on a private way; there, `sgc use FILE` takes it. It
 /// works for nodes of the CA that it was made for, until it ends or is withdrawn.
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("what").required(true))]
@@ -118,7 +118,7 @@ fn give(
     let id = TokenRecords::change(state, |records| records.add(record, now))?;
     output::diagnostic(&format!(
         "Token {id} for {topic}, until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
-         There: sgc use TOKEN. To take it back: sgc share-token --withdraw {id}",
+         There: sgc use -, which reads it from standard input. To take it back: sgc share-token --withdraw {id}",
         token.expires
     ));
     let node = identity.node_name().as_str();

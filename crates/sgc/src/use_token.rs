@@ -23,8 +23,12 @@ const TOKENS_DIR: &str = "tokens";
 /// the file already stays as it is.
 #[derive(Debug, Args)]
 pub(crate) struct UseArgs {
-    /// The token, a file that holds it, or - for standard input, which keeps it out of the shell's history
-    token: String,
+    /// The file that holds the token, or - for standard input
+    #[arg(value_name = "FILE", required_unless_present = "token_file")]
+    token: Option<String>,
+    /// The same as FILE
+    #[arg(long, value_name = "FILE", conflicts_with = "token")]
+    token_file: Option<String>,
     /// The configuration; without it, the one *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -37,7 +41,8 @@ pub(crate) struct UseArgs {
 pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     let path = files::config_here(args.config.as_deref())?;
     let (config, identity, _) = policy::load(&path)?;
-    let text = token_text(&args.token)?;
+    let given = args.token.as_deref().or(args.token_file.as_deref()).unwrap_or("-");
+    let text = token_text(given)?;
     let token = ShareToken::parse(&text)?;
     check(&token, &config)?;
     let node = identity.node_name().as_str();
@@ -79,8 +84,9 @@ fn token_text(given: &str) -> Result<Zeroizing<String>, CliError> {
     let limit = TOKEN_TEXT_BYTES_MAX as u64 + 2;
     let mut text = Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX + 2));
     if given.trim_start().starts_with(TOKEN_PREFIX) {
-        text.push_str(given);
-    } else if given == "-" {
+        return Err(CliError::TokenShown);
+    }
+    if given == "-" {
         if std::io::stdin().is_terminal() {
             output::diagnostic("Paste the token, then end with Ctrl-D:");
         }

@@ -493,8 +493,14 @@ fn a_token_is_used_by_adding_three_lines() {
     ];
     let token = place.good(&args);
     let token = token.trim();
+    place.write("pose.token", token);
+    place.write("cut.token", &token[..token.len() - 3]);
     let before = place.read("cart.toml");
-    let said = place.good(&["use", token, "-c", "cart.toml", "--dry-run"]);
+    // Whoever may list processes would see it.
+    let said = place.bad(2, &["use", token, "-c", "cart.toml"]);
+    assert!(said.contains("is shown to every user of this host") && !said.contains(&token[20..60]), "{said}");
+    assert!(!place.path("cart-state").exists());
+    let said = place.good(&["use", "pose.token", "-c", "cart.toml", "--dry-run"]);
     assert!(
         said.contains("/handoff/pose [geometry_msgs/msg/PoseStamped] of arm-1") && said.contains("[[use]]"),
         "{said}"
@@ -503,7 +509,7 @@ fn a_token_is_used_by_adding_three_lines() {
     assert!(!place.path("cart-state").exists());
 
     fs::set_permissions(place.path("cart.toml"), fs::Permissions::from_mode(0o640)).unwrap();
-    place.good(&["use", token, "-c", "cart.toml"]);
+    place.good(&["use", "--token-file", "pose.token", "-c", "cart.toml"]);
     let after = place.read("cart.toml");
     assert!(after.starts_with(&before) && !after.contains("sgc-token"), "{after}");
     assert_eq!((place.mode("cart.toml"), place.mode("cart-state/tokens")), (0o640, 0o700));
@@ -511,9 +517,9 @@ fn a_token_is_used_by_adding_three_lines() {
     assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o7777, 0o600);
     assert!(Path::new(&file).file_name().unwrap().to_str().unwrap().starts_with("handoff-pose-"));
     assert!(place.good(&["check", "-c", "cart.toml"]).contains("no mistakes"));
-    let said = place.bad(2, &["use", token, "-c", "cart.toml"]);
+    let said = place.bad(2, &["use", "pose.token", "-c", "cart.toml"]);
     assert!(said.contains("used with this very token already"), "{said}");
-    let said = place.bad(2, &["use", &token[..token.len() - 3], "-c", "cart.toml"]);
+    let said = place.bad(2, &["use", "cut.token", "-c", "cart.toml"]);
     assert!(said.contains("cut or mistyped") && !said.contains(&token[20..60]), "{said}");
 
     // The node joins that one name, and says what it waits for.

@@ -176,6 +176,7 @@ def connect(
     address: str,
     *,
     token: Optional[str] = None,
+    token_file: Optional[str] = None,
     ca: Optional[Pem] = None,
     certificate: Optional[Pem] = None,
     key: Optional[Pem] = None,
@@ -185,10 +186,16 @@ def connect(
     """Connects to a gateway.
 
     ``address`` is ``grpc://HOST[:PORT]``, or ``grpcs://HOST[:PORT]`` over TLS. A gateway admits by ``token``
-    (``sgc token create`` makes one), by a client certificate (``certificate`` and its ``key``), or programs of its own
+    (``sgc token create --out FILE`` makes one; ``token_file=FILE`` reads it, which keeps it out of programs and command
+    lines), by a client certificate (``certificate`` and its ``key``), or programs of its own
     host. ``ca`` verifies the gateway, by default whom the system trusts; ``server_name`` is what its certificate calls it,
     if that is not HOST. Files are in PEM.
     """
+    if token_file is not None:
+        if token is not None:
+            raise ValueError("give either token or token_file")
+        with open(token_file, encoding="ascii") as file:
+            token = file.read().strip()
     parts = urlsplit(address if "//" in address else f"grpc://{address}")
     if parts.scheme not in ("grpc", "grpcs") or not parts.hostname:
         raise ValueError(f"{address!r} is no address of a gateway: write grpc://HOST:PORT or grpcs://HOST:PORT")
