@@ -291,6 +291,9 @@ pub enum LinkError {
         /// Its length.
         bytes: usize,
     },
+    /// The peer's handshake is longer than any that is read.
+    #[error("its handshake is longer than any that nodes read: is a node listening there?")]
+    HandshakeTooLong,
     /// A packet that is too long to be sent as a datagram; the link lives, and a flow would take it.
     #[error("a datagram of {bytes} bytes cannot be sent, at most {max} can")]
     DatagramTooLong {
@@ -412,6 +415,9 @@ pub enum Refusal {
         /// True if only post-quantum ones are.
         post_quantum: bool,
     },
+    /// Its handshake is longer than any that is read.
+    #[error("its handshake is longer than any that is read")]
+    HandshakeTooLong,
     /// Its greeting is none.
     #[error("{0}")]
     Greeting(#[source] ProtocolError),
@@ -470,6 +476,7 @@ impl Refusal {
             Self::Certificate(_) => RefusalKind::BadCertificate,
             Self::Version(_) => RefusalKind::Version,
             Self::KeyExchange { .. } => RefusalKind::KeyExchange,
+            Self::HandshakeTooLong => RefusalKind::HandshakeTooLong,
             Self::Greeting(_) => RefusalKind::BadGreeting,
             Self::TimedOut { .. } => RefusalKind::TimedOut,
             Self::TooMany { .. } => RefusalKind::TooMany,

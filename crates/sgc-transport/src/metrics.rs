@@ -23,6 +23,8 @@ pub enum RefusalKind {
     Version,
     /// It offers no key exchange that is accepted here.
     KeyExchange,
+    /// Its handshake is longer than any that is read.
+    HandshakeTooLong,
     /// It connected and then said something that is no greeting.
     BadGreeting,
     /// It did not finish in time.
@@ -39,7 +41,7 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// Every kind, in the order of the counters.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::NoCertificate,
         Self::OtherCa,
         Self::NotAdmitted,
@@ -49,6 +51,7 @@ impl RefusalKind {
         Self::BadCertificate,
         Self::Version,
         Self::KeyExchange,
+        Self::HandshakeTooLong,
         Self::BadGreeting,
         Self::TimedOut,
         Self::TooMany,
@@ -69,6 +72,7 @@ impl RefusalKind {
             Self::BadCertificate => "bad_certificate",
             Self::Version => "version",
             Self::KeyExchange => "key_exchange",
+            Self::HandshakeTooLong => "handshake_too_long",
             Self::BadGreeting => "bad_greeting",
             Self::TimedOut => "timed_out",
             Self::TooMany => "too_many",

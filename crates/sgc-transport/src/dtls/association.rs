@@ -14,6 +14,7 @@ use dimpl::{
 use rustls::AlertDescription;
 use rustls_pki_types::{CertificateDer, UnixTime};
 use sgc_trust::{CertError, VerifiedPeer};
+use sgc_wire::CERT_BYTES_MAX;
 
 use super::front::{self, Inside, Token};
 use super::keys::{Keys, Loan};
@@ -37,8 +38,27 @@ const WORD_PATIENCE: Duration = Duration::from_secs(1);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(20);
 /// How often a refusal is said: it is not acknowledged.
 const REFUSAL_COPIES: usize = 2;
-/// The longest that dimpl may have to hand out, bytes: one record.
-const RECORD_BYTES_MAX: usize = 1 << 15;
+/// Longest datagram that is given to dimpl, bytes. A node's own flights have at most [`FLIGHT_BYTES_MAX`], and a sealed
+/// packet of QUIC is shorter than 1500.
+const DATAGRAM_BYTES_MAX: usize = 2048;
+/// Most datagrams that dimpl keeps of messages that are not complete.
+const QUEUE_RX_DATAGRAMS: usize = 30;
+/// Most datagrams of a flight of ours.
+const QUEUE_TX_DATAGRAMS: usize = 10;
+/// Most records of a flight of ours: one more, and dimpl panics (`dtls13/engine.rs`, `flight_saved_records`).
+const FLIGHT_RECORDS_MAX: usize = 12;
+/// Length of the buffer that dimpl writes into, bytes. dimpl panics unless it holds the peer's certificate, which may
+/// be as long as everything that dimpl keeps.
+const OUTPUT_BYTES: usize = QUEUE_RX_DATAGRAMS * DATAGRAM_BYTES_MAX;
+
+/// A record takes at most this much of a datagram for its headers and its tag, bytes: 13, 12, 8 and 16 in DTLS 1.2.
+const RECORD_OVERHEAD_BYTES: usize = 49;
+/// The messages of a flight besides the certificate, bytes: hellos, requests, a signature and a MAC.
+const FLIGHT_REST_BYTES: usize = 1024;
+const FLIGHT_DATAGRAMS: usize =
+    (CERT_BYTES_MAX + FLIGHT_REST_BYTES).div_ceil(FLIGHT_BYTES_MAX - RECORD_OVERHEAD_BYTES);
+// A flight has at most six messages, and every further datagram begins with the rest of one.
+const _: () = assert!(FLIGHT_DATAGRAMS + 5 <= FLIGHT_RECORDS_MAX && FLIGHT_DATAGRAMS <= QUEUE_TX_DATAGRAMS);
 /// `protocol_version`: of what is spoken inside.
 const ALERT_VERSION: u8 = 70;
 
@@ -49,6 +69,8 @@ static CONFIG: LazyLock<Arc<Config>> = LazyLock::new(|| {
         .flight_start_rto(FLIGHT_RTO)
         .flight_retries(FLIGHT_RETRIES)
         .handshake_timeout(DIMPL_TIMEOUT)
+        .max_queue_rx(QUEUE_RX_DATAGRAMS)
+        .max_queue_tx(QUEUE_TX_DATAGRAMS)
         .with_crypto_provider(provider)
         .build()
         .expect("dimpl accepts its own cipher suites and these numbers");
@@ -62,6 +84,8 @@ pub(super) struct Sink {
     pub(super) packet_lens: Vec<usize>,
     pub(super) data: Vec<u8>,
     pub(super) data_lens: Vec<usize>,
+    /// What dimpl writes into, [`OUTPUT_BYTES`] long once it was used.
+    output: Vec<u8>,
 }
 
 impl Sink {
@@ -106,6 +130,8 @@ pub(super) enum End {
     TimedOut,
     /// It has forgotten us.
     Restarted,
+    /// Its handshake is longer than any that is read.
+    TooLong,
     /// It said so.
     Goodbye,
     /// It is no longer needed here.
@@ -123,6 +149,7 @@ impl End {
             Self::NotOurs => LinkError::RefusedByPeer(PeerRefusal::Version),
             Self::TimedOut => LinkError::HandshakeTimedOut { after },
             Self::Restarted => LinkError::PeerRestarted,
+            Self::TooLong => LinkError::HandshakeTooLong,
             Self::Goodbye | Self::Released => LinkError::RefusedByPeer(PeerRefusal::GaveUp),
             Self::Broken(text) => LinkError::Transport(format!("DTLS: {text}")),
         }
@@ -134,6 +161,7 @@ impl End {
             Self::Refused(why) => Refusal::Certificate(why.clone()),
             Self::ByPeer(why) => Refusal::ByPeer(why.clone()),
             Self::TimedOut | Self::NotOurs => Refusal::TimedOut { after },
+            Self::TooLong => Refusal::HandshakeTooLong,
             Self::Goodbye | Self::Released | Self::Restarted => Refusal::ByPeer(PeerRefusal::GaveUp),
             Self::Broken(text) => Refusal::Transport(format!("DTLS: {text}")),
         }
@@ -187,7 +215,6 @@ pub(super) struct Association {
     certificate: Option<CertificateDer<'static>>,
     /// What a dialer said first, for the case that it has to be said with a ticket.
     first_flight: Vec<Vec<u8>>,
-    scratch: Vec<u8>,
 }
 
 impl Association {
@@ -217,7 +244,6 @@ impl Association {
             stage: Stage::Handshake,
             certificate: None,
             first_flight: Vec::new(),
-            scratch: vec![0; 2048],
         })
     }
 
@@ -239,6 +265,12 @@ impl Association {
         if self.is_ended() || (!self.takes_plaintext() && front::has_plaintext(records)) {
             return false;
         }
+        if records.len() > DATAGRAM_BYTES_MAX {
+            if matches!(self.stage, Stage::Handshake) {
+                self.end(End::TooLong);
+            }
+            return false;
+        }
         if matches!(self.stage, Stage::Handshake)
             || now.saturating_duration_since(self.clock) >= CLOCK_INTERVAL
         {
@@ -246,10 +278,13 @@ impl Association {
             let result = self.dtls.handle_timeout(now);
             self.check(result);
         }
-        match self.dtls.handle_packet(records) {
-            // Anybody could have sent that.
-            Err(Error::UnexpectedMessage(UnexpectedMessageError::UnrecognizedAutoServerResponse)) => {}
-            result => self.check(result),
+        // After an error dimpl is where it may panic, and is only asked for what it has to say.
+        if !self.is_ended() {
+            match self.dtls.handle_packet(records) {
+                // Anybody could have sent that.
+                Err(Error::UnexpectedMessage(UnexpectedMessageError::UnrecognizedAutoServerResponse)) => {}
+                result => self.check(result),
+            }
         }
         self.drain(now, sink)
     }
@@ -401,6 +436,11 @@ impl Association {
         let Err(error) = result else { return };
         self.end(match error {
             Error::Timeout(_) => End::TimedOut,
+            Error::ReceiveQueueFull | Error::TooManyClientHelloFragments
+                if matches!(self.stage, Stage::Handshake) =>
+            {
+                End::TooLong
+            }
             Error::SecurityError(SecurityError::FatalAlert { description }) => {
                 End::ByPeer(PeerRefusal::from_alert(description))
             }
@@ -423,11 +463,13 @@ impl Association {
     /// only the peer can have sent, and not before.
     fn drain(&mut self, now: Instant, sink: &mut Sink) -> bool {
         let mut has_heard = false;
-        let mut buffer = std::mem::take(&mut self.scratch);
+        let mut output = std::mem::take(&mut sink.output);
+        if output.len() < OUTPUT_BYTES {
+            output = vec![0; OUTPUT_BYTES];
+        }
         loop {
-            match self.dtls.poll_output(&mut buffer) {
+            match self.dtls.poll_output(&mut output) {
                 Output::Packet(record) => sink.packet(&self.prefix, record),
-                Output::BufferTooSmall { needed } if needed <= RECORD_BYTES_MAX => buffer.resize(needed, 0),
                 Output::BufferTooSmall { needed } => {
                     self.end(End::Broken(format!("a record of {needed} bytes")));
                     break;
@@ -437,6 +479,11 @@ impl Association {
                     break;
                 }
                 Output::Connected => self.connected(now),
+                Output::PeerCert(leaf) if leaf.len() > CERT_BYTES_MAX => {
+                    let bytes = leaf.len();
+                    self.end(End::Refused(CertError::CertificateTooLong { bytes }));
+                    break;
+                }
                 Output::PeerCert(leaf) => self.certificate = Some(leaf.to_vec().into()),
                 Output::ApplicationData(data) => {
                     self.heard = now;
@@ -452,7 +499,7 @@ impl Association {
                 _ => {}
             }
         }
-        self.scratch = buffer;
+        sink.output = output;
         has_heard
     }
 

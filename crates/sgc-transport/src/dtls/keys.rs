@@ -11,6 +11,7 @@ use dimpl::crypto::{Buf, HashAlgorithm, KeyProvider, SignatureAlgorithm, Signing
 use dimpl::{CryptoError, CryptoOperation};
 use rustls::SignatureScheme;
 use rustls::sign::CertifiedKey;
+use sgc_wire::CERT_BYTES_MAX;
 
 static NEXT: AtomicU64 = AtomicU64::new(0);
 static LENT: LazyLock<Mutex<HashMap<u64, Arc<CertifiedKey>>>> = LazyLock::new(Mutex::default);
@@ -27,10 +28,10 @@ pub(super) struct Loan {
 }
 
 impl Loan {
-    /// `None` if DTLS cannot use the key.
+    /// `None` if DTLS cannot use the key, or the certificate is longer than those that nodes read.
     pub(super) fn new(key: Arc<CertifiedKey>) -> Option<Self> {
         scheme(&key)?;
-        let leaf = key.cert.first()?.to_vec();
+        let leaf = key.cert.first().filter(|leaf| leaf.len() <= CERT_BYTES_MAX)?.to_vec();
         let number = NEXT.fetch_add(1, Relaxed);
         lent().insert(number, key);
         let certificate = DtlsCertificate { certificate: leaf, private_key: number.to_be_bytes().to_vec() };

@@ -477,7 +477,7 @@ impl Mux {
                 // Who said no more than a hello may be nobody; a link that was says itself why it ended.
                 let is_news = match end {
                     End::TimedOut => state.datagrams > 1,
-                    End::Refused(_) | End::ByPeer(_) => true,
+                    End::Refused(_) | End::ByPeer(_) | End::TooLong => true,
                     End::Broken(_) => !was_up,
                     End::Goodbye => state.association.is_unused(),
                     _ => false,
@@ -501,21 +501,20 @@ impl Mux {
     }
 
     /// Does what is due, and says when to come again.
-    fn tick(&self, now: Instant) -> Instant {
+    fn tick(&self, now: Instant, sink: &mut Sink) -> Instant {
         let peers: Vec<_> = lock(&self.tables).by_id.values().cloned().collect();
         let mut next = now + TICK_MAX;
-        let mut sink = Sink::default();
         for peer in peers {
             sink.clear();
             let mut state = lock(&peer.state);
             if state.released.is_some_and(|at| at <= now) {
-                state.association.close(End::Released, now, &mut sink);
+                state.association.close(End::Released, now, sink);
             } else if !peer.is_proven.load(Relaxed) && now >= state.touched + UNPROVEN_PATIENCE {
                 state.association.end(End::TimedOut);
             } else {
-                state.association.tick(now, &mut sink);
+                state.association.tick(now, sink);
             }
-            self.transmit(&sink, state.addresses[0], state.src_ip);
+            self.transmit(sink, state.addresses[0], state.src_ip);
             next = next.min(state.association.due());
             self.settle(&peer, &mut state);
         }
@@ -616,7 +615,8 @@ pub(super) async fn wait_until_up(
 
 /// Drives the timers of a socket for as long as it is used.
 async fn keep_time(mux: Weak<Mux>, wake: Arc<Notify>) {
-    while let Some(next) = mux.upgrade().map(|mux| mux.tick(Instant::now())) {
+    let mut sink = Sink::default();
+    while let Some(next) = mux.upgrade().map(|mux| mux.tick(Instant::now(), &mut sink)) {
         tokio::select! {
             () = tokio::time::sleep_until(next.into()) => {}
             () = wake.notified() => {}

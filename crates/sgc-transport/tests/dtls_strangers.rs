@@ -1,0 +1,144 @@
+//! Strangers that meet a node over DTLS: certificates of any length, and listeners that are nobody.
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
+#[path = "support/stranger.rs"]
+mod stranger;
+mod support;
+
+use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::Duration;
+
+use dimpl::ProtocolVersion;
+use sgc_transport::*;
+use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX};
+use sgc_wire::CERT_BYTES_MAX;
+use stranger::{FakeListener, LongCertificate, VERSIONS, visit};
+use support::*;
+use tokio::process::Command;
+
+/// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot send
+/// longer ones.
+fn long(version: ProtocolVersion) -> &'static [(usize, usize)] {
+    match version {
+        ProtocolVersion::DTLS1_2 => &[(2100, 1150), (5000, 1150), (20_000, 2000), (50_000, 2000)],
+        _ => &[(2100, 1150), (5000, 1150), (8000, 2000)],
+    }
+}
+
+/// A certificate that is read is judged by its CA; a longer one by its length.
+fn is_judged(reason: &CertError, bytes: usize) -> bool {
+    match reason {
+        CertError::UnknownIssuer => bytes < CERT_BYTES_MAX,
+        CertError::CertificateTooLong { bytes: found } => *found >= bytes && bytes >= CERT_BYTES_MAX,
+        _ => false,
+    }
+}
+
+/// An honest node still gets a link, so nothing panicked.
+async fn still_serves(server: &mut Server, fleet: &sgc_trust::Fleet) {
+    dial(enroll(fleet, "arm-1"), &server.url).await.unwrap();
+    server.link().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn listener_survives_long_certificates_of_openssl() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let dir: PathBuf = std::env::temp_dir().join(format!("sgc-long-{}", std::process::id()));
+    std::fs::create_dir_all(&dir).unwrap();
+    for bytes in [2100, 8000, 16_000, 100_000] {
+        let long = LongCertificate::new(bytes);
+        let (leaf, key) = (dir.join("leaf.pem"), dir.join("key.pem"));
+        std::fs::write(&leaf, long.certificate.pem()).unwrap();
+        std::fs::write(&key, long.key.serialize_pem()).unwrap();
+        for mtu in ["1200", "16000"] {
+            let mut child = Command::new("openssl")
+                .args(["s_client", "-dtls1_2", "-mtu", mtu, "-connect", &server.addr.to_string(), "-cert"])
+                .arg(&leaf)
+                .arg("-key")
+                .arg(&key)
+                .stdin(Stdio::piped())
+                .stdout(Stdio::null())
+                .stderr(Stdio::null())
+                .kill_on_drop(true)
+                .spawn()
+                .expect("this test needs the program `openssl`");
+            let refused = server.refusal().await;
+            let is_expected = match &refused.reason {
+                Refusal::Certificate(reason) => is_judged(reason, bytes),
+                Refusal::HandshakeTooLong => bytes == 100_000 || mtu == "16000",
+                _ => false,
+            };
+            assert!(is_expected, "{bytes} bytes in datagrams of {mtu}: {refused}");
+            let _ = child.start_kill();
+            let _ = child.wait().await;
+        }
+    }
+    let _ = std::fs::remove_dir_all(&dir);
+    still_serves(&mut server, &fleet).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn listener_survives_long_certificates_in_both_versions() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    for version in VERSIONS {
+        for &(bytes, datagram_bytes) in long(version) {
+            let certificate = LongCertificate::new(bytes).for_dtls();
+            let addr = server.addr;
+            let visiting = tokio::task::spawn_blocking(move || {
+                visit(addr, version, &certificate, datagram_bytes, Duration::from_secs(2))
+            });
+            let refused = server.refusal().await;
+            let Refusal::Certificate(reason) = &refused.reason else {
+                panic!("{version:?} {bytes}: {refused}")
+            };
+            assert!(is_judged(reason, bytes), "{version:?} {bytes}: {refused}");
+            visiting.await.unwrap();
+        }
+    }
+    let counted: u64 =
+        [RefusalKind::OtherCa, RefusalKind::BadCertificate].map(|k| server.metrics.refused(k)).iter().sum();
+    assert_eq!(counted, VERSIONS.iter().map(|version| long(*version).len() as u64).sum::<u64>());
+    still_serves(&mut server, &fleet).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dialer_survives_long_certificates_in_both_versions() {
+    let fleet = fleet(1);
+    let dialer = dialer(enroll(&fleet, "arm-1"));
+    for version in VERSIONS {
+        for &(bytes, datagram_bytes) in long(version) {
+            let certificate = LongCertificate::new(bytes).for_dtls();
+            let fake = FakeListener::start(version, certificate, datagram_bytes);
+            let url = format!("dtls://{}", fake.addr).parse().unwrap();
+            let error = dial_with(&dialer, &url).await.unwrap_err();
+            let LinkError::RefusedHere(reason) = &error else { panic!("{version:?} {bytes}: {error}") };
+            assert!(is_judged(reason, bytes), "{version:?} {bytes}: {error}");
+            fake.stop();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn members_with_as_many_groups_as_there_may_be_link() {
+    let fleet = fleet(1);
+    let identity = |name: &str| {
+        let groups = (0..GROUPS_MAX).map(|n| format!("{n:02}{}", "g".repeat(62)).parse().unwrap()).collect();
+        let request = EnrollRequest { groups, ..EnrollRequest::new(name.parse().unwrap(), now()) };
+        std::sync::Arc::new(fleet.issue(&request, &mut rng()).unwrap())
+    };
+    let (near, far) = (identity(&"a".repeat(64)), identity(&"b".repeat(64)));
+    assert!(near.chain()[0].len() > 2048, "{}", near.chain()[0].len());
+    let mut server = Server::start_on("dtls", far, LinkOptions::default());
+    let link = dial(near, &server.url).await.unwrap();
+    let far = server.link().await;
+    link.send_control(bytes::Bytes::from_static(b"long")).await.unwrap();
+    assert_eq!(soon(far.recv_control()).await.unwrap(), "long");
+}
+
+fn rng() -> rand_chacha::ChaCha20Rng {
+    use rand_core::SeedableRng as _;
+    rand_chacha::ChaCha20Rng::seed_from_u64(7)
+}
