@@ -309,6 +309,7 @@ pub async fn run_on<N: RosNetwork>(
         congestion: config.transport.congestion,
         offload: config.transport.offload,
         mtu_discovery: config.transport.mtu_discovery,
+        dtls12: config.transport.dtls12,
         dscp: config.transport.dscp,
         ..LinkOptions::default()
     };

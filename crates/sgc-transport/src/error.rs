@@ -294,6 +294,12 @@ pub enum LinkError {
     /// The peer's handshake is longer than any that is read.
     #[error("its handshake is longer than any that nodes read: is a node listening there?")]
     HandshakeTooLong,
+    /// The listener has no DTLS 1.3.
+    #[error(
+        "the listener speaks DTLS 1.2 only, in which everyone on the way sees both certificates: upgrade it, or set \
+         `dtls_1_2 = true` in [transport]"
+    )]
+    DtlsVersion,
     /// A packet that is too long to be sent as a datagram; the link lives, and a flow would take it.
     #[error("a datagram of {bytes} bytes cannot be sent, at most {max} can")]
     DatagramTooLong {

@@ -46,6 +46,9 @@ pub struct LinkOptions {
     /// Whether links over UDP look for the longest packet that the path carries; else they stay at 1200 bytes. What DTLS
     /// carries is at most 1340 bytes long.
     pub mtu_discovery: bool,
+    /// Whether DTLS 1.2 is spoken with listeners that have no 1.3. Anyone on the way can then make a dialer fall back to it, and
+    /// sees the certificates of both ends.
+    pub dtls12: bool,
     /// The code point of differentiated services (RFC 2474), 0 to 63, that everything a link sends is marked with.
     pub dscp: Option<u8>,
     /// What decides how much may be under way.
@@ -71,6 +74,7 @@ impl Default for LinkOptions {
             post_quantum: false,
             offload: true,
             mtu_discovery: true,
+            dtls12: false,
             dscp: None,
             congestion: Congestion::Delay,
         }
@@ -91,6 +95,7 @@ impl fmt::Debug for LinkOptions {
             .field("post_quantum", &self.post_quantum)
             .field("offload", &self.offload)
             .field("mtu_discovery", &self.mtu_discovery)
+            .field("dtls12", &self.dtls12)
             .field("dscp", &self.dscp)
             .field("congestion", &self.congestion)
             .finish_non_exhaustive()

@@ -162,7 +162,11 @@ async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     );
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     until(&mut lines, "ACCEPT").await;
-    let options = LinkOptions { handshake_timeout: Duration::from_millis(1500), ..LinkOptions::default() };
+    let options = LinkOptions {
+        handshake_timeout: Duration::from_millis(1500),
+        dtls12: true,
+        ..LinkOptions::default()
+    };
     let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
     let url = format!("dtls://{accept}").parse().unwrap();
     let error = dial_with(&dialer, &url).await.unwrap_err();

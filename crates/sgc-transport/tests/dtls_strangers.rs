@@ -7,13 +7,14 @@ mod support;
 
 use std::path::PathBuf;
 use std::process::Stdio;
+use std::sync::Arc;
 use std::time::Duration;
 
-use dimpl::ProtocolVersion;
+use dimpl::{DtlsCertificate, ProtocolVersion};
 use sgc_transport::*;
-use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX};
+use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX, Identity};
 use sgc_wire::CERT_BYTES_MAX;
-use stranger::{FakeListener, LongCertificate, VERSIONS, visit};
+use stranger::{Encounter, FakeListener, LongCertificate, VERSIONS, visit};
 use support::*;
 use tokio::process::Command;
 
@@ -107,7 +108,8 @@ async fn listener_survives_long_certificates_in_both_versions() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn dialer_survives_long_certificates_in_both_versions() {
     let fleet = fleet(1);
-    let dialer = dialer(enroll(&fleet, "arm-1"));
+    let options = LinkOptions { dtls12: true, ..LinkOptions::default() };
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
     for version in VERSIONS {
         for &(bytes, datagram_bytes) in long(version) {
             let certificate = LongCertificate::new(bytes).for_dtls();
@@ -127,7 +129,7 @@ async fn members_with_as_many_groups_as_there_may_be_link() {
     let identity = |name: &str| {
         let groups = (0..GROUPS_MAX).map(|n| format!("{n:02}{}", "g".repeat(62)).parse().unwrap()).collect();
         let request = EnrollRequest { groups, ..EnrollRequest::new(name.parse().unwrap(), now()) };
-        std::sync::Arc::new(fleet.issue(&request, &mut rng()).unwrap())
+        Arc::new(fleet.issue(&request, &mut rng()).unwrap())
     };
     let (near, far) = (identity(&"a".repeat(64)), identity(&"b".repeat(64)));
     assert!(near.chain()[0].len() > 2048, "{}", near.chain()[0].len());
@@ -141,4 +143,79 @@ async fn members_with_as_many_groups_as_there_may_be_link() {
 fn rng() -> rand_chacha::ChaCha20Rng {
     use rand_core::SeedableRng as _;
     rand_chacha::ChaCha20Rng::seed_from_u64(7)
+}
+
+/// A member's certificate and key, for a DTLS that is not ours.
+fn for_dtls(identity: &Identity) -> DtlsCertificate {
+    let text = identity.to_text();
+    let (begin, end) = ("-----BEGIN PRIVATE KEY-----", "-----END PRIVATE KEY-----");
+    let start = text.find(begin).unwrap();
+    let stop = text[start..].find(end).unwrap() + start + end.len();
+    let key = rcgen::KeyPair::from_pem(&text[start..stop]).unwrap();
+    DtlsCertificate { certificate: identity.chain()[0].to_vec(), private_key: key.serialize_der() }
+}
+
+/// Nobody who shook hands was shown a certificate, and none was on the wire in the clear.
+fn saw_nothing(met: &[Encounter], leaf: &[u8]) {
+    // The key and what follows it, which is in no other certificate.
+    let secret = &leaf[leaf.len() / 2..leaf.len() / 2 + 24];
+    assert!(!met.is_empty());
+    for met in met {
+        assert_eq!(met.certificate, None);
+        assert!(!met.is_connected);
+        let is_in = |datagram: &Vec<u8>| datagram.windows(secret.len()).any(|bytes| bytes == secret);
+        assert!(!met.received.iter().any(is_in), "the certificate was sent in the clear");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dialer_shows_its_certificate_to_members_only() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let options = LinkOptions { dtls12: true, ..LinkOptions::default() };
+    let dialer = Dialer::new(Arc::clone(&arm), options, Arc::default());
+    for version in VERSIONS {
+        let fake = FakeListener::start(version, LongCertificate::new(10).for_dtls(), 1150);
+        let url = format!("dtls://{}", fake.addr).parse().unwrap();
+        let error = dial_with(&dialer, &url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedHere(CertError::UnknownIssuer)), "{version:?}: {error}");
+        saw_nothing(&fake.stop(), &arm.chain()[0]);
+    }
+    // A member is shown it, in the clear in DTLS 1.2: so it would have been seen.
+    for version in VERSIONS {
+        let fake = FakeListener::start(version, for_dtls(&enroll(&fleet, "router")), 1150);
+        let url = format!("dtls://{}", fake.addr).parse().unwrap();
+        dial_with(&dialer, &url).await.unwrap_err();
+        let met = fake.stop();
+        assert!(met.iter().any(|met| met.certificate.as_deref() == Some(&arm.chain()[0])), "{version:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dialer_is_not_talked_out_of_dtls13() {
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let options = LinkOptions { handshake_timeout: Duration::from_secs(1), ..LinkOptions::default() };
+    let dialer = Dialer::new(Arc::clone(&arm), options, Arc::default());
+    // Of the fleet even, so that nothing but the version is against it.
+    let fake = FakeListener::start(ProtocolVersion::DTLS1_2, for_dtls(&enroll(&fleet, "router")), 1150);
+    let url = format!("dtls://{}", fake.addr).parse().unwrap();
+    let error = dial_with(&dialer, &url).await.unwrap_err();
+    assert!(matches!(error, LinkError::DtlsVersion), "{error}");
+    saw_nothing(&fake.stop(), &arm.chain()[0]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn listener_is_told_why_a_dialer_does_not_go_on() {
+    let (ours, theirs) = (fleet(1), fleet(2));
+    for dtls12 in [false, true] {
+        let mut server = Server::start_on("dtls", enroll(&ours, "router"), LinkOptions::default());
+        let options = LinkOptions { dtls12, ..LinkOptions::default() };
+        let dialer = Dialer::new(enroll(&theirs, "arm-1"), options, Arc::default());
+        let error = dial_with(&dialer, &server.url).await.unwrap_err();
+        assert!(matches!(error, LinkError::RefusedHere(CertError::UnknownIssuer)), "{error}");
+        let refused = server.refusal().await;
+        assert!(matches!(refused.reason, Refusal::ByPeer(PeerRefusal::OtherCa)), "{refused}");
+        assert_eq!(server.metrics.refused(RefusalKind::OtherCa), 1);
+    }
 }

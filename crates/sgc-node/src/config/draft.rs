@@ -171,6 +171,7 @@ pub(super) struct TransportDraft {
     pub(super) congestion: Option<Located<String>>,
     pub(super) offload: Option<Located<bool>>,
     pub(super) mtu_discovery: Option<Located<bool>>,
+    pub(super) dtls_1_2: Option<Located<bool>>,
     pub(super) dscp: Option<Located<String>>,
     pub(super) lane_dscp: Option<Located<String>>,
 }

@@ -130,6 +130,8 @@ pub struct TransportConfig {
     pub offload: bool,
     /// Whether the longest packet that a path carries is looked for.
     pub mtu_discovery: bool,
+    /// Whether listeners that speak DTLS 1.2 only are dialled, to whom certificates go in the clear.
+    pub dtls12: bool,
     /// What packets are marked with, 0 to 63.
     pub dscp: Option<u8>,
     /// The same for connections of single topics that this node dials.
@@ -139,7 +141,7 @@ pub struct TransportConfig {
 impl Default for TransportConfig {
     fn default() -> Self {
         let congestion = Congestion::default();
-        Self { congestion, offload: true, mtu_discovery: true, dscp: None, lane_dscp: None }
+        Self { congestion, offload: true, mtu_discovery: true, dtls12: false, dscp: None, lane_dscp: None }
     }
 }
 

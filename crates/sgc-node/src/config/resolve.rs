@@ -517,6 +517,7 @@ impl Resolver<'_> {
             congestion: congestion.unwrap_or_default(),
             offload: written.offload.as_ref().is_none_or(|offload| offload.value),
             mtu_discovery: written.mtu_discovery.as_ref().is_none_or(|looks| looks.value),
+            dtls12: written.dtls_1_2.as_ref().is_some_and(|takes| takes.value),
             dscp: written.dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
             lane_dscp: written.lane_dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
         }

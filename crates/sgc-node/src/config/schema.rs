@@ -147,7 +147,7 @@ impl Table {
                 "link",
             ],
             Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
-            Self::Transport => &["congestion", "offload", "mtu_discovery", "dscp", "lane_dscp"],
+            Self::Transport => &["congestion", "offload", "mtu_discovery", "dtls_1_2", "dscp", "lane_dscp"],
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],

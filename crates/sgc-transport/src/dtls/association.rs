@@ -16,7 +16,7 @@ use rustls_pki_types::{CertificateDer, UnixTime};
 use sgc_trust::{CertError, VerifiedPeer};
 use sgc_wire::CERT_BYTES_MAX;
 
-use super::front::{self, Inside, Token};
+use super::front::{self, Echo, Inside, Token};
 use super::keys::{Keys, Loan};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, Refusal};
@@ -61,6 +61,8 @@ const FLIGHT_DATAGRAMS: usize =
 const _: () = assert!(FLIGHT_DATAGRAMS + 5 <= FLIGHT_RECORDS_MAX && FLIGHT_DATAGRAMS <= QUEUE_TX_DATAGRAMS);
 /// `protocol_version`: of what is spoken inside.
 const ALERT_VERSION: u8 = 70;
+/// `handshake_failure`: what listeners without DTLS 1.3 answer as well.
+const ALERT_HANDSHAKE_FAILURE: u8 = 40;
 
 static CONFIG: LazyLock<Arc<Config>> = LazyLock::new(|| {
     let provider = CryptoProvider { key_provider: &Keys, ..aws_lc_rs::default_provider() };
@@ -113,6 +115,8 @@ pub(super) struct Setup<'a> {
     pub(super) credentials: &'a CredentialStore,
     pub(super) options: &'a LinkOptions,
     pub(super) is_dialer: bool,
+    /// The beginning of the dialer's random, as far as a listener has it.
+    pub(super) echo: Option<Echo>,
     /// What the peer is to put in front of its records, and how the end of that would look.
     pub(super) id: u64,
     pub(super) reset: Token,
@@ -132,6 +136,8 @@ pub(super) enum End {
     Restarted,
     /// Its handshake is longer than any that is read.
     TooLong,
+    /// It has no DTLS 1.3, and this node does not dial with 1.2.
+    OldVersion,
     /// It said so.
     Goodbye,
     /// It is no longer needed here.
@@ -150,6 +156,7 @@ impl End {
             Self::TimedOut => LinkError::HandshakeTimedOut { after },
             Self::Restarted => LinkError::PeerRestarted,
             Self::TooLong => LinkError::HandshakeTooLong,
+            Self::OldVersion => LinkError::DtlsVersion,
             Self::Goodbye | Self::Released => LinkError::RefusedByPeer(PeerRefusal::GaveUp),
             Self::Broken(text) => LinkError::Transport(format!("DTLS: {text}")),
         }
@@ -160,7 +167,7 @@ impl End {
         match self {
             Self::Refused(why) => Refusal::Certificate(why.clone()),
             Self::ByPeer(why) => Refusal::ByPeer(why.clone()),
-            Self::TimedOut | Self::NotOurs => Refusal::TimedOut { after },
+            Self::TimedOut | Self::NotOurs | Self::OldVersion => Refusal::TimedOut { after },
             Self::TooLong => Refusal::HandshakeTooLong,
             Self::Goodbye | Self::Released | Self::Restarted => Refusal::ByPeer(PeerRefusal::GaveUp),
             Self::Broken(text) => Refusal::Transport(format!("DTLS: {text}")),
@@ -197,6 +204,10 @@ pub(super) struct Association {
     _key: Loan,
     credentials: CredentialStore,
     is_dialer: bool,
+    /// The dialer takes a listener that has no DTLS 1.3.
+    takes_dtls12: bool,
+    /// Something came that a listener without DTLS 1.3 answers.
+    has_met_dtls12: bool,
     handshake_timeout: Duration,
     idle_timeout: Duration,
     id: u64,
@@ -213,6 +224,10 @@ pub(super) struct Association {
     is_claimed: bool,
     stage: Stage,
     certificate: Option<CertificateDer<'static>>,
+    /// Who a listener is, as its certificate says: a dialer judges it before it shows its own.
+    listener: Option<Box<VerifiedPeer>>,
+    /// The beginning of the random of the dialer's hello.
+    echo: Option<Echo>,
     /// What a dialer said first, for the case that it has to be said with a ticket.
     first_flight: Vec<Vec<u8>>,
 }
@@ -221,7 +236,14 @@ impl Association {
     /// `None` if DTLS cannot use the key of the identity.
     pub(super) fn new(setup: &Setup<'_>, now: Instant) -> Option<Self> {
         let key = Loan::new(setup.credentials.identity().certified_key())?;
-        let mut dtls = Dtls::new_auto(Arc::clone(&CONFIG), key.certificate(), now);
+        let takes_dtls12 = setup.options.dtls12;
+        // A listener tells the version from the hello. A dialer that has asked for both may be talked out of 1.3 by
+        // anyone on the way, and in 1.2 certificates travel in the clear.
+        let mut dtls = if setup.is_dialer && !takes_dtls12 {
+            Dtls::new_13(Arc::clone(&CONFIG), key.certificate(), now)
+        } else {
+            Dtls::new_auto(Arc::clone(&CONFIG), key.certificate(), now)
+        };
         if setup.is_dialer {
             dtls.set_active(true);
         }
@@ -230,6 +252,8 @@ impl Association {
             _key: key,
             credentials: setup.credentials.clone(),
             is_dialer: setup.is_dialer,
+            takes_dtls12,
+            has_met_dtls12: false,
             handshake_timeout: setup.options.handshake_timeout,
             idle_timeout: setup.options.idle_timeout,
             id: setup.id,
@@ -243,6 +267,8 @@ impl Association {
             is_claimed: false,
             stage: Stage::Handshake,
             certificate: None,
+            listener: None,
+            echo: setup.echo,
             first_flight: Vec::new(),
         })
     }
@@ -258,6 +284,7 @@ impl Association {
             self.first_flight.push(sink.packets[at..at + len].to_vec());
             at += len;
         }
+        self.echo = self.first_flight.first().and_then(|hello| front::client_hello(hello));
     }
 
     /// Takes one datagram's records. True if something in it was authentic and new.
@@ -270,6 +297,9 @@ impl Association {
                 self.end(End::TooLong);
             }
             return false;
+        }
+        if self.is_dialer && !self.takes_dtls12 && matches!(self.stage, Stage::Handshake) {
+            self.has_met_dtls12 |= front::is_without_dtls13(records);
         }
         if matches!(self.stage, Stage::Handshake)
             || now.saturating_duration_since(self.clock) >= CLOCK_INTERVAL
@@ -312,6 +342,8 @@ impl Association {
         }
         let is_late = now >= self.started + self.handshake_timeout;
         match &mut self.stage {
+            // Who forges the answer of an old listener changes no more than this word.
+            Stage::Handshake if is_late && self.has_met_dtls12 => self.end(End::OldVersion),
             Stage::Handshake if is_late => self.end(End::TimedOut),
             Stage::Asking { .. } if is_late => self.end(End::NotOurs),
             Stage::Asking { next, interval, .. } if *next <= now => {
@@ -359,9 +391,16 @@ impl Association {
         }
     }
 
-    /// The random of the first ClientHello.
-    pub(super) fn echo(&self) -> Option<front::Echo> {
-        self.first_flight.first().and_then(|hello| front::client_hello(hello))
+    /// The beginning of the random of the dialer's hello.
+    pub(super) fn echo(&self) -> Option<Echo> {
+        self.echo
+    }
+
+    /// The peer refuses our certificate before the handshake is over, if this is the echo of the hello that began it.
+    pub(super) fn refused_by_peer(&mut self, alert: u8, echo: &Echo) {
+        if matches!(self.stage, Stage::Handshake) && self.echo.as_ref() == Some(echo) {
+            self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
+        }
     }
 
     /// The listener has forgotten the association, if this is what it said.
@@ -441,6 +480,11 @@ impl Association {
             {
                 End::TooLong
             }
+            Error::SecurityError(SecurityError::FatalAlert {
+                description: ALERT_VERSION | ALERT_HANDSHAKE_FAILURE,
+            }) if self.is_dialer && !self.takes_dtls12 && matches!(self.stage, Stage::Handshake) => {
+                End::OldVersion
+            }
             Error::SecurityError(SecurityError::FatalAlert { description }) => {
                 End::ByPeer(PeerRefusal::from_alert(description))
             }
@@ -479,12 +523,13 @@ impl Association {
                     break;
                 }
                 Output::Connected => self.connected(now),
-                Output::PeerCert(leaf) if leaf.len() > CERT_BYTES_MAX => {
-                    let bytes = leaf.len();
-                    self.end(End::Refused(CertError::CertificateTooLong { bytes }));
-                    break;
+                Output::PeerCert(leaf) => {
+                    if let Err(why) = self.take_certificate(leaf) {
+                        // What dimpl has to send holds our own certificate in DTLS 1.2, and stays there.
+                        self.refuse_early(why, sink);
+                        break;
+                    }
                 }
-                Output::PeerCert(leaf) => self.certificate = Some(leaf.to_vec().into()),
                 Output::ApplicationData(data) => {
                     self.heard = now;
                     has_heard = true;
@@ -503,32 +548,57 @@ impl Association {
         has_heard
     }
 
+    /// Keeps the peer's certificate. A dialer judges it here: dimpl has checked the listener's signature in DTLS 1.2, and
+    /// shows nothing of ours before it has done so in 1.3.
+    fn take_certificate(&mut self, leaf: &[u8]) -> Result<(), CertError> {
+        if leaf.len() > CERT_BYTES_MAX {
+            return Err(CertError::CertificateTooLong { bytes: leaf.len() });
+        }
+        let leaf = CertificateDer::from(leaf.to_vec());
+        if self.is_dialer {
+            let chain = std::slice::from_ref(&leaf);
+            let peer = tls::judge(&self.credentials, chain, UnixTime::now(), false)?;
+            self.listener = Some(Box::new(peer));
+        }
+        self.certificate = Some(leaf);
+        Ok(())
+    }
+
+    /// Refuses the peer's certificate in a handshake that is not over, and says so outside of DTLS.
+    fn refuse_early(&mut self, why: CertError, sink: &mut Sink) {
+        if let Some(echo) = &self.echo {
+            let word = front::refusal(tls_alert(&why), echo);
+            for _ in 0..REFUSAL_COPIES {
+                sink.packet(&[], &word);
+            }
+        }
+        self.end(End::Refused(why));
+    }
+
     /// The handshake is over; whose it was is judged here, before anything else of the peer counts.
     fn connected(&mut self, now: Instant) {
         if !matches!(self.stage, Stage::Handshake) {
             return;
         }
         self.first_flight.clear();
-        let chain = self.certificate.as_slice();
-        let verdict = match chain {
-            [] => Err(CertError::NoCertificate),
-            chain => tls::judge(&self.credentials, chain, UnixTime::now(), !self.is_dialer),
-        };
-        match (verdict, self.is_dialer) {
-            (Ok(peer), true) => {
-                let next = now + ASK_INTERVAL;
-                self.stage = Stage::Asking { peer: Box::new(peer), next, interval: ASK_INTERVAL };
-                self.say(Inside::Ask);
-            }
-            (Ok(peer), false) => self.stage = Stage::Up { peer: Box::new(peer), since: now },
-            (Err(why), true) => self.refuse(why),
-            (Err(why), false) => self.stage = Stage::Refusing { why, until: now + WORD_PATIENCE },
+        if self.is_dialer {
+            let Some(peer) = self.listener.take() else { return self.refuse(CertError::NoCertificate) };
+            self.stage = Stage::Asking { peer, next: now + ASK_INTERVAL, interval: ASK_INTERVAL };
+            return self.say(Inside::Ask);
         }
+        let verdict = match self.certificate.as_slice() {
+            [] => Err(CertError::NoCertificate),
+            chain => tls::judge(&self.credentials, chain, UnixTime::now(), true),
+        };
+        self.stage = match verdict {
+            Ok(peer) => Stage::Up { peer: Box::new(peer), since: now },
+            Err(why) => Stage::Refusing { why, until: now + WORD_PATIENCE },
+        };
     }
 
     /// Tells the peer why, and ends.
     fn refuse(&mut self, why: CertError) {
-        let alert = u8::from(AlertDescription::from(tls::alert(&why)));
+        let alert = tls_alert(&why);
         for _ in 0..REFUSAL_COPIES {
             self.say(Inside::Refused { alert });
         }
@@ -563,4 +633,9 @@ impl Association {
             (Inside::Ask, true) | (Inside::Answer { .. }, false) | (Inside::Unknown, true) => {}
         }
     }
+}
+
+/// What the peer is told of a certificate of its own that is refused (RFC 8446, 6.2).
+fn tls_alert(why: &CertError) -> u8 {
+    u8::from(AlertDescription::from(tls::alert(why)))
 }

@@ -13,6 +13,8 @@ const TICKET: u8 = 0xc3;
 const RESET: u8 = 0xc4;
 /// Too many are connecting.
 const BUSY: u8 = 0xc5;
+/// The certificate is refused, in a handshake that is not over.
+const REFUSAL: u8 = 0xc6;
 
 /// First byte of what is said inside of records and is not QUIC: QUIC never begins a packet with it.
 const INSIDE: u8 = 0;
@@ -30,6 +32,9 @@ const RECORD_HEAD_BYTES: usize = 13;
 const HANDSHAKE_HEAD_BYTES: usize = 12;
 const CONTENT_HANDSHAKE: u8 = 22;
 const CLIENT_HELLO: u8 = 1;
+const SERVER_HELLO: u8 = 2;
+const HELLO_VERIFY_REQUEST: u8 = 3;
+const SUPPORTED_VERSIONS: u16 = 43;
 
 pub(super) type Token = [u8; TOKEN_BYTES];
 pub(super) type Echo = [u8; ECHO_BYTES];
@@ -46,6 +51,8 @@ pub(super) enum Front<'a> {
     Challenge(Token, Echo),
     Reset(Token),
     Busy(Echo),
+    /// With an alert (RFC 8446, 6.2).
+    Refusal(u8, Echo),
 }
 
 /// Sorts a datagram; `None` if it is none of ours.
@@ -61,6 +68,10 @@ pub(super) fn sort(datagram: &[u8]) -> Option<Front<'_>> {
         }
         RESET => rest.try_into().ok().map(Front::Reset),
         BUSY => rest.try_into().ok().map(Front::Busy),
+        REFUSAL => {
+            let (alert, echo) = rest.split_first()?;
+            Some(Front::Refusal(*alert, echo.try_into().ok()?))
+        }
         _ => None,
     }
 }
@@ -85,17 +96,59 @@ pub(super) fn busy(echo: &Echo) -> Vec<u8> {
     [&[BUSY], &echo[..]].concat()
 }
 
+pub(super) fn refusal(alert: u8, echo: &Echo) -> Vec<u8> {
+    [&[REFUSAL, alert], &echo[..]].concat()
+}
+
 /// The beginning of the random of the ClientHello that a datagram begins with; `None` if it begins with anything else.
 /// A hello that comes in pieces counts by the piece that holds the random.
 pub(super) fn client_hello(datagram: &[u8]) -> Option<Echo> {
+    let (kind, body) = first_piece(datagram)?;
+    // Two bytes of version, then the random.
+    let random = body.get(2..2 + ECHO_BYTES)?;
+    if kind == CLIENT_HELLO { random.try_into().ok() } else { None }
+}
+
+/// Returns whether a datagram begins with an answer to a hello that only a listener without DTLS 1.3 gives. Anybody can
+/// make one.
+pub(super) fn is_without_dtls13(datagram: &[u8]) -> bool {
+    match first_piece(datagram) {
+        Some((HELLO_VERIFY_REQUEST, _)) => true,
+        Some((SERVER_HELLO, body)) => !has_supported_versions(body).unwrap_or(true),
+        _ => false,
+    }
+}
+
+/// Returns whether a ServerHello has the extension in which the version is chosen since TLS 1.3 (RFC 8446, 4.2.1);
+/// `None` if the hello is cut off.
+fn has_supported_versions(body: &[u8]) -> Option<bool> {
+    // Version, random, session id, cipher suite, compression, extensions.
+    let (session_id_bytes, rest) = body.get(34..)?.split_first()?;
+    let rest = rest.get(usize::from(*session_id_bytes) + 3..)?;
+    if rest.is_empty() {
+        return Some(false);
+    }
+    let (length, mut rest) = rest.split_first_chunk()?;
+    rest = rest.get(..usize::from(u16::from_be_bytes(*length)))?;
+    while !rest.is_empty() {
+        let (kind, after) = rest.split_first_chunk()?;
+        let (length, after) = after.split_first_chunk()?;
+        if u16::from_be_bytes(*kind) == SUPPORTED_VERSIONS {
+            return Some(true);
+        }
+        rest = after.get(usize::from(u16::from_be_bytes(*length))..)?;
+    }
+    Some(false)
+}
+
+/// The kind and the content of the unencrypted handshake message that a datagram begins with, if it is the message's
+/// first piece.
+fn first_piece(datagram: &[u8]) -> Option<(u8, &[u8])> {
     let (head, rest) = datagram.split_at_checked(RECORD_HEAD_BYTES)?;
     let length = usize::from(u16::from_be_bytes([head[11], head[12]]));
     let (handshake, body) = rest.get(..length)?.split_at_checked(HANDSHAKE_HEAD_BYTES)?;
-    let is_hello = head[0] == CONTENT_HANDSHAKE && epoch(head) == 0 && handshake[0] == CLIENT_HELLO;
-    let is_first_piece = handshake[6..9] == [0, 0, 0];
-    // Two bytes of version, then the random.
-    let random = body.get(2..2 + ECHO_BYTES)?;
-    if is_hello && is_first_piece { random.try_into().ok() } else { None }
+    let is_handshake = head[0] == CONTENT_HANDSHAKE && epoch(head) == 0;
+    (is_handshake && handshake[6..9] == [0, 0, 0]).then_some((handshake[0], body))
 }
 
 /// Whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS 1.3 has
@@ -183,6 +236,7 @@ pub fn exercise(datagram: &[u8]) {
             let _ = has_plaintext(record);
             // A hello is plaintext.
             assert!(client_hello(record).is_none() || has_plaintext(record));
+            assert!(!is_without_dtls13(record) || has_plaintext(record));
             Some(record.to_vec())
         }
         Some(Front::Id(id, record)) => Some([&id_prefix(id), record].concat()),
@@ -190,6 +244,7 @@ pub fn exercise(datagram: &[u8]) {
         Some(Front::Challenge(token, echo)) => Some(challenge(&token, &echo)),
         Some(Front::Reset(token)) => Some(reset(&token)),
         Some(Front::Busy(echo)) => Some(busy(&echo)),
+        Some(Front::Refusal(alert, echo)) => Some(refusal(alert, &echo)),
     };
     assert!(again.is_none_or(|again| again == datagram));
     if Inside::is_inside(datagram) {
@@ -233,6 +288,24 @@ mod tests {
     }
 
     #[test]
+    fn answer_of_a_listener_without_dtls13_is_recognised() {
+        let message = |kind: u8, body: &[u8]| {
+            let len = body.len() as u8;
+            record(0, &[&[kind, 0, 0, len, 0, 0, 0, 0, 0, 0, 0, len], body].concat())
+        };
+        let server_hello = |extensions: &[u8]| {
+            let fixed = [&[0xfe, 0xfd][..], &[7; 32], &[2, 9, 9], &[0xc0, 0x2b, 0]].concat();
+            message(SERVER_HELLO, &[&fixed, &[0, extensions.len() as u8][..], extensions].concat())
+        };
+        assert!(is_without_dtls13(&message(HELLO_VERIFY_REQUEST, &[0xfe, 0xff, 1, 5])));
+        assert!(is_without_dtls13(&server_hello(&[0, 23, 0, 0])));
+        assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 0, 0, 43, 0, 2, 0xfe, 0xfc])));
+        // A hello that is cut off says nothing.
+        assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 9])));
+        assert!(!is_without_dtls13(&hello()));
+    }
+
+    #[test]
     fn plaintext_is_found_behind_ciphertext() {
         let sealed12 = record(1, &[7; 40]);
         let sealed13 = [&[0x2f, 0, 1, 0, 20], &[7; 20][..]].concat();
@@ -260,7 +333,8 @@ mod tests {
             if let Some(first) = bytes.first_mut()
                 && round % 3 == 0
             {
-                *first = [0, 22, 0x2c, ID, CHALLENGE, TICKET, RESET, BUSY][rng.next_u32() as usize % 8];
+                *first =
+                    [0, 22, 0x2c, ID, CHALLENGE, TICKET, RESET, BUSY, REFUSAL][rng.next_u32() as usize % 9];
             }
             if !bytes.is_empty() {
                 let at = rng.next_u32() as usize % bytes.len();

@@ -24,7 +24,7 @@ use sgc_trust::{AddressPrefix, VerifiedPeer};
 use tokio::sync::{Notify, mpsc, watch};
 
 use super::association::{Association, End, Setup, Sink, Stage};
-use super::front::{self, Front, Token};
+use super::front::{self, Echo, Front, Token};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, LinkError, PeerRefusal, Refusal};
 use crate::metrics::{Pending, TransportMetrics};
@@ -200,7 +200,7 @@ impl Mux {
 
     /// Begins an association with this address; `None` if DTLS cannot use the identity's key.
     pub(super) fn dial(&self, remote: SocketAddr) -> Option<watch::Receiver<Progress>> {
-        let peer = self.open(remote, None, true)?;
+        let peer = self.open(remote, None, None, true)?;
         let mut sink = Sink::default();
         lock(&peer.state).association.start(Instant::now(), &mut sink);
         self.transmit(&sink, remote, None);
@@ -232,13 +232,20 @@ impl Mux {
         }
     }
 
-    fn open(&self, remote: SocketAddr, src_ip: Option<IpAddr>, is_proven: bool) -> Option<Arc<Peer>> {
+    fn open(
+        &self,
+        remote: SocketAddr,
+        src_ip: Option<IpAddr>,
+        echo: Option<Echo>,
+        is_proven: bool,
+    ) -> Option<Arc<Peer>> {
         let (id, now) = (u64::from_be_bytes(random()), Instant::now());
         let reset = self.reset_token(id);
         let setup = Setup {
             credentials: &self.credentials,
             options: &self.options,
             is_dialer: self.is_dialer,
+            echo,
             id,
             reset,
         };
@@ -317,6 +324,12 @@ impl Mux {
                     self.settle(&peer, &mut state);
                 }
             }
+            (Some(Front::Refusal(alert, echo)), _) => {
+                let Some(peer) = self.pending_at(remote) else { return };
+                let mut state = lock(&peer.state);
+                state.association.refused_by_peer(alert, &echo);
+                self.settle(&peer, &mut state);
+            }
             (Some(Front::Reset(token)), true) => {
                 let Some(peer) = lock(&self.tables).routes.get(&remote).cloned() else { return };
                 let mut state = lock(&peer.state);
@@ -394,7 +407,7 @@ impl Mux {
             self.say(&front::busy(&echo), meta);
             return;
         }
-        match self.open(meta.addr, meta.dst_ip, is_proven) {
+        match self.open(meta.addr, meta.dst_ip, Some(echo), is_proven) {
             Some(peer) => {
                 lock(&self.places).take(now, Slot { remote, peer: Arc::clone(&peer) });
                 self.wake.notify_one();
