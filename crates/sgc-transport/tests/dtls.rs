@@ -383,3 +383,172 @@ async fn a_node_that_is_another_inside_gets_no_link() {
     );
     assert_eq!(server.metrics.accepted(), 0);
 }
+
+/// A NAT with one address towards the listener, which several dialers may share.
+struct SharedAddress {
+    url: LinkUrl,
+    /// Where the listener sees all of them.
+    outside: Arc<tokio::net::UdpSocket>,
+    /// Who gets what the listener sends, latest first.
+    dialers: Arc<std::sync::Mutex<Vec<std::net::SocketAddr>>>,
+    /// How many of them get it.
+    copies: Arc<std::sync::atomic::AtomicUsize>,
+    task: tokio::task::JoinHandle<()>,
+}
+
+impl SharedAddress {
+    async fn before(listener: std::net::SocketAddr) -> Self {
+        let inside = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
+        let outside = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
+        let url = format!("dtls://{}", inside.local_addr().unwrap()).parse().unwrap();
+        let dialers = Arc::new(std::sync::Mutex::new(Vec::<std::net::SocketAddr>::new()));
+        let copies = Arc::new(std::sync::atomic::AtomicUsize::new(1));
+        let task = {
+            let (outside, dialers, copies) =
+                (Arc::clone(&outside), Arc::clone(&dialers), Arc::clone(&copies));
+            tokio::spawn(async move {
+                let (mut up, mut down) = (vec![0; 65_536], vec![0; 65_536]);
+                let mut seen = std::collections::HashSet::new();
+                loop {
+                    tokio::select! {
+                        Ok((len, from)) = inside.recv_from(&mut up) => {
+                            if seen.insert(from) {
+                                dialers.lock().unwrap().insert(0, from);
+                            }
+                            // One that was taken out is heard no more.
+                            if dialers.lock().unwrap().contains(&from) {
+                                let _ = outside.send_to(&up[..len], listener).await;
+                            }
+                        }
+                        Ok(len) = outside.recv(&mut down) => {
+                            let to: Vec<_> =
+                                dialers.lock().unwrap().iter().take(copies.load(Relaxed)).copied().collect();
+                            for dialer in to {
+                                let _ = inside.send_to(&down[..len], dialer).await;
+                            }
+                        }
+                    }
+                }
+            })
+        };
+        Self { url, outside, dialers, copies, task }
+    }
+}
+
+impl Drop for SharedAddress {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+async fn talk(near: &AnyLink, far: &AnyLink) {
+    for _ in 0..5 {
+        near.send_control(bytes::Bytes::from_static(b"there")).await.unwrap();
+        assert_eq!(soon(far.recv_control()).await.unwrap(), "there");
+        far.send_control(bytes::Bytes::from_static(b"back")).await.unwrap();
+        assert_eq!(soon(near.recv_control()).await.unwrap(), "back");
+    }
+}
+
+/// Sends what a member says to the listener from an address that is not the member's, and waits until it was heard.
+async fn spoof(
+    server: &mut Server,
+    fleet: &sgc_trust::Fleet,
+    from: &tokio::net::UdpSocket,
+) -> (AnyLink, AnyLink, Relay) {
+    let relay = Relay::start(server.addr, 3).await;
+    let url = format!("dtls://{}", relay.addr).parse().unwrap();
+    let near = dial(enroll(fleet, "thief"), &url).await.unwrap();
+    let far = server.link().await;
+    talk(&near, &far).await;
+    relay.weather.seen.lock().unwrap().clear();
+    relay.weather.tap.store(true, Relaxed);
+    relay.weather.loss.store(1000, Relaxed);
+    near.send_control(bytes::Bytes::from_static(b"spoofed")).await.unwrap();
+    let held = |relay: &Relay| -> Vec<Vec<u8>> {
+        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1).cloned().collect()
+    };
+    until_true(|| !held(&relay).is_empty()).await;
+    soon(async {
+        let mut sent = 0;
+        loop {
+            for datagram in held(&relay).split_off(sent) {
+                from.send_to(&datagram, server.addr).await.unwrap();
+                sent += 1;
+            }
+            if let Ok(word) = tokio::time::timeout(Duration::from_millis(50), far.recv_control()).await {
+                assert_eq!(word.unwrap(), "spoofed");
+                break;
+            }
+        }
+    })
+    .await;
+    (near, far, relay)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn member_that_spoofs_an_address_takes_no_route() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let nat = SharedAddress::before(server.addr).await;
+    let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
+    let far = server.link().await;
+    talk(&near, &far).await;
+    let thief = spoof(&mut server, &fleet, &nat.outside).await;
+    // The listener speaks first: nothing of the owner's has come that could have put it right.
+    far.send_control(bytes::Bytes::from_static(b"first")).await.unwrap();
+    let heard = tokio::time::timeout(Duration::from_millis(800), near.recv_control()).await;
+    assert_eq!(heard.expect("the route is the thief's").unwrap(), "first");
+    talk(&near, &far).await;
+    assert_ne!(thief.1.remote(), far.remote());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn member_that_spoofs_an_address_keeps_nobody_out_there() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let nat = SharedAddress::before(server.addr).await;
+    let _thief = spoof(&mut server, &fleet, &nat.outside).await;
+    let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
+    let far = server.link().await;
+    talk(&near, &far).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn address_of_a_peer_that_is_gone_is_given_to_the_next() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let nat = SharedAddress::before(server.addr).await;
+    let gone = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
+    let _far = server.link().await;
+    // It says nothing more and hears nothing more; the listener has not noticed.
+    nat.dialers.lock().unwrap().clear();
+    let near = dial(enroll(&fleet, "arm-2"), &nat.url).await.unwrap();
+    let far = server.link().await;
+    talk(&near, &far).await;
+    drop(gone);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn peer_that_answers_keeps_its_address_from_one_that_listens_in() {
+    let fleet = fleet(1);
+    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let nat = SharedAddress::before(server.addr).await;
+    let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
+    let far = server.link().await;
+    talk(&near, &far).await;
+    // A member on the way hears all that goes to the address, and connects from there.
+    nat.copies.store(2, Relaxed);
+    let options = LinkOptions { handshake_timeout: Duration::from_secs(3), ..LinkOptions::default() };
+    let thief = Dialer::new(enroll(&fleet, "thief"), options, Arc::default());
+    let dialing = {
+        let url = nat.url.clone();
+        tokio::spawn(async move { dial_with(&thief, &url).await })
+    };
+    while !dialing.is_finished() {
+        talk(&near, &far).await;
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    soon(dialing).await.unwrap().unwrap_err();
+    talk(&near, &far).await;
+}

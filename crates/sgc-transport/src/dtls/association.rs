@@ -86,6 +86,8 @@ pub(super) struct Sink {
     pub(super) packet_lens: Vec<usize>,
     pub(super) data: Vec<u8>,
     pub(super) data_lens: Vec<usize>,
+    /// The token that a dialer has repeated.
+    pub(super) proof: Option<Token>,
     /// What dimpl writes into, [`OUTPUT_BYTES`] long once it was used.
     output: Vec<u8>,
 }
@@ -107,6 +109,7 @@ impl Sink {
         self.packet_lens.clear();
         self.data.clear();
         self.data_lens.clear();
+        self.proof = None;
     }
 }
 
@@ -329,6 +332,14 @@ impl Association {
         self.drain(now, sink);
     }
 
+    /// Sends a token to the peer, which repeats it.
+    pub(super) fn probe(&mut self, token: Token, now: Instant, sink: &mut Sink) {
+        if matches!(self.stage, Stage::Up { .. }) {
+            self.say(Inside::Probe { token });
+            self.drain(now, sink);
+        }
+    }
+
     /// Does what is due.
     pub(super) fn tick(&mut self, now: Instant, sink: &mut Sink) {
         if self.is_ended() {
@@ -534,7 +545,7 @@ impl Association {
                     self.heard = now;
                     has_heard = true;
                     if Inside::is_inside(data) {
-                        self.heed(Inside::parse(data), now);
+                        self.heed(Inside::parse(data), now, &mut sink.proof);
                     } else if matches!(self.stage, Stage::Up { .. }) {
                         self.has_data = true;
                         sink.plaintext(data);
@@ -606,7 +617,7 @@ impl Association {
     }
 
     /// What the peer says besides QUIC.
-    fn heed(&mut self, inside: Inside, now: Instant) {
+    fn heed(&mut self, inside: Inside, now: Instant, proof: &mut Option<Token>) {
         match (inside, self.is_dialer) {
             (Inside::Ask, false) => match &self.stage {
                 Stage::Up { .. } => self.say(Inside::Answer { id: self.id, reset: self.reset }),
@@ -629,8 +640,11 @@ impl Association {
                     self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
                 }
             }
+            (Inside::Probe { token }, true) => self.say(Inside::Proof { token }),
+            (Inside::Proof { token }, false) => *proof = Some(token),
             (Inside::Unknown, false) => self.say(Inside::Refused { alert: ALERT_VERSION }),
-            (Inside::Ask, true) | (Inside::Answer { .. }, false) | (Inside::Unknown, true) => {}
+            (Inside::Ask | Inside::Proof { .. } | Inside::Unknown, true)
+            | (Inside::Answer { .. } | Inside::Probe { .. }, false) => {}
         }
     }
 }

@@ -20,6 +20,8 @@ const REFUSAL: u8 = 0xc6;
 const INSIDE: u8 = 0;
 const HELLO: u8 = 1;
 const REFUSED: u8 = 2;
+const PROBE: u8 = 3;
+const PROOF: u8 = 4;
 /// What is spoken inside.
 pub(super) const INSIDE_VERSION: u8 = 1;
 
@@ -192,6 +194,10 @@ pub(super) enum Inside {
     Answer { id: u64, reset: Token },
     /// The certificate is refused, with this alert (RFC 8446, 6.2).
     Refused { alert: u8 },
+    /// The listener sends a token to an address.
+    Probe { token: Token },
+    /// The dialer repeats it.
+    Proof { token: Token },
     /// Another version, or nothing known.
     Unknown,
 }
@@ -211,6 +217,12 @@ impl Inside {
                     .map_or(Self::Unknown, |(id, reset)| Self::Answer { id: u64::from_be_bytes(*id), reset })
             }
             [INSIDE, REFUSED, alert] => Self::Refused { alert: *alert },
+            [INSIDE, PROBE, token @ ..] => {
+                token.try_into().map_or(Self::Unknown, |token| Self::Probe { token })
+            }
+            [INSIDE, PROOF, token @ ..] => {
+                token.try_into().map_or(Self::Unknown, |token| Self::Proof { token })
+            }
             _ => Self::Unknown,
         }
     }
@@ -222,6 +234,8 @@ impl Inside {
                 [&[INSIDE, HELLO, INSIDE_VERSION], &id.to_be_bytes()[..], &reset].concat()
             }
             Self::Refused { alert } => vec![INSIDE, REFUSED, alert],
+            Self::Probe { token } => [&[INSIDE, PROBE], &token[..]].concat(),
+            Self::Proof { token } => [&[INSIDE, PROOF], &token[..]].concat(),
             Self::Unknown => vec![INSIDE],
         }
     }

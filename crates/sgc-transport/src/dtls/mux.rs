@@ -25,6 +25,7 @@ use tokio::sync::{Notify, mpsc, watch};
 
 use super::association::{Association, End, Setup, Sink, Stage};
 use super::front::{self, Echo, Front, Token};
+use super::paths::Paths;
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, LinkError, PeerRefusal, Refusal};
 use crate::metrics::{Pending, TransportMetrics};
@@ -37,8 +38,6 @@ const UNPROVEN_PER_ADDRESS_MAX: usize = 8;
 const UNPROVEN_PATIENCE: Duration = Duration::from_secs(3);
 /// How long a ticket holds, at least; at most twice that.
 const TICKET_PERIOD: Duration = Duration::from_secs(30);
-/// How many addresses one association is reached at: the present one, and those that it may just have left.
-const ROUTES_MAX: usize = 3;
 /// Shortest datagram that is answered with a reset, which is shorter.
 const RESET_FOR_BYTES_MIN: usize = 40;
 /// Most resets a second.
@@ -124,8 +123,7 @@ impl Holder for Slot {
 
 struct PeerState {
     association: Association,
-    /// The present one first.
-    addresses: Vec<SocketAddr>,
+    paths: Paths,
     src_ip: Option<IpAddr>,
     pending: Option<Pending>,
     datagrams: u32,
@@ -227,7 +225,7 @@ impl Mux {
             sink.clear();
             let mut state = lock(&peer.state);
             state.association.close(End::Released, now, &mut sink);
-            self.transmit(&sink, state.addresses[0], state.src_ip);
+            self.transmit(&sink, state.paths.present(), state.src_ip);
             self.settle(&peer, &mut state);
         }
     }
@@ -252,7 +250,7 @@ impl Mux {
         let association = Association::new(&setup, now)?;
         let state = PeerState {
             association,
-            addresses: vec![remote],
+            paths: Paths::new(remote),
             src_ip,
             pending: (!self.is_dialer).then(|| self.metrics.pending()),
             datagrams: 0,
@@ -302,7 +300,9 @@ impl Mux {
             (Some(Front::Id(id, records)), false) => {
                 let peer = lock(&self.tables).by_id.get(&id).cloned();
                 match peer {
-                    Some(peer) => self.feed(&peer, records, meta, now, sink, data),
+                    Some(peer) => {
+                        self.feed(&peer, records, meta, now, sink, data);
+                    }
                     None if datagram.len() >= RESET_FOR_BYTES_MIN => self.reset(id, meta, now),
                     None => {}
                 }
@@ -362,16 +362,23 @@ impl Mux {
             let tables = lock(&self.tables);
             (tables.pending.get(&remote).cloned(), tables.routes.get(&remote).cloned())
         };
-        // Whoever is established is not disturbed by a hello that anybody can send in its name.
+        // Whoever is established is not disturbed by a hello that anybody can send in its name, nor is whoever begins by
+        // what is established.
         let peer = match (pending, route) {
-            (Some(_), Some(route)) if !front::has_plaintext(records) => Some(route),
+            (Some(pending), Some(route)) if !front::has_plaintext(records) => {
+                if self.feed(&route, records, meta, now, sink, data) {
+                    return;
+                }
+                Some(pending)
+            }
             (Some(pending), _) => Some(pending),
             (None, Some(route)) if self.is_dialer || front::client_hello(records).is_none() => Some(route),
             _ => None,
         };
         if let Some(peer) = peer {
             peer.is_proven.fetch_or(is_proven, Relaxed);
-            return self.feed(&peer, records, meta, now, sink, data);
+            self.feed(&peer, records, meta, now, sink, data);
+            return;
         }
         let Some(echo) = front::client_hello(records).filter(|_| !self.is_dialer) else { return };
         let remote = canonical(remote);
@@ -417,7 +424,7 @@ impl Mux {
         }
     }
 
-    /// Gives an association what is its own.
+    /// Gives an association what is its own. Returns whether something in it was authentic and new.
     fn feed(
         &self,
         peer: &Arc<Peer>,
@@ -426,55 +433,103 @@ impl Mux {
         now: Instant,
         sink: &mut Sink,
         data: &mut Ready,
-    ) {
+    ) -> bool {
         sink.clear();
-        let mut state = lock(&peer.state);
+        let mut guard = lock(&peer.state);
+        let state = &mut *guard;
         state.datagrams = state.datagrams.saturating_add(1);
         state.touched = now;
         let is_authentic = state.association.receive(records, now, sink);
         if state.association.has_shown() {
             peer.is_proven.store(true, Relaxed);
         }
-        self.settle(peer, &mut state);
-        if is_authentic && state.addresses[0] != meta.addr && !self.is_dialer {
-            self.route(peer, &mut state, meta.addr);
-        }
-        if is_authentic {
+        let mut claim = self.settle(peer, state);
+        // Quinn hears of an address when it is proved.
+        let mut from = *meta;
+        if is_authentic && (self.is_dialer || !matches!(state.association.stage(), Stage::Up { .. })) {
             state.src_ip = meta.dst_ip;
+        } else if is_authentic {
+            if state.paths.heard(meta.addr, meta.dst_ip, random, now) {
+                state.src_ip = meta.dst_ip;
+            } else {
+                (from.addr, from.dst_ip) = (state.paths.present(), state.src_ip);
+            }
+            let proved = sink.proof.take().and_then(|token| state.paths.proved(&token));
+            if let Some(address) = proved {
+                claim = Some(address);
+                if address == meta.addr {
+                    state.src_ip = meta.dst_ip;
+                }
+            }
         }
         // Handshakes are answered where they come from; so is what is said at a new address.
         self.transmit(sink, meta.addr, meta.dst_ip);
-        data.take(sink, meta);
-    }
-
-    /// The peer is here now; quinn may still send to where it was before.
-    fn route(&self, peer: &Arc<Peer>, state: &mut PeerState, remote: SocketAddr) {
-        state.addresses.retain(|address| *address != remote);
-        state.addresses.insert(0, remote);
-        let mut tables = lock(&self.tables);
-        if let Some(oldest) = state.addresses.get(ROUTES_MAX).copied() {
-            tables.forget(oldest, peer);
-            state.addresses.truncate(ROUTES_MAX);
+        data.take(sink, &from);
+        self.probe(state, now, sink);
+        drop(guard);
+        if let Some(address) = claim {
+            self.claim_address(address, peer, now, sink);
         }
-        tables.routes.insert(remote, Arc::clone(peer));
+        is_authentic
     }
 
-    /// Draws the consequences of where an association stands.
-    fn settle(&self, peer: &Arc<Peer>, state: &mut PeerState) {
+    /// Sends the tokens that are due.
+    fn probe(&self, state: &mut PeerState, now: Instant, sink: &mut Sink) {
+        while let Some(sending) = state.paths.poll(now) {
+            sink.clear();
+            state.association.probe(sending.token, now, sink);
+            self.transmit(sink, sending.address, sending.src_ip);
+            self.wake.notify_one();
+        }
+    }
+
+    /// An association proved that its peer is at this address: it gets what is sent there, unless another that has the
+    /// address proves the same.
+    fn claim_address(&self, address: SocketAddr, peer: &Arc<Peer>, now: Instant, sink: &mut Sink) {
+        let owner = {
+            let mut state = lock(&peer.state);
+            if !matches!(state.association.stage(), Stage::Up { .. }) {
+                return;
+            }
+            let mut tables = lock(&self.tables);
+            match tables.routes.get(&address) {
+                Some(owner) if !Arc::ptr_eq(owner, peer) => {
+                    state.paths.refused(address);
+                    Arc::clone(owner)
+                }
+                _ => {
+                    tables.routes.insert(address, Arc::clone(peer));
+                    if tables.pending.get(&address).is_some_and(|p| Arc::ptr_eq(p, peer)) {
+                        tables.pending.remove(&address);
+                    }
+                    if let Some(left) = state.paths.moved_to(address) {
+                        tables.forget(left, peer);
+                    }
+                    return;
+                }
+            }
+        };
+        let mut state = lock(&owner.state);
+        let src_ip = state.src_ip;
+        state.paths.contested(address, src_ip, peer.id, random, now);
+        self.probe(&mut state, now, sink);
+    }
+
+    /// Draws the consequences of where an association stands. Returns the address that it has proved to be its peer's by
+    /// a handshake.
+    fn settle(&self, peer: &Arc<Peer>, state: &mut PeerState) -> Option<SocketAddr> {
         match state.association.stage() {
             Stage::Up { peer: node, .. } if matches!(*peer.progress.borrow(), Progress::Connecting) => {
                 state.pending = None;
                 let node = node.clone();
-                {
+                let address = state.paths.present();
+                if self.is_dialer {
                     let mut tables = lock(&self.tables);
-                    for address in &state.addresses {
-                        tables.routes.insert(*address, Arc::clone(peer));
-                        if tables.pending.get(address).is_some_and(|p| Arc::ptr_eq(p, peer)) {
-                            tables.pending.remove(address);
-                        }
-                    }
+                    tables.forget(address, peer);
+                    tables.routes.insert(address, Arc::clone(peer));
                 }
                 peer.progress.send_replace(Progress::Up(node));
+                return (!self.is_dialer).then_some(address);
             }
             Stage::Ended(end) if !matches!(*peer.progress.borrow(), Progress::Ended(_)) => {
                 let was_up = matches!(*peer.progress.borrow(), Progress::Up(_));
@@ -483,7 +538,7 @@ impl Mux {
                 {
                     let mut tables = lock(&self.tables);
                     tables.by_id.remove(&peer.id);
-                    for address in &state.addresses {
+                    for address in state.paths.all() {
                         tables.forget(*address, peer);
                     }
                 }
@@ -498,7 +553,7 @@ impl Mux {
                 if !self.is_dialer && is_news {
                     let refusal = end.to_listener(after);
                     self.metrics.count_refused(refusal.kind());
-                    let _ = self.reports.try_send((canonical(state.addresses[0]), refusal));
+                    let _ = self.reports.try_send((canonical(state.paths.present()), refusal));
                 }
                 let error = match end {
                     End::Goodbye | End::Released if was_up => LinkError::Closed {
@@ -511,6 +566,7 @@ impl Mux {
             }
             _ => {}
         }
+        None
     }
 
     /// Does what is due, and says when to come again.
@@ -519,7 +575,8 @@ impl Mux {
         let mut next = now + TICK_MAX;
         for peer in peers {
             sink.clear();
-            let mut state = lock(&peer.state);
+            let mut guard = lock(&peer.state);
+            let state = &mut *guard;
             if state.released.is_some_and(|at| at <= now) {
                 state.association.close(End::Released, now, sink);
             } else if !peer.is_proven.load(Relaxed) && now >= state.touched + UNPROVEN_PATIENCE {
@@ -527,9 +584,26 @@ impl Mux {
             } else {
                 state.association.tick(now, sink);
             }
-            self.transmit(sink, state.addresses[0], state.src_ip);
+            self.transmit(sink, state.paths.present(), state.src_ip);
             next = next.min(state.association.due());
-            self.settle(&peer, &mut state);
+            let claim = self.settle(&peer, state);
+            let loss = state.paths.expire(now);
+            self.probe(state, now, sink);
+            next = next.min(state.paths.due().unwrap_or(next));
+            drop(guard);
+            if let Some(address) = claim {
+                self.claim_address(address, &peer, now, sink);
+            }
+            if let Some(loss) = loss {
+                let claimant = {
+                    let mut tables = lock(&self.tables);
+                    tables.forget(loss.address, &peer);
+                    tables.by_id.get(&loss.claimant).cloned()
+                };
+                if let Some(claimant) = claimant {
+                    self.claim_address(loss.address, &claimant, now, sink);
+                }
+            }
         }
         next.max(now + TICK_MIN)
     }
@@ -768,6 +842,8 @@ impl AsyncUdpSocket for DtlsSocket {
         let Some(peer) = peer else { return Ok(()) };
         send.sink.clear();
         send.sent = (0, 0);
+        // Quinn learns that its peer has moved when something comes from there; the association knows it before.
+        let (destination, src_ip);
         {
             let now = Instant::now();
             let mut state = lock(&peer.state);
@@ -776,9 +852,10 @@ impl AsyncUdpSocket for DtlsSocket {
                 state.association.seal(packet, now, &mut send.sink);
             }
             self.mux.settle(&peer, &mut state);
+            destination = state.paths.forward(transmit.destination);
+            src_ip = if destination == transmit.destination { transmit.src_ip } else { state.src_ip };
         }
-        let Transmit { destination, src_ip, ecn, .. } = *transmit;
-        send.to = Some(Heading { destination, src_ip, ecn });
+        send.to = Some(Heading { destination, src_ip, ecn: transmit.ecn });
         match send.flush(&*self.io) {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 // Quinn may have nothing more to send, which would leave the rest here.
