@@ -13,6 +13,7 @@ pub mod cdr;
 pub mod certs;
 pub mod control;
 pub mod dtls;
+pub mod dtls_handshake;
 pub mod gateway;
 pub mod grants;
 pub mod mux;
@@ -31,6 +32,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("certs", certs::run),
     ("control", control::run),
     ("dtls", dtls::run),
+    ("dtls_handshake", dtls_handshake::run),
     ("gateway", gateway::run),
     ("grants", grants::run),
     ("mux", mux::run),

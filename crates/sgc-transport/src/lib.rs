@@ -44,6 +44,9 @@ pub mod benchmarks {
 
 pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub use dtls::HandshakeExercise;
 #[doc(hidden)]
 pub use dtls::exercise_front;
 pub use endpoint::{Dialer, Listener, RefusedPeer};

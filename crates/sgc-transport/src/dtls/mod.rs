@@ -6,11 +6,15 @@
 
 mod association;
 mod endpoint;
+#[cfg(any(test, feature = "fuzzing"))]
+mod exercise;
 mod front;
 mod keys;
 mod mux;
 mod paths;
 
 pub(crate) use endpoint::{DtlsDialer, DtlsListener};
+#[cfg(feature = "fuzzing")]
+pub use exercise::HandshakeExercise;
 pub use front::exercise as exercise_front;
 pub(crate) use mux::{Claim, Mux};
