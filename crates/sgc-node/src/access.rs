@@ -386,7 +386,8 @@ mod tests {
     fn a_token_that_is_refused_stands_in_the_audit_log_without_itself() {
         let cast = Cast::new();
         let log = cast.dir.path().join("audit.jsonl");
-        let (audit, writer) = Audit::open(&log, 1 << 20, Default::default()).unwrap();
+        let (audit, writer) =
+            Audit::open(&log, crate::config::AuditConfig::default().room, Default::default()).unwrap();
         let access = cast.access("[gateway]").unwrap().unwrap().heard_by(refused_tokens(audit));
         let text = "sgc-access-1:AAAA";
         assert!(access.admit(&Admission { token: Some(text), ..elsewhere() }).is_err());

@@ -4,23 +4,31 @@
 //! does not fit is counted and said in the log itself. Lines are handed to the system at once, so that a killed
 //! process loses none that were written; they are forced to the disk when a file is put aside and when the node
 //! stops, so that a loss of power may cost the last seconds. No key, token or message comes here.
+//!
+//! Each peer has quotas for the records that it can cause (`quota`): nobody pushes older records out of the files by
+//! joining and leaving. Files are the business of `file`.
+
+mod file;
+mod quota;
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::io;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use rustix::fs::OFlags;
 use serde::{Deserialize, Serialize};
 use sgc_wire::{Name, NodeId, UnixMillis};
 use tracing::warn;
 
+use self::file::LogFile;
+pub use self::file::{AuditRoom, Unread, read, rotated_path};
+use self::quota::{Cause, Quotas};
 use crate::core::now;
 
 /// Records that may wait to be written.
@@ -29,17 +37,12 @@ const WAITING_MAX: usize = 1024;
 const BATCH_MAX: usize = 64;
 /// Longest text of one field, bytes.
 const FIELD_BYTES_MAX: usize = 512;
-/// Longest line that is read, bytes; those written are shorter.
-const LINE_BYTES_MAX: u64 = 16 * 1024;
+/// Longest delay of a summary after its hour.
+const SUMMARY_DELAY: Duration = Duration::from_secs(60);
 const FILE_NAME: &str = "audit.jsonl";
-/// Refusals of one kind kept in a minute: whoever is refused for ever must not push out what is older.
-const REFUSALS_PER_MINUTE_MAX: u32 = 120;
-const MINUTE_MS: u64 = 60_000;
-/// The kinds of them.
-const REFUSALS: [AuditEvent; 3] = [AuditEvent::Refused, AuditEvent::LinkRefused, AuditEvent::TokenRefused];
 
 /// What happened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AuditEvent {
     /// The node started.
     Started,
@@ -75,13 +78,15 @@ pub enum AuditEvent {
     TokenRevoked,
     /// One was shown at the gateway that does not hold.
     TokenRefused,
+    /// One peer caused more records of one event than are written in an hour: the last of those, and their number.
+    Summary,
     /// Records were lost.
     Lost,
 }
 
 impl AuditEvent {
     /// All of them.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Started,
         Self::Stopped,
         Self::Granted,
@@ -99,6 +104,7 @@ impl AuditEvent {
         Self::TokenMade,
         Self::TokenRevoked,
         Self::TokenRefused,
+        Self::Summary,
         Self::Lost,
     ];
 
@@ -122,7 +128,16 @@ impl AuditEvent {
             Self::TokenMade => "token_made",
             Self::TokenRevoked => "token_revoked",
             Self::TokenRefused => "token_refused",
+            Self::Summary => "summary",
             Self::Lost => "audit_lost",
+        }
+    }
+
+    /// Returns who causes it where a record names no peer.
+    fn cause(self) -> Cause {
+        match self {
+            Self::Crl | Self::Epoch | Self::Renewed => Cause::Fleet,
+            _ => Cause::Local,
         }
     }
 }
@@ -164,6 +179,21 @@ pub struct AuditRecord {
     /// Records that were lost.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lost: Option<u64>,
+    /// Of a summary: the event of the records that it stands for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub of: Option<String>,
+    /// Of a summary: how many records it stands for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub count: Option<u64>,
+    /// Of a summary: the time of the first of them. `time` is that of the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from: Option<String>,
+    #[serde(skip)]
+    kind: Option<AuditEvent>,
+    #[serde(skip)]
+    cause: Cause,
+    #[serde(skip)]
+    about: Option<Name>,
 }
 
 impl AuditRecord {
@@ -174,8 +204,9 @@ impl AuditRecord {
 
     /// Something that happened at `unix`.
     pub fn at(event: AuditEvent, unix: UnixMillis) -> Self {
-        let event = event.label().to_owned();
-        Self { time: unix.to_string(), unix_ms: unix.0, event, ..Self::default() }
+        let (label, cause) = (event.label().to_owned(), event.cause());
+        let (time, kind) = (unix.to_string(), Some(event));
+        Self { time, unix_ms: unix.0, event: label, kind, cause, ..Self::default() }
     }
 
     /// On this topic.
@@ -189,6 +220,7 @@ impl AuditRecord {
     #[must_use]
     pub fn name(mut self, name: &Name) -> Self {
         self.name = Some(name.to_string());
+        self.about = Some(*name);
         self
     }
 
@@ -196,14 +228,25 @@ impl AuditRecord {
     #[must_use]
     pub fn peer(mut self, peer: &NodeId) -> Self {
         self.peer = Some(peer.to_string());
+        self.cause = Cause::Peer(*peer);
         self
     }
 
     /// At this address.
     #[must_use]
-    pub fn remote(mut self, remote: impl ToString) -> Self {
-        self.remote = Some(bounded(&remote.to_string()));
+    pub fn remote(mut self, remote: SocketAddr) -> Self {
+        self.remote = Some(remote.to_string());
+        if !matches!(self.cause, Cause::Peer(_)) {
+            self.cause = Cause::Address(remote.ip());
+        }
         self
+    }
+
+    /// Because of a user of this machine: no quota counts it.
+    #[must_use]
+    pub fn by_user(mut self) -> Self {
+        self.cause = Cause::Local;
+        self.by("a user")
     }
 
     /// For this reason.
@@ -242,34 +285,24 @@ struct Shared {
     records: SyncSender<Option<AuditRecord>>,
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
-    refusals: [Mutex<Window>; REFUSALS.len()],
+    quotas: Arc<Mutex<Quotas>>,
     lost_total: AtomicU64,
 }
 
 impl Shared {
-    fn lose(&self) {
-        self.lost.fetch_add(1, Relaxed);
-        self.lost_total.fetch_add(1, Relaxed);
-    }
-}
-
-/// How many there were in a minute.
-#[derive(Debug, Default)]
-struct Window {
-    minute: u64,
-    count: u32,
-}
-
-impl Window {
-    /// Whether one more fits into the minute of `unix_ms`.
-    fn takes(&mut self, unix_ms: u64) -> bool {
-        let minute = unix_ms / MINUTE_MS;
-        if self.minute != minute {
-            *self = Self { minute, count: 0 };
+    fn send(&self, record: AuditRecord) {
+        match self.records.try_send(Some(record)) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
+                self.lost.fetch_add(1, Relaxed);
+                self.lost_total.fetch_add(1, Relaxed);
+            }
         }
-        self.count = self.count.saturating_add(1);
-        self.count <= REFUSALS_PER_MINUTE_MAX
     }
+}
+
+fn lock(quotas: &Mutex<Quotas>) -> MutexGuard<'_, Quotas> {
+    quotas.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The thread that writes.
@@ -281,21 +314,21 @@ pub struct AuditWriter {
 
 impl Audit {
     /// Opens the log at `path`; a line that an earlier run left unfinished is ended.
-    pub fn open(path: &Path, max_bytes: u64, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
-        let file = LogFile::open(path, max_bytes)?;
+    pub fn open(path: &Path, room: AuditRoom, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
+        let file = LogFile::open(path, room)?;
         let (records, waiting) = sync_channel(WAITING_MAX);
         // The thread holds no sender: it ends when nobody can write any more.
-        let lost = Arc::<AtomicU64>::default();
+        let (lost, quotas) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Quotas>>::default());
         let shared = Arc::new(Shared {
             records,
             lost: lost.clone(),
             names: ArcSwap::from_pointee(names),
-            refusals: Default::default(),
+            quotas: quotas.clone(),
             lost_total: AtomicU64::new(0),
         });
         let thread = std::thread::Builder::new()
             .name("sgc-audit".to_owned())
-            .spawn(move || write_all(file, &waiting, &lost))?;
+            .spawn(move || write_all(file, &waiting, &lost, &quotas))?;
         let audit = Self { shared: Some(shared.clone()) };
         Ok((audit, AuditWriter { shared, thread }))
     }
@@ -303,22 +336,12 @@ impl Audit {
     /// Hands a record over; never waits.
     pub fn write(&self, mut record: AuditRecord) {
         let Some(shared) = &self.shared else { return };
-        let refusal = REFUSALS.iter().position(|event| event.label() == record.event);
-        if let Some(Ok(mut window)) = refusal.and_then(|at| shared.refusals.get(at)).map(Mutex::lock)
-            && !window.takes(record.unix_ms)
-        {
-            shared.lose();
-            return;
+        if let Cause::Peer(peer) = &record.cause {
+            record.peer_name = shared.names.load().get(peer).cloned();
         }
-        if let Some(peer) = record.peer.as_deref().and_then(|peer| peer.parse::<NodeId>().ok()) {
-            record.peer_name = shared.names.load().get(&peer).cloned();
-        }
-        match shared.records.try_send(Some(record)) {
-            Ok(()) => {}
-            Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
-                shared.lose();
-            }
-        }
+        let mut records = Vec::with_capacity(1);
+        lock(&shared.quotas).handle(record, &mut records);
+        records.into_iter().for_each(|record| shared.send(record));
     }
 
     /// Peers are called otherwise from now on.
@@ -338,6 +361,11 @@ impl Audit {
         self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))
     }
 
+    /// Records that stand in summaries only, since the node started.
+    pub fn summed_up_total(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| lock(&shared.quotas).left_out())
+    }
+
     /// Records that were lost and not yet said to be.
     pub fn lost(&self) -> u64 {
         self.shared.as_ref().map_or(0, |shared| shared.lost.load(Relaxed))
@@ -354,12 +382,12 @@ impl AuditWriter {
 
 /// Adds a record to the log at `path` from beside the node that writes it, which may run or not. It is on the disk then.
 pub fn append(path: &Path, record: &AuditRecord) -> io::Result<()> {
-    // How long the log may be is for the node to say, which puts it aside.
-    let mut file = LogFile::open(path, u64::MAX)?;
+    // The node alone puts its log aside.
+    let mut file = LogFile::open(path, AuditRoom { max_bytes: u64::MAX, files: 1 })?;
     let mut line = String::new();
     push_line(&mut line, record);
     file.append(&line)?;
-    file.file.sync_data()
+    file.sync()
 }
 
 /// Where a node with this state directory keeps its log.
@@ -367,119 +395,37 @@ pub fn audit_path(configured: Option<&Path>, state: Option<&Path>) -> Option<Pat
     configured.map(Path::to_owned).or_else(|| Some(state?.join(FILE_NAME)))
 }
 
-/// Where the log that was put aside is.
-pub fn old_path(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".1");
-    PathBuf::from(name)
-}
-
-/// Reads what was put aside and what is written now, in order; gives each record to `take`, and how many lines were
-/// none.
-pub fn read(path: &Path, mut take: impl FnMut(AuditRecord)) -> io::Result<u64> {
-    let mut malformed = 0;
-    let mut any = false;
-    for path in [old_path(path), path.to_owned()] {
-        let file = match fs::File::open(&path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-            file => file?,
-        };
-        any = true;
-        let mut reader = BufReader::new(file);
-        let mut line = Vec::new();
-        let mut is_tail = false;
-        loop {
-            line.clear();
-            let n = (&mut reader).take(LINE_BYTES_MAX).read_until(b'\n', &mut line)?;
-            if n == 0 {
-                break;
-            }
-            let ends = line.last() == Some(&b'\n');
-            // The rest of a line that was too long belongs to it.
-            if !std::mem::replace(&mut is_tail, !ends) {
-                match serde_json::from_slice::<AuditRecord>(&line) {
-                    Ok(record) if !record.event.is_empty() => take(record),
-                    _ if line.trim_ascii().is_empty() => {}
-                    _ => malformed += 1,
-                }
-            }
-        }
-    }
-    if any { Ok(malformed) } else { Err(io::ErrorKind::NotFound.into()) }
-}
-
-/// A log that is written to.
-struct LogFile {
-    path: PathBuf,
-    max_bytes: u64,
-    file: fs::File,
-    bytes: u64,
-    /// A line was begun and not ended.
-    is_torn: bool,
-}
-
-impl LogFile {
-    fn open(path: &Path, max_bytes: u64) -> io::Result<Self> {
-        // A link could lead the log elsewhere; what is no file could hold up whoever opens it.
-        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
-        let mut options = fs::OpenOptions::new();
-        let options = options.read(true).append(true).create(true).mode(0o600).custom_flags(flags);
-        let mut file = options.open(path)?;
-        let metadata = file.metadata()?;
-        if !metadata.is_file() {
-            return Err(io::Error::other("it is not a file"));
-        }
-        file.set_permissions(fs::Permissions::from_mode(0o600))?;
-        let mut is_torn = false;
-        if metadata.len() > 0 {
-            file.seek(SeekFrom::End(-1))?;
-            let mut last = [0];
-            file.read_exact(&mut last)?;
-            is_torn = last != *b"\n";
-        }
-        Ok(Self { path: path.to_owned(), max_bytes, file, bytes: metadata.len(), is_torn })
-    }
-
-    fn append(&mut self, lines: &str) -> io::Result<()> {
-        if self.bytes > 0 && self.bytes + lines.len() as u64 > self.max_bytes {
-            self.file.sync_data()?;
-            fs::rename(&self.path, old_path(&self.path))?;
-            *self = Self::open(&self.path, self.max_bytes)?;
-        }
-        if self.is_torn {
-            self.write(b"\n")?;
-        }
-        self.write(lines.as_bytes())
-    }
-
-    /// A write that fails may have written a part.
-    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.is_torn = true;
-        self.file.write_all(bytes)?;
-        self.bytes += bytes.len() as u64;
-        self.is_torn = false;
-        Ok(())
-    }
-}
-
-fn write_all(mut file: LogFile, waiting: &Receiver<Option<AuditRecord>>, lost: &AtomicU64) {
+fn write_all(
+    mut file: LogFile,
+    waiting: &Receiver<Option<AuditRecord>>,
+    lost: &AtomicU64,
+    quotas: &Mutex<Quotas>,
+) {
     let mut is_failing = false;
     let mut ends = false;
     while !ends {
-        let mut lines = String::new();
-        let mut count = 0;
-        let Ok(first) = waiting.recv() else { break };
-        let mut next = Some(first);
-        while let Some(record) = next {
-            let Some(record) = record else {
-                ends = true;
-                break;
-            };
-            push_line(&mut lines, &record);
-            count += 1;
-            next = (count < BATCH_MAX).then(|| waiting.try_recv().ok()).flatten();
+        let mut records = Vec::new();
+        match waiting.recv_timeout(SUMMARY_DELAY) {
+            Ok(Some(record)) => records.push(record),
+            Err(RecvTimeoutError::Timeout) => lock(quotas).sweep(now().unix.0, &mut records),
+            Ok(None) | Err(RecvTimeoutError::Disconnected) => ends = true,
+        }
+        while !ends && records.len() < BATCH_MAX {
+            match waiting.try_recv() {
+                Ok(Some(record)) => records.push(record),
+                Ok(None) => ends = true,
+                Err(_) => break,
+            }
+        }
+        if ends {
+            lock(quotas).finish(&mut records);
         }
         let missing = lost.swap(0, Relaxed);
+        if records.is_empty() && missing == 0 {
+            continue;
+        }
+        let mut lines = String::new();
+        records.iter().for_each(|record| push_line(&mut lines, record));
         if missing > 0 {
             let record = AuditRecord { lost: Some(missing), ..AuditRecord::new(AuditEvent::Lost) };
             push_line(&mut lines, &record);
@@ -487,14 +433,14 @@ fn write_all(mut file: LogFile, waiting: &Receiver<Option<AuditRecord>>, lost: &
         match file.append(&lines) {
             Ok(()) => is_failing = false,
             Err(error) => {
-                lost.fetch_add(missing + count as u64, Relaxed);
+                lost.fetch_add(missing + records.len() as u64, Relaxed);
                 if !std::mem::replace(&mut is_failing, true) {
-                    warn!(path = %file.path.display(), %error, "the audit log cannot be written; losses are counted");
+                    warn!(path = %file.path().display(), %error, "the audit log cannot be written; losses are counted");
                 }
             }
         }
     }
-    let _ = file.file.sync_data();
+    let _ = file.sync();
 }
 
 fn push_line(lines: &mut String, record: &AuditRecord) {

@@ -507,7 +507,7 @@ impl<N: RosNetwork> Core<N> {
             }
             CoreEvent::Crl { der, reply } => {
                 let taken = self.router.add_crl(now(), &der);
-                let record = AuditRecord::new(AuditEvent::Crl).by("a user");
+                let record = AuditRecord::new(AuditEvent::Crl).by_user();
                 match &taken {
                     // Written where it comes into force.
                     Ok(true) => {}
@@ -698,7 +698,9 @@ impl<N: RosNetwork> Core<N> {
         drops.extend(self.data.rates().drops());
         drops.extend(self.ros_failures.snapshot());
         drops.extend(self.board.drops().snapshot());
-        drops.extend(Some(self.audit.lost_total()).filter(|n| *n > 0).map(|n| ("audit_lost".to_owned(), n)));
+        let audit =
+            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
+        drops.extend(audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n)));
         let router = self.router.stats();
         Status {
             node: self.identity.node_name().to_string(),

@@ -588,7 +588,7 @@ fn open_audit(
 ) -> Result<(Audit, Option<AuditWriter>), NodeError> {
     let path = audit::audit_path(config.audit.file.as_deref(), state);
     let Some(path) = path.filter(|_| !config.audit.off) else { return Ok((Audit::default(), None)) };
-    let (audit, writer) = Audit::open(&path, config.audit.max_bytes, rules.names.clone())
+    let (audit, writer) = Audit::open(&path, config.audit.room, rules.names.clone())
         .map_err(|source| NodeError::Audit { path, source })?;
     Ok((audit, Some(writer)))
 }

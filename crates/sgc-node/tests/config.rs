@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sgc_gateway::{Anonymous, Right};
+use sgc_node::audit::AuditRoom;
 use sgc_node::config::{
     ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Mistake, Naming, Origin,
     Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, Shaping, Table, TokenConfig, TokenSource,
@@ -974,6 +975,7 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
         [audit]
         file = "/var/log/sgc.jsonl"
         max_bytes = 1048576
+        files = 99
         "#,
     );
     assert_eq!(config.state.as_deref(), Some(Path::new("/etc/sgc/state")));
@@ -982,10 +984,16 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
     let every = std::time::Duration::from_secs(900);
     assert_eq!(config.rotation, RotationConfig { every, messages: 4096 });
     let file = Some(PathBuf::from("/var/log/sgc.jsonl"));
-    assert_eq!(config.audit, AuditConfig { file, max_bytes: 1 << 20, off: false });
+    assert_eq!(
+        config.audit,
+        AuditConfig { file, room: AuditRoom { max_bytes: 1 << 20, files: 99 }, off: false }
+    );
     let plain = good(NODE);
     assert_eq!(plain.rotation.every, std::time::Duration::from_secs(3600));
-    assert_eq!((plain.rotation.messages, plain.audit.max_bytes), (1 << 24, 16 << 20));
+    assert_eq!(
+        (plain.rotation.messages, plain.audit.room),
+        (1 << 24, AuditRoom { max_bytes: 16 << 20, files: 8 })
+    );
     assert!(good(&format!("{NODE}[audit]\noff = true")).audit.off);
     let duration = "it takes a number with s, min, h or d, from \"10s\" to \"30d\"";
     for (every, said) in
@@ -1002,6 +1010,11 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
         (
             "[audit]\nmax_bytes = -1",
             &["node.toml:4: `max_bytes` is -1; it takes a number of bytes from 65536 to 1099511627776"],
+        ),
+        ("[audit]\nfiles = 0", &["node.toml:4: `files` is 0; it takes a number of files from 1 to 99"]),
+        (
+            "[audit]\noff = true\nfiles = 3",
+            &["node.toml:5: `off` is true, but `files` is given: take one of them out"],
         ),
         (
             "[audit]\noff = true\nfile = 'x'",

@@ -1,6 +1,6 @@
 //! `sgc audit`: shows who was granted, refused and cut off by a node of this machine.
 //!
-//! It reads the log that the node writes; the node need not run. What is in a log came from elsewhere: nothing of it
+//! It reads the log that the node writes, and the files of it that were put aside; the node need not run. What is in a log came from elsewhere: nothing of it
 //! reaches the terminal that could steer it.
 
 use std::path::{Path, PathBuf};
@@ -53,12 +53,12 @@ pub(crate) fn audit(args: &AuditArgs) -> Result<(), CliError> {
         .since
         .map_or(0, |since| unix_now().0.saturating_sub(u64::try_from(since.as_millis()).unwrap_or(u64::MAX)));
     let mut found = Vec::new();
-    let malformed = audit::read(&path, |record| {
+    let unread = audit::read(&path, |record| {
         if record.unix_ms >= from && args.wants(&record) {
             found.push(record);
         }
     });
-    let malformed = malformed.map_err(|error| CliError::NoAudit {
+    let unread = unread.map_err(|error| CliError::NoAudit {
         path: path.clone(),
         reason: match error.kind() {
             std::io::ErrorKind::NotFound => "there is no such file".to_owned(),
@@ -79,8 +79,18 @@ pub(crate) fn audit(args: &AuditArgs) -> Result<(), CliError> {
             output::line(line)?;
         }
     }
-    if malformed > 0 {
-        let lines = if malformed == 1 { "1 line is".to_owned() } else { format!("{malformed} lines are") };
+    if !unread.files.is_empty() {
+        let files: Vec<_> = unread.files.iter().map(|file| file.display().to_string()).collect();
+        output::diagnostic(&format!(
+            "sgc: not read, unpack them and name each with --file: {}",
+            files.join(", ")
+        ));
+    }
+    if unread.lines > 0 {
+        let lines = match unread.lines {
+            1 => "1 line is".to_owned(),
+            malformed => format!("{malformed} lines are"),
+        };
         output::diagnostic(&format!(
             "sgc: {}: {lines} not readable, as a killed node leaves it",
             path.display()
@@ -97,7 +107,9 @@ impl AuditArgs {
         };
         self.topic.as_ref().is_none_or(|topic| record.topic.as_ref() == Some(topic))
             && self.peer.as_ref().is_none_or(is_peer)
-            && (self.events.is_empty() || self.events.contains(&record.event))
+            && (self.events.is_empty()
+                || self.events.contains(&record.event)
+                || record.of.as_ref().is_some_and(|of| self.events.contains(of)))
     }
 }
 
@@ -144,6 +156,9 @@ fn only_log(dir: &Path) -> Result<PathBuf, CliError> {
 fn row(record: &AuditRecord) -> Vec<String> {
     let short = || record.peer.as_ref().map(|peer| peer.chars().take(NODE_CHARS).collect());
     let mut why = Vec::new();
+    if let (Some(of), Some(count)) = (&record.of, record.count) {
+        why.push(format!("{count} more of {of} since {}, the last", record.from.as_deref().unwrap_or("?")));
+    }
     why.extend(record.reason.clone());
     why.extend(record.by.as_ref().map(|by| format!("by {by}")));
     why.extend(record.epoch.map(|epoch| format!("epoch {epoch}")));
@@ -197,11 +212,10 @@ mod tests {
     fn what_came_from_elsewhere_cannot_steer_a_terminal() {
         let hostile = "a\u{1b}[2J\u{9b}31m\u{7f}\r\nb\u{202e}c";
         assert_eq!(plain(hostile), "a[2J31mbc");
-        let json =
-            serde_json::to_string(&AuditRecord { event: hostile.into(), ..AuditRecord::default() }).unwrap();
+        let json = serde_json::to_string(&AuditRecord::new(AuditEvent::Refused).reason(hostile)).unwrap();
         let shown = harmless(&json);
         assert!(!shown.chars().any(is_harmful), "{shown}");
         let read: AuditRecord = serde_json::from_str(&shown).unwrap();
-        assert_eq!(read.event, hostile);
+        assert_eq!(read.reason.as_deref(), Some(hostile));
     }
 }

@@ -162,6 +162,7 @@ pub(super) struct RotationDraft {
 pub(super) struct AuditDraft {
     pub(super) file: Option<Located<PathBuf>>,
     pub(super) max_bytes: Option<Located<i64>>,
+    pub(super) files: Option<Located<i64>>,
     pub(super) off: Option<Located<bool>>,
 }
 

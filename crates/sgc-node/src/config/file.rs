@@ -143,6 +143,7 @@ impl FileReader<'_> {
                     .string(audit.as_ref(), "file", "a string, such as \"/var/log/sgc/arm-1.audit\"")
                     .map(|file| file.map(PathBuf::from)),
                 max_bytes: self.integer(audit.as_ref(), "max_bytes", "a number, such as 16777216"),
+                files: self.integer(audit.as_ref(), "files", "a number, such as 8"),
                 off: self.boolean(audit.as_ref(), "off", "true or false"),
             },
             transport: self.transport(transport.as_ref()),

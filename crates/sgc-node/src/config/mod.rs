@@ -27,6 +27,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::audit::AuditRoom;
 pub use sgc_ros::{Interface, Naming, Rename, Shaping};
 use sgc_router::MappingKind;
 use sgc_transport::{Congestion, ListenAddr};
@@ -319,8 +320,8 @@ impl Default for RotationConfig {
 pub struct AuditConfig {
     /// The file; none is `audit.jsonl` in the state directory.
     pub file: Option<PathBuf>,
-    /// How large it becomes before it is put aside, bytes; one that was put aside is kept.
-    pub max_bytes: u64,
+    /// The room that it may take.
+    pub room: AuditRoom,
     /// Nothing is written.
     pub off: bool,
 }
@@ -328,13 +329,17 @@ pub struct AuditConfig {
 impl AuditConfig {
     /// Some hundred records.
     pub const MAX_BYTES_MIN: u64 = 64 << 10;
-    /// Twice as much is on the disk.
+    /// As much as any disk has.
     pub const MAX_BYTES_MAX: u64 = 1 << 40;
+    /// One file that was put aside, so that no record is gone as soon as a file is full.
+    pub const FILES_MIN: u32 = 1;
+    /// A number of files that is read at once.
+    pub const FILES_MAX: u32 = 99;
 }
 
 impl Default for AuditConfig {
     fn default() -> Self {
-        Self { file: None, max_bytes: 16 << 20, off: false }
+        Self { file: None, room: AuditRoom { max_bytes: 16 << 20, files: 8 }, off: false }
     }
 }
 

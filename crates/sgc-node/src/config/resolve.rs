@@ -25,6 +25,7 @@ use super::{
     RotationConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
     ros_env,
 };
+use crate::audit::AuditRoom;
 
 /// Shares of one node.
 pub const SHARES_MAX: usize = 1024;
@@ -528,10 +529,13 @@ impl Resolver<'_> {
         let file = written.file.as_ref().and_then(|f| self.path(f, "\"/var/log/sgc/arm-1.audit\""));
         let bounds = (AuditConfig::MAX_BYTES_MIN, AuditConfig::MAX_BYTES_MAX);
         let max_bytes = written.max_bytes.as_ref().and_then(|n| self.number(n, "a number of bytes", bounds));
+        let bounds = (AuditConfig::FILES_MIN.into(), AuditConfig::FILES_MAX.into());
+        let files = written.files.as_ref().and_then(|n| self.number(n, "a number of files", bounds));
+        let files = files.and_then(|files| u32::try_from(files).ok());
         let off = written.off.as_ref().is_some_and(|off| off.value);
         let other = [written.file.as_ref().map(|f| (f.key, &f.origin))]
             .into_iter()
-            .chain([written.max_bytes.as_ref().map(|n| (n.key, &n.origin))])
+            .chain([&written.max_bytes, &written.files].map(|n| n.as_ref().map(|n| (n.key, &n.origin))))
             .flatten()
             .next();
         if let Some((other, origin)) = other.filter(|_| off) {
@@ -542,7 +546,12 @@ impl Resolver<'_> {
                 Mistake::Contradiction { key: "off", value: "true", other, other_value, right },
             );
         }
-        AuditConfig { file, max_bytes: max_bytes.unwrap_or(AuditConfig::default().max_bytes), off }
+        let usual = AuditConfig::default().room;
+        let room = AuditRoom {
+            max_bytes: max_bytes.unwrap_or(usual.max_bytes),
+            files: files.unwrap_or(usual.files),
+        };
+        AuditConfig { file, room, off }
     }
 
     fn number(&mut self, written: &Located<i64>, what: &'static str, (min, max): (u64, u64)) -> Option<u64> {

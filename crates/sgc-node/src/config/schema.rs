@@ -151,7 +151,7 @@ impl Table {
             Self::Admin => &["socket"],
             Self::Authority => &["fleet"],
             Self::Rotation => &["every", "messages"],
-            Self::Audit => &["file", "max_bytes", "off"],
+            Self::Audit => &["file", "max_bytes", "files", "off"],
             Self::Partner => &["name", "ca", "node"],
             Self::Gateway => &[
                 "listen",

@@ -163,7 +163,7 @@ impl Lab {
     pub fn audit(&self, node: &str) -> Vec<AuditRecord> {
         let mut records = Vec::new();
         match audit::read(&self.state(node).join("audit.jsonl"), |record| records.push(record)) {
-            Ok(malformed) => assert_eq!(malformed, 0),
+            Ok(unread) => assert_eq!(unread, audit::Unread::default()),
             Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::NotFound),
         }
         records

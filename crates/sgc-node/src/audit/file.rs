@@ -1,0 +1,253 @@
+//! The files of the audit log: how they are appended to, put aside and read.
+//!
+//! `FILE` is written; `FILE.1` is the last one that was put aside, `FILE.2` the one before it. Another program may
+//! rename or cut the file at any time, as logrotate does: the writer looks before each write.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+
+use super::AuditRecord;
+
+/// Longest line that is read, bytes; those written are shorter.
+const LINE_BYTES_MAX: u64 = 16 * 1024;
+/// Files that are read, the newest ones.
+const READ_FILES_MAX: usize = 256;
+/// Endings of files that a log rotator compressed.
+const COMPRESSED: [&str; 5] = [".gz", ".xz", ".zst", ".bz2", ".lz4"];
+
+/// The room that the log may take on the disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AuditRoom {
+    /// Most bytes of one file; at this size it is put aside.
+    pub max_bytes: u64,
+    /// Files that are kept beside the one that is written.
+    pub files: u32,
+}
+
+/// Where the log is that was put aside as the `n`th, from 1, the newest.
+pub fn rotated_path(path: &Path, n: u32) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(format!(".{n}"));
+    PathBuf::from(name)
+}
+
+/// The log file that is written.
+pub(super) struct LogFile {
+    path: PathBuf,
+    room: AuditRoom,
+    file: fs::File,
+    bytes: u64,
+    /// A line was begun and not ended.
+    is_torn: bool,
+}
+
+impl LogFile {
+    /// Opens or makes the file at `path`; what is no file of its own, such as a symbolic link, is an error.
+    pub(super) fn open(path: &Path, room: AuditRoom) -> io::Result<Self> {
+        // A link could lead the log elsewhere; what is no file could hold up whoever opens it.
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+        let mut options = fs::OpenOptions::new();
+        let options = options.read(true).append(true).create(true).mode(0o600).custom_flags(flags);
+        let mut file = options.open(path)?;
+        let metadata = file.metadata()?;
+        if !metadata.is_file() {
+            return Err(io::Error::other("it is not a file"));
+        }
+        file.set_permissions(fs::Permissions::from_mode(0o600))?;
+        let mut is_torn = false;
+        if metadata.len() > 0 {
+            file.seek(SeekFrom::End(-1))?;
+            let mut last = [0];
+            file.read_exact(&mut last)?;
+            is_torn = last != *b"\n";
+        }
+        Ok(Self { path: path.to_owned(), room, file, bytes: metadata.len(), is_torn })
+    }
+
+    /// Returns where it is.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Appends whole lines, after putting the file aside if they do not fit.
+    pub(super) fn append(&mut self, lines: &str) -> io::Result<()> {
+        self.follow()?;
+        if self.bytes > 0 && self.bytes + lines.len() as u64 > self.room.max_bytes {
+            self.rotate()?;
+        }
+        if self.is_torn {
+            self.write(b"\n")?;
+        }
+        self.write(lines.as_bytes())
+    }
+
+    /// Forces the lines to the disk.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        self.file.sync_data()
+    }
+
+    /// Opens the file anew if another program renamed, removed or cut it.
+    fn follow(&mut self) -> io::Result<()> {
+        let ours = self.file.metadata()?;
+        match fs::symlink_metadata(&self.path) {
+            Ok(there) if (there.dev(), there.ino()) == (ours.dev(), ours.ino()) => {
+                // The commands of a user append to it as well.
+                self.bytes = ours.len();
+                Ok(())
+            }
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+            _ => {
+                self.file.sync_data()?;
+                *self = Self::open(&self.path, self.room)?;
+                Ok(())
+            }
+        }
+    }
+
+    fn rotate(&mut self) -> io::Result<()> {
+        self.file.sync_data()?;
+        // More may be there of a time when more were kept.
+        for n in self.room.files.saturating_add(1).. {
+            if fs::remove_file(rotated_path(&self.path, n)).is_err() {
+                break;
+            }
+        }
+        for n in (0..self.room.files).rev() {
+            let from = if n == 0 { self.path.clone() } else { rotated_path(&self.path, n) };
+            match fs::rename(from, rotated_path(&self.path, n + 1)) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+                _ => {}
+            }
+        }
+        *self = Self::open(&self.path, self.room)?;
+        fs::File::open(directory(&self.path))?.sync_all()
+    }
+
+    /// A write that fails may have written a part.
+    fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.is_torn = true;
+        self.file.write_all(bytes)?;
+        self.bytes += bytes.len() as u64;
+        self.is_torn = false;
+        Ok(())
+    }
+}
+
+/// What could not be read of a log.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Unread {
+    /// Lines that are no records.
+    pub lines: u64,
+    /// Files that a log rotator compressed, and files beyond the newest 256.
+    pub files: Vec<PathBuf>,
+}
+
+/// Reads the log at `path`, with all files that were put aside, from the oldest record to the newest; gives each record
+/// to `take`. Numbered files (`FILE.2`) and dated ones (`FILE-20261124`) belong to it.
+pub fn read(path: &Path, mut take: impl FnMut(AuditRecord)) -> io::Result<Unread> {
+    let Aside { files, mut unread } = Aside::of(path)?;
+    // The newest is opened first: what is put aside meanwhile is met once more, and known by its inode.
+    let (mut opened, mut met) = (Vec::new(), BTreeSet::new());
+    for path in std::iter::once(path).chain(files.iter().map(PathBuf::as_path)) {
+        if opened.len() == READ_FILES_MAX {
+            unread.files.push(path.to_owned());
+            continue;
+        }
+        let file = match fs::File::open(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            file => file?,
+        };
+        let metadata = file.metadata()?;
+        if met.insert((metadata.dev(), metadata.ino())) {
+            opened.push(file);
+        }
+    }
+    if opened.is_empty() && unread.files.is_empty() {
+        return Err(io::ErrorKind::NotFound.into());
+    }
+    for file in opened.into_iter().rev() {
+        unread.lines += read_file(file, &mut take)?;
+    }
+    Ok(unread)
+}
+
+/// Reads one file; returns how many of its lines are no records.
+fn read_file(file: fs::File, take: &mut impl FnMut(AuditRecord)) -> io::Result<u64> {
+    let mut malformed = 0;
+    let mut reader = BufReader::new(file);
+    let mut line = Vec::new();
+    let mut is_tail = false;
+    loop {
+        line.clear();
+        let n = (&mut reader).take(LINE_BYTES_MAX).read_until(b'\n', &mut line)?;
+        if n == 0 {
+            return Ok(malformed);
+        }
+        let ends = line.last() == Some(&b'\n');
+        // The rest of a line that was too long belongs to it.
+        if !std::mem::replace(&mut is_tail, !ends) {
+            match serde_json::from_slice::<AuditRecord>(&line) {
+                Ok(record) if !record.event.is_empty() => take(record),
+                _ if line.trim_ascii().is_empty() => {}
+                _ => malformed += 1,
+            }
+        }
+    }
+}
+
+/// The files of a log that were put aside.
+#[derive(Default)]
+struct Aside {
+    /// The newest first.
+    files: Vec<PathBuf>,
+    unread: Unread,
+}
+
+impl Aside {
+    fn of(path: &Path) -> io::Result<Self> {
+        let mut aside = Self::default();
+        let entries = match fs::read_dir(directory(path)) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(aside),
+            entries => entries?,
+        };
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let (mut numbered, mut dated) = (Vec::new(), Vec::new());
+        for entry in entries {
+            let entry = entry?;
+            let found = entry.file_name().to_string_lossy().into_owned();
+            let Some(ending) = found.strip_prefix(&name) else { continue };
+            let (plain, is_compressed) = match COMPRESSED.iter().find_map(|c| ending.strip_suffix(c)) {
+                Some(plain) => (plain, true),
+                None => (ending, false),
+            };
+            let number =
+                plain.strip_prefix('.').filter(|n| !n.starts_with('0')).and_then(|n| n.parse::<u32>().ok());
+            let is_date = |date: &&str| {
+                date.starts_with(|c: char| c.is_ascii_digit())
+                    && date.chars().all(|c| c.is_ascii_digit() || c == '-')
+            };
+            let date = plain.strip_prefix('-').filter(is_date).map(str::to_owned);
+            match (number, date) {
+                (None, None) => {}
+                _ if is_compressed => aside.unread.files.push(entry.path()),
+                (Some(number), _) => numbered.push((number, entry.path())),
+                (None, Some(date)) => dated.push((date, entry.path())),
+            }
+        }
+        numbered.sort();
+        dated.sort();
+        let dated = dated.into_iter().rev().map(|(_, path)| path);
+        aside.files = numbered.into_iter().map(|(_, path)| path).chain(dated).collect();
+        aside.unread.files.sort();
+        Ok(aside)
+    }
+}
+
+fn directory(path: &Path) -> &Path {
+    path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
