@@ -443,6 +443,8 @@ impl<N: RosNetwork> Core<N> {
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 let (flows, heart) = (HashMap::new(), self.heart_of(&link));
+                self.control_drops.link_up(id);
+                self.data.drops().link_up(id);
                 self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, heart });
                 let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
                 if reply.send(Some(place)).is_err() {
@@ -453,6 +455,8 @@ impl<N: RosNetwork> Core<N> {
             }
             CoreEvent::LinkDown { id } => {
                 self.router.handle_link_down(now(), id);
+                self.control_drops.link_down(id);
+                self.data.drops().link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
                     self.remember_patience(entry.link.peer().node_id, entry.heart.patience());
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);

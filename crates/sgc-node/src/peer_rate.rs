@@ -24,6 +24,8 @@ pub(crate) struct PeerRates {
     limit: Option<Limit>,
     /// Looked at when links begin, and for the status.
     peers: Mutex<BTreeMap<NodeId, Arc<PeerRate>>>,
+    /// Packets dropped of peers that are forgotten.
+    gone: AtomicU64,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -48,7 +50,7 @@ impl PeerRates {
             limit.burst_ns = nanos(BURST).max(limit.cost_ns(BURST_BYTES_MIN));
             limit
         });
-        Self { limit, peers: Mutex::default() }
+        Self { limit, peers: Mutex::default(), gone: AtomicU64::new(0) }
     }
 
     /// The bucket of a peer that has a link now, if there is a limit. It outlives the link until what was sent is paid
@@ -60,12 +62,17 @@ impl PeerRates {
     fn of_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
         let limit = self.limit?;
         let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        peers.retain(|id, rate| *id == peer || Arc::strong_count(rate) > 1 || !rate.is_paid(now));
+        peers.retain(|id, rate| {
+            let stays = *id == peer || Arc::strong_count(rate) > 1 || !rate.is_paid(now);
+            self.gone.fetch_add(if stays { 0 } else { rate.over().dropped }, Relaxed);
+            stays
+        });
         let idle = |rate: &Arc<PeerRate>| Arc::strong_count(rate) == 1;
         if peers.len() >= PEERS_MAX
             && let Some(one) = peers.iter().find(|(id, rate)| **id != peer && idle(rate)).map(|(id, _)| *id)
+            && let Some(rate) = peers.remove(&one)
         {
-            peers.remove(&one);
+            self.gone.fetch_add(rate.over().dropped, Relaxed);
         }
         Some(peers.entry(peer).or_insert_with(|| Arc::new(PeerRate::new(peer, limit))).clone())
     }
@@ -76,16 +83,18 @@ impl PeerRates {
         peers.get(peer).map(|rate| rate.over()).unwrap_or_default()
     }
 
-    /// Drops, by peer.
+    /// Drops: of all peers, and by peer of those that have a link.
     pub(crate) fn drops(&self) -> BTreeMap<String, u64> {
         let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut drops = BTreeMap::new();
-        for (peer, dropped) in
-            peers.iter().map(|(id, rate)| (id, rate.over().dropped)).filter(|(_, n)| *n > 0)
-        {
-            *drops.entry("over_rate".to_owned()).or_default() += dropped;
-            drops.insert(format!("over_rate from {}", peer.short()), dropped);
+        let (mut drops, mut all) = (BTreeMap::new(), self.gone.load(Relaxed));
+        for (peer, rate) in peers.iter() {
+            let dropped = rate.over().dropped;
+            all += dropped;
+            if dropped > 0 && Arc::strong_count(rate) > 1 {
+                drops.insert(format!("over_rate from {}", peer.short()), dropped);
+            }
         }
+        drops.extend((all > 0).then(|| ("over_rate".to_owned(), all)));
         drops
     }
 }
@@ -259,7 +268,11 @@ mod tests {
         assert_eq!((rates.drops()["over_rate"], rates.over(&NodeId([1; 32])).dropped), (2, 2));
         // Who has paid is forgotten.
         assert!(of(SECOND, 3).take_now_at(SECOND, PACKET));
-        assert!(rates.drops().is_empty());
+        assert_eq!(
+            rates.drops(),
+            BTreeMap::from([("over_rate".to_owned(), 2)]),
+            "and its drops are in the total"
+        );
         let one = NodeId([1; 32]);
         assert!(PeerRates::new(None).of(one).is_none());
     }

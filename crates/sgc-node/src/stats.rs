@@ -1,9 +1,12 @@
 //! Counters of the data path, and the drops that they count.
 
-use std::collections::BTreeMap;
-use std::fmt::Display;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::{self, Display};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use sgc_router::LinkId;
+use sgc_wire::NodeId;
 
 /// Traffic of one name at this node.
 #[derive(Debug, Default)]
@@ -133,26 +136,55 @@ impl DataDrop {
     }
 }
 
-/// Kinds of drops by culprit that are remembered; beyond it all are forgotten and begin anew.
-const CULPRITS_MAX: usize = 512;
+/// Rows of drops by culprit; beyond it the smallest one leaves.
+const ROWS_MAX: usize = 512;
 
-/// Counts by kind, and by kind and culprit. Written on the rare path only.
+/// The cause of a drop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Culprit {
+    /// A link. Its rows end with it.
+    Link(LinkId),
+    /// A peer.
+    Peer(NodeId),
+}
+
+impl From<LinkId> for Culprit {
+    fn from(link: LinkId) -> Self {
+        Self::Link(link)
+    }
+}
+
+impl From<NodeId> for Culprit {
+    fn from(peer: NodeId) -> Self {
+        Self::Peer(peer)
+    }
+}
+
+impl Display for Culprit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Link(link) => link.fmt(f),
+            Self::Peer(peer) => f.write_str(&peer.short()),
+        }
+    }
+}
+
+/// Counts by kind, and by kind and culprit. Written on the rare path only. The count of a kind holds those of all its
+/// culprits, also of links that have ended.
 #[derive(Debug, Default)]
 pub(crate) struct Drops(Mutex<Counts>);
 
 #[derive(Debug, Default)]
 struct Counts {
     kinds: BTreeMap<&'static str, u64>,
-    culprits: BTreeMap<String, u64>,
+    rows: BTreeMap<(Culprit, &'static str), u64>,
+    links: BTreeSet<LinkId>,
 }
 
 impl Drops {
     /// Counts one; true if it is the first of its kind.
     pub(crate) fn count(&self, kind: &'static str) -> bool {
-        let mut counts = self.lock();
-        let n = counts.kinds.entry(kind).or_default();
-        *n += 1;
-        *n == 1
+        self.add(kind, 1)
     }
 
     /// Counts several; true if they are the first of their kind.
@@ -163,24 +195,46 @@ impl Drops {
         *n == several
     }
 
-    /// Counts one of somebody's; true if it is the first of its kind from there.
-    pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Display) -> bool {
+    /// Counts one of somebody's; true if it is the first of its kind from there. Of a link that is not up, only the kind is
+    /// counted.
+    pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Into<Culprit>) -> bool {
+        let culprit = culprit.into();
         let mut counts = self.lock();
+        let counts = &mut *counts;
         *counts.kinds.entry(kind).or_default() += 1;
-        let key = format!("{kind} from {culprit}");
-        if counts.culprits.len() >= CULPRITS_MAX && !counts.culprits.contains_key(&key) {
-            counts.culprits.clear();
+        if matches!(culprit, Culprit::Link(link) if link != LinkId::LOCAL && !counts.links.contains(&link)) {
+            return false;
         }
-        let n = counts.culprits.entry(key).or_default();
+        let key = (culprit, kind);
+        if counts.rows.len() >= ROWS_MAX
+            && !counts.rows.contains_key(&key)
+            && let Some(smallest) = counts.rows.iter().min_by_key(|(_, n)| **n).map(|(key, _)| *key)
+        {
+            counts.rows.remove(&smallest);
+        }
+        let n = counts.rows.entry(key).or_default();
         *n += 1;
         *n == 1
+    }
+
+    /// From now on the drops of this link have rows of their own.
+    pub(crate) fn link_up(&self, link: LinkId) {
+        self.lock().links.insert(link);
+    }
+
+    /// The link ended, and with it its rows.
+    pub(crate) fn link_down(&self, link: LinkId) {
+        let mut counts = self.lock();
+        counts.links.remove(&link);
+        counts.rows.retain(|(culprit, _), _| *culprit != Culprit::Link(link));
     }
 
     /// All counts.
     pub(crate) fn snapshot(&self) -> BTreeMap<String, u64> {
         let counts = self.lock();
         let kinds = counts.kinds.iter().map(|(kind, n)| ((*kind).to_owned(), *n));
-        kinds.chain(counts.culprits.clone()).collect()
+        let rows = counts.rows.iter().map(|((culprit, kind), n)| (format!("{kind} from {culprit}"), *n));
+        kinds.chain(rows).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, Counts> {
@@ -205,15 +259,34 @@ mod tests {
     }
 
     #[test]
-    fn culprits_are_bounded_and_totals_are_not_lost() {
+    fn rows_are_bounded_and_totals_are_not_lost() {
         let drops = Drops::default();
-        assert!(drops.count_from("stale", 1));
-        assert!(!drops.count_from("stale", 1));
-        for link in 0..10_000 {
+        let links = (0..10_000).map(LinkId);
+        links.clone().for_each(|link| drops.link_up(link));
+        assert!(drops.count_from("stale", LinkId(1)));
+        assert!(!drops.count_from("stale", LinkId(1)));
+        for link in links {
             drops.count_from("stale", link);
         }
         let snapshot = drops.snapshot();
-        assert!(snapshot.len() <= CULPRITS_MAX + 1);
-        assert_eq!(snapshot["stale"], 10_002);
+        assert_eq!(snapshot.len(), ROWS_MAX + 1);
+        assert_eq!((snapshot["stale"], snapshot["stale from link 1"]), (10_002, 3), "the largest stays");
+    }
+
+    #[test]
+    fn rows_end_with_their_link_and_stay_in_the_total() {
+        let drops = Drops::default();
+        for link in [1, 2].map(LinkId) {
+            drops.link_up(link);
+            drops.count_from("stale", link);
+        }
+        drops.count_from("stale", Culprit::Peer(NodeId([7; 32])));
+        drops.link_down(LinkId(1));
+        // A packet that was under way when its link ended.
+        assert!(!drops.count_from("stale", LinkId(1)));
+        let rows: Vec<_> = drops.snapshot().into_iter().collect();
+        let row = |key: &str, n| (key.to_owned(), n);
+        let peer = format!("stale from {}", NodeId([7; 32]).short());
+        assert_eq!(rows, [row("stale", 4), row(&peer, 1), row("stale from link 2", 1)]);
     }
 }

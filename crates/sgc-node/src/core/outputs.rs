@@ -181,7 +181,7 @@ impl<N: RosNetwork> Core<N> {
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 graph::remember_refusal(&mut self.refused, name, peer, &reason);
-                if self.control_drops.count_from("join_refused", peer.short()) {
+                if self.control_drops.count_from("join_refused", peer) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
             }

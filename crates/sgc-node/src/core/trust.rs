@@ -73,7 +73,7 @@ impl<N: RosNetwork> Core<N> {
 
     fn renewal_ready(&mut self, RenewalAnswer { asker, node, answer }: RenewalAnswer) {
         if let Err(why) = &answer
-            && self.control_drops.count_from(why.key(), node.short())
+            && self.control_drops.count_from(why.key(), node)
         {
             warn!(peer = %node.short(), %why, "gives no credentials; counted from here on");
         }
