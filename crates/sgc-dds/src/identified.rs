@@ -4,7 +4,8 @@
 //! enough: coming in, it hands out the received packet, so the inline QoS in front of the payload can be read; going
 //! out, it asks for the payload when the submessage's header is in the message and before its length is set, so
 //! parameters can still be added. The latter reaches into `struct ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0
-//! builds; [`add_related`] says what it relies on, and leaves the message alone where that does not hold.
+//! builds; [`add_related`] says what it relies on, and leaves the message alone where that does not hold. Another
+//! version of `cyclors` does not compile: [`CYCLORS`].
 //!
 //! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
 
@@ -27,6 +28,33 @@ use crate::identity::{
 };
 use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
+
+/// The requirement of `Cargo.toml` for the only version of `cyclors` whose C code this module was written for. Cargo builds
+/// no other version than the one that is written there with `=`, and whoever writes another one there meets the assertion
+/// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
+/// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), the callers of
+/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with what stands here.
+const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
+
+const _: () = assert!(
+    contains(include_str!("../Cargo.toml").as_bytes(), CYCLORS.as_bytes()),
+    "identified.rs was written for the C structs of another version of cyclors: see CYCLORS"
+);
+
+const fn contains(text: &[u8], part: &[u8]) -> bool {
+    let mut at = 0;
+    while at + part.len() <= text.len() {
+        let mut n = 0;
+        while n < part.len() && text[at + n] == part[n] {
+            n += 1;
+        }
+        if n == part.len() {
+            return true;
+        }
+        at += 1;
+    }
+    false
+}
 
 /// What a received message says besides its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
