@@ -5,11 +5,12 @@
 //! `status`, whose answer is the document itself, and for `tap`, whose answer is that line and then a stream of
 //! [`TapHead`]s with what is seen; the line has the description of the type, if the node knows it. What is asked is carried out elsewhere.
 
-use std::fs;
+mod socket;
+
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use base64::Engine as _;
@@ -17,9 +18,13 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use sgc_wire::{CRL_BYTES_MAX, Name};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{UnixListener, UnixStream};
+use tokio::net::UnixStream;
 use tokio::sync::{Semaphore, mpsc, oneshot};
-use tracing::debug;
+use tokio::task::JoinHandle;
+use tracing::{debug, info, warn};
+
+pub use self::socket::{SocketError, connect, default_socket_path};
+use self::socket::{StatusSocket, may_ask};
 
 use crate::core::CoreEvent;
 use crate::gateway::Gateway;
@@ -43,6 +48,11 @@ const TAPS_MAX: usize = 8;
 const TAP_STALL_MAX: Duration = Duration::from_secs(30);
 /// Longest ROS name that is asked for, bytes: DDS topics have at most 256, with a prefix.
 const TOPIC_BYTES_MAX: usize = 254;
+/// First and longest time between two attempts to have the socket.
+const BIND_AGAIN_MIN: Duration = Duration::from_millis(100);
+const BIND_AGAIN_MAX: Duration = Duration::from_secs(5);
+/// How often a socket is looked for whose path somebody may have removed, as programs that tidy `/tmp` do.
+const LOOK_EVERY: Duration = Duration::from_secs(5);
 /// How long a question that was begun may take, and how long its answer may be in being read.
 const TRANSFER_MAX: Duration = Duration::from_secs(5);
 
@@ -247,52 +257,98 @@ pub enum AdminError {
     },
 }
 
-/// Binds the socket for this user alone. One that a dead node left is replaced, a live one is not.
-pub(crate) fn bind_socket(path: &Path) -> io::Result<UnixListener> {
-    if let Some(directory) = path.parent() {
-        fs::DirBuilder::new().recursive(true).mode(0o700).create(directory)?;
+/// What answers need.
+#[derive(Clone)]
+pub(crate) struct Desk {
+    pub(crate) events: mpsc::Sender<CoreEvent>,
+    pub(crate) reloader: Arc<Reloader>,
+    pub(crate) gateway: Arc<Gateway>,
+}
+
+/// Binds the socket at `path`, and answers there until the task that is returned is aborted. While another has the socket,
+/// a predecessor that still stops for example, it tries again.
+pub(crate) fn begin(path: PathBuf, desk: Desk) -> JoinHandle<()> {
+    let first = StatusSocket::bind(&path);
+    tokio::spawn(keep_socket(path, first, desk))
+}
+
+async fn keep_socket(path: PathBuf, first: Result<StatusSocket, SocketError>, desk: Desk) {
+    let (mut attempt, mut wait) = (first, BIND_AGAIN_MIN);
+    let mut said: Option<String> = None;
+    loop {
+        let why = match attempt {
+            Ok(socket) => {
+                if said.take().is_some() {
+                    info!(path = %path.display(), "the status socket is there now");
+                }
+                wait = BIND_AGAIN_MIN;
+                tokio::select! {
+                    () = serve(&socket, &desk) => return,
+                    () = removed(&socket) => "its path was removed".to_owned(),
+                }
+            }
+            Err(error) => error.to_string(),
+        };
+        if said.as_ref() != Some(&why) {
+            warn!(path = %path.display(), "no status socket: {why}; trying again");
+            said = Some(why);
+        }
+        tokio::time::sleep(wait).await;
+        wait = (wait * 2).min(BIND_AGAIN_MAX);
+        attempt = StatusSocket::bind(&path);
     }
-    if std::os::unix::net::UnixStream::connect(path).is_ok() {
-        return Err(io::Error::new(io::ErrorKind::AddrInUse, "another node answers there"));
+}
+
+/// Waits until the path of the socket leads to it no more.
+async fn removed(socket: &StatusSocket) {
+    while socket.is_in_place() {
+        tokio::time::sleep(LOOK_EVERY).await;
     }
-    match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    let listener = UnixListener::bind(path)?;
-    fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
-    Ok(listener)
 }
 
 /// Answers until the node ends.
-pub(crate) async fn serve(
-    listener: UnixListener,
-    events: mpsc::Sender<CoreEvent>,
-    reloader: Arc<Reloader>,
-    gateway: Arc<Gateway>,
-) {
+async fn serve(socket: &StatusSocket, desk: &Desk) {
     let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     let taps = Arc::new(Semaphore::new(TAPS_MAX));
+    let refused = Arc::new(AtomicBool::new(false));
     while let Ok(place) = places.clone().acquire_owned().await {
-        let Ok((stream, _)) = listener.accept().await else { return };
-        if events.is_closed() {
+        let accepted = socket.listener().accept().await;
+        if desk.events.is_closed() {
             return;
         }
-        let (events, reloader, taps) = (events.clone(), reloader.clone(), taps.clone());
-        let gateway = gateway.clone();
+        let mut stream = match accepted {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                // No more files may be open, for example.
+                debug!(%error, "the status socket takes no connection");
+                tokio::time::sleep(BIND_AGAIN_MIN).await;
+                continue;
+            }
+        };
+        let (desk, taps, refused) = (desk.clone(), taps.clone(), refused.clone());
         tokio::spawn(async move {
-            if is_ours(&stream) {
-                answer(stream, &events, &reloader, &taps, &gateway).await;
+            match stream.peer_cred().map(|peer| peer.uid()) {
+                Ok(uid) if may_ask(uid) => {
+                    answer(stream, &desk.events, &desk.reloader, &taps, &desk.gateway).await;
+                }
+                // The mode of the socket keeps others out already, unless somebody changed it.
+                Ok(uid) => refuse(&mut stream, uid, &refused).await,
+                Err(error) => debug!(%error, "who asks at the status socket cannot be told"),
             }
             drop(place);
         });
     }
 }
 
-/// The mode of the socket says so already, unless somebody changed it.
-fn is_ours(stream: &UnixStream) -> bool {
+/// Tells another user that it gets no answer.
+async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
+    if !was_said.swap(true, Relaxed) {
+        warn!(uid, "another user asks at the status socket and is refused; said once");
+    }
     let own = rustix::process::geteuid().as_raw();
-    stream.peer_cred().is_ok_and(|peer| peer.uid() == own || peer.uid() == 0)
+    let text =
+        envelope(Err(format!("this node answers uid {own}, whose it is, and root alone: you are uid {uid}")));
+    let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(text.as_bytes())).await;
 }
 
 async fn answer(

@@ -55,12 +55,11 @@ mod tell;
 mod type_questions;
 
 pub use access::{ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with};
+pub use admin::{SocketError, default_socket_path};
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use gateway::{GatewayStartError, OpenLocalRos};
-pub use node::{
-    NodeError, RunOptions, admin_socket_path, check_identity, default_socket_path, load_identity, run, run_on,
-};
+pub use node::{NodeError, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on};
 pub use reload::{ConfigSource, ReloadReport};
 pub use rules::{RulesError, read_token};
 pub use state::{StateError, check_state_dir, create_state_dir, state_dir};

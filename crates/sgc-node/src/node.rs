@@ -25,7 +25,7 @@ use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use crate::access::{AccessError, access_with, refused_tokens};
-use crate::admin;
+use crate::admin::{self, Desk};
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
@@ -243,16 +243,7 @@ fn wanted_nearby(routers: &[RouterUrl], identity: &Identity) -> Result<Option<Wa
 
 /// Where a node's status socket is: as configured, or in the user's runtime directory.
 pub fn admin_socket_path(config: &Config, node: &str) -> PathBuf {
-    config.admin_socket.clone().unwrap_or_else(|| default_socket_path(node))
-}
-
-/// Where the status socket of a node with this name is unless its configuration says otherwise.
-pub fn default_socket_path(node: &str) -> PathBuf {
-    let directory = match std::env::var_os("XDG_RUNTIME_DIR") {
-        Some(dir) if !dir.is_empty() => PathBuf::from(dir).join("sgc"),
-        _ => std::env::temp_dir().join(format!("sgc-{}", rustix::process::getuid().as_raw())),
-    };
-    directory.join(format!("{node}.sock"))
+    config.admin_socket.clone().unwrap_or_else(|| admin::default_socket_path(node))
 }
 
 /// Runs a node until `shutdown` is ready; then withdraws its names, lets its queues empty, and returns.
@@ -495,15 +486,8 @@ pub async fn run_on<N: RosNetwork>(
     if let Some(watch) = file_watch {
         tasks.push(tokio::spawn(watch.run(reloader.clone())));
     }
-    match admin::bind_socket(&socket) {
-        Ok(listener) => tasks.push(tokio::spawn(admin::serve(
-            listener,
-            events.clone(),
-            reloader.clone(),
-            gateway.clone(),
-        ))),
-        Err(error) => warn!(path = %socket.display(), %error, "no status socket"),
-    }
+    let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone() };
+    let socket = admin::begin(socket, desk);
     audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
     if let Some(ready) = options.ready {
         let _ = ready.send(listening);
@@ -542,6 +526,9 @@ pub async fn run_on<N: RosNetwork>(
     for task in tasks {
         task.abort();
     }
+    // A successor may have the socket when it is removed.
+    socket.abort();
+    let _ = socket.await;
     for (task, stop) in accepting {
         let _ = stop.send(());
         let _ = task.await;
@@ -553,7 +540,6 @@ pub async fn run_on<N: RosNetwork>(
     if tokio::time::timeout(DRAIN_MAX, all_ended.recv()).await.is_err() {
         warn!("the local network did not take everything in time");
     }
-    let _ = fs::remove_file(&socket);
     audit.write(AuditRecord::new(AuditEvent::Stopped));
     if let Some(writer) = audit_writer {
         let _ = tokio::task::spawn_blocking(move || writer.finish()).await;

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Deserialize;
+use sgc_node::SocketError;
 use sgc_node::admin::AdminRequest;
 use sgc_node::config::{self, Config};
 
@@ -50,6 +51,12 @@ pub(crate) struct Status {
     pub(crate) refused: BTreeMap<String, u64>,
     router: RouterSize,
     gateway: Option<Gateway>,
+}
+
+/// The answer of a node that gives none.
+#[derive(Debug, Deserialize)]
+struct Refused {
+    error: String,
 }
 
 /// Programs without ROS at a node.
@@ -220,10 +227,18 @@ pub(crate) fn no_node(socket: &Path, error: &std::io::Error, patience: Duration)
     }
 }
 
+/// Connects to the node at a status socket, if it is this user's or root's.
+pub(crate) fn connect(socket: &Path, patience: Duration) -> Result<UnixStream, CliError> {
+    sgc_node::admin::connect(socket).map_err(|error| match error {
+        SocketError::Io(error) => no_node(socket, &error, patience),
+        untrusted => CliError::NoNode { path: socket.to_owned(), reason: untrusted.to_string() },
+    })
+}
+
 /// Asks a node; gives its answer as it came.
 pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
     let no_node = |error: std::io::Error| no_node(socket, &error, patience);
-    let mut stream = UnixStream::connect(socket).map_err(no_node)?;
+    let mut stream = connect(socket, patience)?;
     stream.set_read_timeout(Some(patience)).map_err(no_node)?;
     stream.set_write_timeout(Some(patience)).map_err(no_node)?;
     // A node of an earlier version answers without reading.
@@ -234,6 +249,9 @@ pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> 
 }
 
 fn parse(socket: &Path, text: &str) -> Result<Status, CliError> {
+    if let Ok(Refused { error }) = serde_json::from_str(text) {
+        return Err(CliError::NotSeen { reason: error });
+    }
     serde_json::from_str(text)
         .map_err(|e| CliError::NotAStatus { path: socket.to_owned(), reason: e.to_string() })
 }

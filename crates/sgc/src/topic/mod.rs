@@ -181,7 +181,7 @@ impl TapArgs {
         let socket = self.node.socket()?;
         let request = AdminRequest::Tap { topic: self.topic.clone(), side: self.side.map(Into::into), bytes };
         let no_node = |error: std::io::Error| status::no_node(&socket, &error, BEGIN_MAX);
-        let mut stream = UnixStream::connect(&socket).map_err(no_node)?;
+        let mut stream = status::connect(&socket, BEGIN_MAX)?;
         stream.set_read_timeout(Some(BEGIN_MAX)).map_err(no_node)?;
         stream.write_all(request.to_line().as_bytes()).map_err(no_node)?;
         let mut line = Vec::new();

@@ -83,7 +83,7 @@ impl Publisher {
     fn begin(socket: PathBuf, wish: PublishWish) -> Result<(Self, Published), CliError> {
         let patience = BEGIN_MAX + Duration::from_millis(wish.wait_ms);
         let no_node = |error: std::io::Error| status::no_node(&socket, &error, patience);
-        let mut into = UnixStream::connect(&socket).map_err(no_node)?;
+        let mut into = status::connect(&socket, patience)?;
         into.set_read_timeout(Some(patience)).map_err(no_node)?;
         into.write_all(AdminRequest::Publish(wish).to_line().as_bytes()).map_err(no_node)?;
         let from = BufReader::new(into.try_clone().map_err(no_node)?);

@@ -1,0 +1,337 @@
+//! The place of the status socket, and how both ends make sure of each other.
+//!
+//! The node binds the socket in a directory of its own user and keeps a lock beside it for as long as it lives, so that
+//! one node has it and a successor waits. Both ends ask the system for the other's user (`SO_PEERCRED`): file modes
+//! alone would trust whoever made the directory first. What is said over a connection is the business of `admin`.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+use tokio::net::UnixListener;
+
+/// Permission bits that let others than the owner in.
+const OTHERS_BITS: u32 = 0o077;
+/// The bit that lets anybody make and remove files.
+const WORLD_WRITE_BIT: u32 = 0o002;
+/// The bit that lets none but their owners remove files.
+const STICKY_BIT: u32 = 0o1000;
+const ROOT: u32 = 0;
+
+/// Why there is no connection to a status socket, or no status socket.
+#[derive(Debug, thiserror::Error)]
+pub enum SocketError {
+    /// What the system said of the socket.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// Another node has the socket.
+    #[error("another node has it; it is taken over when that one ends")]
+    Taken,
+    /// The directory cannot be made or looked at.
+    #[error("directory {}: {source}", dir.display())]
+    Directory {
+        /// The directory.
+        dir: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The directory is a file or a symbolic link.
+    #[error("{} is not a directory but a file or a symbolic link: remove it, or set XDG_RUNTIME_DIR or `socket` in [admin]", dir.display())]
+    NoDirectory {
+        /// What should be a directory.
+        dir: PathBuf,
+    },
+    /// The directory is another user's.
+    #[error(
+        "directory {} belongs to uid {uid}, who could replace the socket: remove it, or set XDG_RUNTIME_DIR or `socket` in [admin]",
+        dir.display()
+    )]
+    NotOurs {
+        /// The directory.
+        dir: PathBuf,
+        /// Its owner.
+        uid: u32,
+    },
+    /// Others may change the directory.
+    #[error("directory {}: its mode {mode:04o} lets others in; chmod 700 it", dir.display())]
+    Exposed {
+        /// The directory.
+        dir: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// Another user's process has the socket.
+    #[error(
+        "a process of uid {uid} answers there, and neither root nor uid {expected}: it is not trusted; nothing was asked"
+    )]
+    Stranger {
+        /// The user who has the socket.
+        uid: u32,
+        /// The user who should have it.
+        expected: u32,
+    },
+}
+
+/// Where the status socket of a node with this name is unless its configuration says otherwise.
+pub fn default_socket_path(node: &str) -> PathBuf {
+    usual_dir(&|name| std::env::var_os(name).map(PathBuf::from)).join(format!("{node}.sock"))
+}
+
+/// The directory of status sockets: the user's runtime directory, that of a systemd service, or one below `/tmp`.
+fn usual_dir(variable: &dyn Fn(&str) -> Option<PathBuf>) -> PathBuf {
+    let absolute = |name| variable(name).filter(|dir| dir.is_absolute());
+    // Several directories of a service are separated by colons.
+    let service = || {
+        let dirs = variable("RUNTIME_DIRECTORY")?;
+        let first = PathBuf::from(dirs.to_str()?.split(':').next()?);
+        first.is_absolute().then_some(first)
+    };
+    absolute("XDG_RUNTIME_DIR").map(|dir| dir.join("sgc")).or_else(service).unwrap_or_else(temporary_dir)
+}
+
+/// The directory below `/tmp`, where anybody may have made it before.
+fn temporary_dir() -> PathBuf {
+    std::env::temp_dir().join(format!("sgc-{}", own_uid()))
+}
+
+fn own_uid() -> u32 {
+    rustix::process::geteuid().as_raw()
+}
+
+/// Checks the directory that a status socket is in; makes nothing. One that anybody may have made, such as the usual one
+/// below `/tmp`, must be this user's alone. Another is the user's own choice: it is this user's or root's, and nobody else
+/// can replace files in it.
+fn check_dir(dir: &Path, anybody_makes: bool) -> Result<(), SocketError> {
+    let failed = |source| SocketError::Directory { dir: dir.to_owned(), source };
+    let metadata =
+        if anybody_makes { fs::symlink_metadata(dir) } else { fs::metadata(dir) }.map_err(failed)?;
+    if !metadata.is_dir() {
+        return Err(SocketError::NoDirectory { dir: dir.to_owned() });
+    }
+    let (uid, mode) = (metadata.uid(), metadata.permissions().mode() & 0o7777);
+    if uid != own_uid() && (anybody_makes || uid != ROOT) {
+        return Err(SocketError::NotOurs { dir: dir.to_owned(), uid });
+    }
+    let is_exposed = match anybody_makes {
+        true => mode & OTHERS_BITS != 0,
+        false => mode & WORLD_WRITE_BIT != 0 && mode & STICKY_BIT == 0,
+    };
+    if is_exposed { Err(SocketError::Exposed { dir: dir.to_owned(), mode }) } else { Ok(()) }
+}
+
+/// Connects to the node at a status socket, if its process is this user's or root's. For root, it may also be that of the
+/// user whose directory the socket is in.
+pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
+    let dir = directory(path);
+    if dir == temporary_dir() && fs::symlink_metadata(dir).is_ok() {
+        check_dir(dir, true)?;
+    }
+    let stream = UnixStream::connect(path)?;
+    let uid = rustix::net::sockopt::socket_peercred(&stream).map_err(io::Error::from)?.uid.as_raw();
+    let expected = expected_uid(dir);
+    if uid == expected || uid == ROOT { Ok(stream) } else { Err(SocketError::Stranger { uid, expected }) }
+}
+
+/// The user whose node should have a socket in this directory.
+fn expected_uid(dir: &Path) -> u32 {
+    match (own_uid(), fs::metadata(dir)) {
+        (ROOT, Ok(metadata)) => metadata.uid(),
+        (own, _) => own,
+    }
+}
+
+/// Whether a process of this user may ask this node.
+pub(super) fn may_ask(uid: u32) -> bool {
+    uid == own_uid() || uid == ROOT
+}
+
+/// A status socket that this node has. Dropping it removes the socket, if it is still this one, and lets a successor in.
+#[derive(Debug)]
+pub(super) struct StatusSocket {
+    path: PathBuf,
+    listener: UnixListener,
+    /// Device and inode of the socket.
+    identity: (u64, u64),
+    /// Locked for as long as this lives. The kernel unlocks it when the process ends, however it does.
+    _lock: fs::File,
+}
+
+impl StatusSocket {
+    /// Binds the socket for this user alone. One that a dead node left is replaced, a live one is not.
+    pub(super) fn bind(path: &Path) -> Result<Self, SocketError> {
+        let dir = directory(path);
+        let failed = |source| SocketError::Directory { dir: dir.to_owned(), source };
+        fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
+        check_dir(dir, dir == temporary_dir())?;
+        let lock = lock(path)?;
+        // A node of an earlier version holds no lock.
+        if UnixStream::connect(path).is_ok() {
+            return Err(SocketError::Taken);
+        }
+        match fs::remove_file(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error.into()),
+            _ => {}
+        }
+        let listener = UnixListener::bind(path)?;
+        fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
+        let identity = identity(path)?;
+        Ok(Self { path: path.to_owned(), listener, identity, _lock: lock })
+    }
+
+    /// Returns the listener.
+    pub(super) fn listener(&self) -> &UnixListener {
+        &self.listener
+    }
+
+    /// Returns `true` while its path leads to it.
+    pub(super) fn is_in_place(&self) -> bool {
+        identity(&self.path).is_ok_and(|there| there == self.identity)
+    }
+}
+
+impl Drop for StatusSocket {
+    fn drop(&mut self) {
+        if self.is_in_place() {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Takes the lock of a socket, `SOCKET.lock`. The file stays when the node ends: who removed it could remove a successor's.
+fn lock(path: &Path) -> Result<fs::File, SocketError> {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".lock");
+    let mut options = fs::OpenOptions::new();
+    let flags = OFlags::NOFOLLOW.bits() as i32;
+    let options = options.write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
+    let file = options.open(name)?;
+    match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(file),
+        Err(rustix::io::Errno::WOULDBLOCK) => Err(SocketError::Taken),
+        Err(error) => Err(io::Error::from(error).into()),
+    }
+}
+
+fn identity(path: &Path) -> io::Result<(u64, u64)> {
+    fs::symlink_metadata(path).map(|metadata| (metadata.dev(), metadata.ino()))
+}
+
+fn directory(path: &Path) -> &Path {
+    path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_usual_place_is_the_users_runtime_directory_then_that_of_the_service() {
+        let dir = |variables: &[(&str, &str)]| {
+            usual_dir(&|name| {
+                variables.iter().find(|(n, _)| *n == name).map(|(_, value)| PathBuf::from(value))
+            })
+        };
+        let (user, service) =
+            (("XDG_RUNTIME_DIR", "/run/user/7"), ("RUNTIME_DIRECTORY", "/run/sgc:/run/more"));
+        assert_eq!(dir(&[user, service]), Path::new("/run/user/7/sgc"));
+        assert_eq!(dir(&[service]), Path::new("/run/sgc"));
+        for wrong in ["", "relative"] {
+            assert_eq!(dir(&[("XDG_RUNTIME_DIR", wrong), ("RUNTIME_DIRECTORY", wrong)]), temporary_dir());
+        }
+    }
+
+    #[tokio::test]
+    async fn one_node_has_a_socket_and_removes_none_but_its_own() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("sub/arm-1.sock");
+        let first = StatusSocket::bind(&path).unwrap();
+        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+        assert_eq!(fs::metadata(path.parent().unwrap()).unwrap().permissions().mode() & 0o777, 0o700);
+        assert!(matches!(StatusSocket::bind(&path), Err(SocketError::Taken)));
+        drop(first);
+        assert!(!path.exists());
+        // What a killed node leaves is replaced; what a node without a lock has is not.
+        drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
+        let second = StatusSocket::bind(&path).unwrap();
+        assert!(second.is_in_place());
+        fs::remove_file(&path).unwrap();
+        let other = std::os::unix::net::UnixListener::bind(&path).unwrap();
+        assert!(!second.is_in_place());
+        drop(second);
+        assert!(path.exists(), "it is not its own any more");
+        assert!(matches!(StatusSocket::bind(&path), Err(SocketError::Taken)));
+        drop(other);
+        StatusSocket::bind(&path).unwrap();
+    }
+
+    #[test]
+    fn a_directory_that_others_can_change_holds_no_socket() {
+        let dir = tempfile::tempdir().unwrap();
+        let check = |mode, anybody_makes| {
+            fs::set_permissions(dir.path(), fs::Permissions::from_mode(mode)).unwrap();
+            check_dir(dir.path(), anybody_makes).is_ok()
+        };
+        for (mode, in_tmp, chosen) in [
+            (0o700, true, true),
+            (0o755, false, true),
+            (0o770, false, true),
+            (0o1777, false, true),
+            (0o777, false, false),
+        ] {
+            assert_eq!((check(mode, true), check(mode, false)), (in_tmp, chosen), "{mode:o}");
+        }
+        check(0o700, true);
+        let link = dir.path().join("link");
+        std::os::unix::fs::symlink(dir.path(), &link).unwrap();
+        assert!(matches!(check_dir(&link, true), Err(SocketError::NoDirectory { .. })));
+        check_dir(&link, false).unwrap();
+        if own_uid() == ROOT {
+            std::os::unix::fs::chown(dir.path(), Some(NOBODY), None).unwrap();
+            for anybody_makes in [true, false] {
+                let checked = check_dir(dir.path(), anybody_makes);
+                assert!(matches!(checked, Err(SocketError::NotOurs { uid: NOBODY, .. })), "{checked:?}");
+            }
+        }
+    }
+
+    const NOBODY: u32 = 65534;
+    const SOCKET_VARIABLE: &str = "SGC_TEST_SOCKET";
+
+    /// In the process of another user: has a socket until the test has seen it.
+    #[test]
+    fn another_users_socket() {
+        let Some(path) = std::env::var_os(SOCKET_VARIABLE) else { return };
+        let listener = std::os::unix::net::UnixListener::bind(path).unwrap();
+        let _ = std::io::Read::read(&mut listener.accept().unwrap().0, &mut [0]);
+    }
+
+    #[test]
+    fn a_socket_of_another_user_is_asked_nothing() {
+        use std::os::unix::process::CommandExt;
+        if own_uid() != ROOT {
+            eprintln!("only root can be another user");
+            return;
+        }
+        let dir = tempfile::tempdir().unwrap();
+        fs::set_permissions(dir.path(), fs::Permissions::from_mode(0o1777)).unwrap();
+        let path = dir.path().join("arm-1.sock");
+        // Nobody may not reach this program by its path.
+        let mut command = std::process::Command::new("/proc/self/exe");
+        command.args(["--exact", "admin::socket::tests::another_users_socket"]).env(SOCKET_VARIABLE, &path);
+        let mut child = command.uid(NOBODY).gid(NOBODY).spawn().unwrap();
+        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
+        while !path.exists() {
+            assert!(std::time::Instant::now() < end && child.try_wait().unwrap().is_none());
+            std::thread::yield_now();
+        }
+        let connected = connect(&path);
+        assert!(
+            matches!(connected, Err(SocketError::Stranger { uid: NOBODY, expected: ROOT })),
+            "{connected:?}"
+        );
+        assert!(child.wait().unwrap().success());
+    }
+}
