@@ -16,6 +16,7 @@ use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
 use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
+use crate::run::LogFilterError;
 
 /// Exit code for a failure while running.
 pub(crate) const EXIT_FAILURE: u8 = 1;
@@ -150,14 +151,14 @@ pub(crate) enum CliError {
         path: PathBuf,
     },
     /// A log filter that is none.
-    #[error("{from} is {value:?}: {reason}; \"info\", \"debug\" or \"sgc_node=debug,info\", for example")]
+    #[error("{from} is {value:?}: {reason}")]
     LogFilter {
         /// The argument or variable.
         from: &'static str,
         /// Its value.
         value: String,
-        /// What the parser said.
-        reason: String,
+        /// What is wrong with it.
+        reason: LogFilterError,
     },
     /// Nobody answers at a status socket.
     #[error("no node runs at {}: {reason}", path.display())]

@@ -16,6 +16,7 @@ mod error;
 mod files;
 mod fleet;
 mod heap;
+mod memory;
 mod name;
 mod output;
 mod policy;
@@ -46,6 +47,10 @@ use crate::error::CliError;
   sgc fleet enroll arm-1                    make a node's identity: arm-1.identity
   sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk")]
 struct Cli {
+    /// Allow core dumps, and debuggers of the same user: the keys of the node are in its memory
+    /// [env: SGC_ALLOW_CORE_DUMPS]
+    #[arg(long, global = true, hide_short_help = true)]
+    allow_core_dumps: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -75,7 +80,10 @@ enum Command {
 
 fn main() -> ExitCode {
     let result = match Cli::try_parse() {
-        Ok(cli) => run(cli.command),
+        Ok(cli) => {
+            memory::close(cli.allow_core_dumps);
+            run(cli.command)
+        }
         Err(error) => return error::usage(&error, &called(std::env::args())),
     };
     match result {

@@ -15,12 +15,28 @@ use sgc_node::{ConfigSource, RunOptions};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::{mpsc, oneshot};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::LevelFilter;
 
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::{heap, output};
 
 const LOG_VARIABLE: &str = "SGC_LOG";
 const LOG_DEFAULT: &str = "info";
+/// The crates that log, as targets are named.
+const LOG_TARGETS: [&str; 12] = [
+    "sgc",
+    "sgc_cdr",
+    "sgc_dds",
+    "sgc_endpoint",
+    "sgc_gateway",
+    "sgc_node",
+    "sgc_ros",
+    "sgc_router",
+    "sgc_transport",
+    "sgc_trust",
+    "sgc_types",
+    "sgc_wire",
+];
 /// How long a process may take to end by itself once the parent that holds its standard input is gone.
 const ORPHAN_GRACE: Duration = Duration::from_secs(5);
 /// How long threads that still work may delay the end of the process.
@@ -167,17 +183,72 @@ pub(crate) fn start_log(argument: Option<&str>) -> Result<(), CliError> {
         (None, Some(value)) => (LOG_VARIABLE, value),
         (None, None) => ("--log", LOG_DEFAULT.to_owned()),
     };
-    let filter = EnvFilter::builder().parse(&value).map_err(|e| CliError::LogFilter {
-        from,
-        value,
-        reason: e.to_string(),
-    })?;
+    let filter = log_filter(&value).map_err(|reason| CliError::LogFilter { from, value, reason })?;
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
     Ok(())
+}
+
+/// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. A bare word that is no level would be taken for a target, of which
+/// everything is logged, and nothing of all others: a typing error would silence the log.
+fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
+    let directives: Vec<_> = text.split(',').map(str::trim).collect();
+    for directive in &directives {
+        let (target, level) = match directive.split_once('=') {
+            Some((target, level)) => (Some(target), level),
+            None => (None, *directive),
+        };
+        if level.is_empty() || level.parse::<LevelFilter>().is_err() {
+            return Err(LogFilterError::Level { written: level.to_owned() });
+        }
+        let Some(target) = target else { continue };
+        let is_path = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | ':' | '-');
+        let name = target.split("::").next().unwrap_or_default();
+        if name.is_empty() || !target.chars().all(is_path) {
+            return Err(LogFilterError::Target { written: target.to_owned() });
+        }
+        if name.starts_with("sgc") && !LOG_TARGETS.contains(&name) {
+            return Err(LogFilterError::UnknownTarget { written: name.to_owned() });
+        }
+    }
+    EnvFilter::builder()
+        .parse(directives.join(","))
+        .map_err(|error| LogFilterError::Other { reason: error.to_string() })
+}
+
+/// The mistake in a log filter.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum LogFilterError {
+    /// No level.
+    #[error(
+        "{written:?} is no level: write off, error, warn, info, debug or trace, or TARGET=LEVEL, such as \
+         sgc_node=debug,info"
+    )]
+    Level {
+        /// What stands in its place.
+        written: String,
+    },
+    /// No name of a crate or module.
+    #[error("{written:?} is no target: write the name of a crate or a module, such as sgc_node=debug,info")]
+    Target {
+        /// What stands in its place.
+        written: String,
+    },
+    /// A target that looks like a crate of SGC.
+    #[error("{written:?} is no part of SGC: write one of {}", LOG_TARGETS.join(", "))]
+    UnknownTarget {
+        /// What stands in its place.
+        written: String,
+    },
+    /// Something else that the parser refuses.
+    #[error("{reason}; write info, debug or sgc_node=debug,info, for example")]
+    Other {
+        /// What it said.
+        reason: String,
+    },
 }
 
 /// Becomes ready when standard input ends, as it does when the parent that holds it dies by whatever means. Should
@@ -335,4 +406,44 @@ async fn shutdown(
         () = terminal_gone => {}
     }
     signals.end_at_once();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_log_filter_is_levels_and_targets() {
+        for right in
+            ["info", "WARN", "off", "sgc_node=debug,info", "sgc_node::core=trace, quinn=off", "sgc=info"]
+        {
+            assert!(log_filter(right).is_ok(), "{right}");
+        }
+        let level = |written: &str| LogFilterError::Level { written: written.to_owned() };
+        let target = |written: &str| LogFilterError::Target { written: written.to_owned() };
+        for (wrong, error) in [
+            ("verbose", level("verbose")),
+            ("", level("")),
+            ("info,", level("")),
+            ("sgc_node", level("sgc_node")),
+            ("sgc_node=loud", level("loud")),
+            ("sgc_node=", level("")),
+            ("info=sgc_node", level("sgc_node")),
+            ("=info", target("")),
+            ("sgc_node[span]=info", target("sgc_node[span]")),
+            ("sgc_nod=info", LogFilterError::UnknownTarget { written: "sgc_nod".to_owned() }),
+        ] {
+            assert_eq!(log_filter(wrong).map(drop), Err(error), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn each_crate_that_logs_is_a_target() {
+        let crates = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/..")).unwrap();
+        let names = crates.map(|entry| entry.unwrap().file_name().to_string_lossy().replace('-', "_"));
+        let mut names: Vec<_> =
+            names.filter(|name| !["sgc_testkit", "sgc_fuzz_targets"].contains(&&**name)).collect();
+        names.sort();
+        assert_eq!(names, LOG_TARGETS);
+    }
 }

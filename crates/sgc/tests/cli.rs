@@ -511,8 +511,8 @@ fn usage_errors_are_one_line_and_code_2() {
         assert!(said.starts_with("sgc: ") && said.lines().count() == 1, "{args:?}: {said}");
     }
     // With no command at all, help is what is missing.
-    assert!(place.bad(2, &[]).contains("Usage: sgc <COMMAND>"));
-    assert!(place.good(&["--help"]).contains("Usage: sgc <COMMAND>"));
+    assert!(place.bad(2, &[]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
+    assert!(place.good(&["--help"]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
     assert_eq!(place.good(&["--version"]), format!("sgc {}\n", env!("CARGO_PKG_VERSION")));
     assert!(!place.good(&["--help"]).contains("demo-peer"));
 }
@@ -528,6 +528,13 @@ fn arguments_that_make_no_node_are_told() {
         ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0", "--log", "loud=x=y"];
     let said = place.bad(2, &args);
     assert!(said.starts_with("sgc: --log is \"loud=x=y\": ") && said.lines().count() == 1, "{said}");
+    // A word that is no level would name a target instead, and silence the log.
+    let right = "\"verbose\" is no level: write off, error, warn, info, debug or trace";
+    let said = place.bad(2, &["run", "--identity", "arm-1.identity", "--log", "verbose"]);
+    assert!(said.starts_with(&format!("sgc: --log is \"verbose\": {right}")), "{said}");
+    let output = place.command(&["run", "--identity", "arm-1.identity"]).env("SGC_LOG", "verbose").output();
+    let said = String::from_utf8(output.unwrap().stderr).unwrap();
+    assert!(said.starts_with(&format!("sgc: SGC_LOG is \"verbose\": {right}")), "{said}");
 }
 
 #[test]

@@ -115,7 +115,11 @@ impl Place {
     }
 
     fn start(&self, config: &str) -> Running {
-        let mut command = self.command(&["run", "-c", config, "--print-ready"]);
+        self.start_with(config, |command| command)
+    }
+
+    fn start_with(&self, config: &str, change: impl FnOnce(Command) -> Command) -> Running {
+        let mut command = change(self.command(&["run", "-c", config, "--print-ready"]));
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let mut stdout = BufReader::new(child.stdout.take().unwrap());
         let mut line = String::new();
@@ -157,6 +161,14 @@ impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+fn wait(what: &str, done: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !done() {
+        assert!(Instant::now() < deadline, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(20));
     }
 }
 
@@ -339,6 +351,140 @@ fn the_status_socket_answers_old_and_odd_questions() {
     let mut slow = UnixStream::connect(place.path("arm.sock")).unwrap();
     slow.write_all(b"sgc/1 rel").unwrap();
     assert_eq!(ask(b"sgc/1 status\n")["node"], "arm-1");
+    node.end();
+}
+
+#[test]
+fn a_successor_gets_the_status_socket_when_its_predecessor_ends() {
+    let place = Place::new();
+    place.write("cart.toml", &place.read("cart.toml").replace("cart.sock", "arm.sock"));
+    let status = || place.run(&["status", "--socket", "arm.sock", "--json"]).stdout;
+    let first = place.start("arm-1.toml");
+    let second = place.start("cart.toml");
+    assert!(status().contains("\"node\":\"arm-1\""), "the live one keeps it");
+    first.end();
+    wait("the second has it", || status().contains("\"node\":\"cart\""));
+    // Programs that tidy /tmp remove sockets.
+    fs::remove_file(place.path("arm.sock")).unwrap();
+    wait("it makes it again", || status().contains("\"node\":\"cart\""));
+    let log = second.end();
+    let no_socket =
+        "no status socket: another node has it; it is taken over when that one ends; trying again";
+    assert_eq!(log.matches(no_socket).count(), 1, "{log}");
+    assert_eq!(log.matches("the status socket is there now").count(), 2, "{log}");
+    assert!(!place.path("arm.sock").exists());
+}
+
+#[test]
+fn a_directory_below_tmp_that_is_not_the_users_own_holds_no_status_socket() {
+    let place = Place::new();
+    fs::create_dir(place.path("tmp")).unwrap();
+    place.write("cart.toml", &place.read("cart.toml").replace("[admin]\nsocket = \"cart.sock\"\n", ""));
+    let with_tmp = |mut command: Command| {
+        command.env_remove("XDG_RUNTIME_DIR").env("TMPDIR", place.path("tmp"));
+        command
+    };
+    let dir = place.path("tmp").join(format!("sgc-{}", rustix::process::geteuid().as_raw()));
+    let status = || {
+        let output =
+            with_tmp(place.command(&["status", "--socket", dir.join("cart.sock").to_str().unwrap()]));
+        let output = { output }.output().unwrap();
+        String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
+    };
+    // Somebody was there first, and leads it elsewhere.
+    fs::create_dir(place.path("elsewhere")).unwrap();
+    std::os::unix::fs::symlink(place.path("elsewhere"), &dir).unwrap();
+    let node = place.start_with("cart.toml", with_tmp);
+    assert_eq!(fs::read_dir(place.path("elsewhere")).unwrap().count(), 0);
+    let said = status();
+    assert!(said.contains("is not a directory but a file or a symbolic link: remove it, or set"), "{said}");
+    fs::remove_file(&dir).unwrap();
+    wait("the node makes it", || status().starts_with("cart: "));
+    assert_eq!(fs::metadata(&dir).unwrap().permissions().mode() & 0o7777, 0o700);
+    // Others are let in while it runs.
+    fs::set_permissions(&dir, fs::Permissions::from_mode(0o755)).unwrap();
+    assert!(status().contains("its mode 0755 lets others in; chmod 700 it"), "{}", status());
+    node.end();
+}
+
+/// In the process of another user: asks the node at a socket, and prints the answer.
+#[test]
+fn as_another_user() {
+    let Some(socket) = std::env::var_os("SGC_TEST_SOCKET") else { return };
+    let mut stream = UnixStream::connect(socket).unwrap();
+    let _ = stream.write_all(b"sgc/1 status\n");
+    let mut text = String::new();
+    let _ = stream.read_to_string(&mut text);
+    println!("{text}");
+}
+
+#[test]
+fn another_user_is_refused_at_a_status_socket_that_somebody_opened() {
+    use std::os::unix::process::CommandExt;
+    if !rustix::process::geteuid().is_root() {
+        eprintln!("only root can be another user");
+        return;
+    }
+    let place = Place::new();
+    let node = place.start("arm-1.toml");
+    let socket = place.path("arm.sock");
+    fs::set_permissions(place.path("."), fs::Permissions::from_mode(0o755)).unwrap();
+    fs::set_permissions(&socket, fs::Permissions::from_mode(0o777)).unwrap();
+    for _ in 0..2 {
+        // Nobody may not reach this program by its path.
+        let mut command = Command::new("/proc/self/exe");
+        command.args(["--exact", "as_another_user", "--nocapture"]).env("SGC_TEST_SOCKET", &socket);
+        let output = command.uid(65534).gid(65534).output().unwrap();
+        let said = String::from_utf8(output.stdout).unwrap();
+        let why = "this node answers uid 0, whose it is, and root alone: you are uid 65534";
+        assert!(said.contains(why) && !said.contains("links"), "{said}");
+    }
+    assert!(place.good(&["status", "--socket", "arm.sock"]).starts_with("arm-1: "));
+    let log = node.end();
+    assert_eq!(log.matches("another user asks at the status socket").count(), 1, "{log}");
+}
+
+#[test]
+fn a_process_with_keys_leaves_no_core_and_is_not_traced_unless_its_user_says_so() {
+    let place = Place::new();
+    // Root's capabilities would let it see everything, so both processes run without them.
+    let plain = |command: Command| {
+        if !rustix::process::geteuid().is_root() {
+            return command;
+        }
+        let mut plain = Command::new("setpriv");
+        plain.args(["--inh-caps=-all", "--bounding-set=-all"]);
+        plain.arg(command.get_program()).args(command.get_args());
+        let variables = command.get_envs().filter_map(|(name, value)| Some((name, value?)));
+        plain.env_clear().envs(variables).current_dir(place.path("."));
+        plain.stdin(Stdio::null());
+        plain
+    };
+    // What another process of the same user sees of its memory.
+    let sees = |node: &Running| {
+        let mut look = Command::new("cat");
+        look.arg(format!("/proc/{}/maps", node.child.id()));
+        plain(look).output().unwrap().status.success()
+    };
+    let core = |node: &Running| -> String {
+        let limits = fs::read_to_string(format!("/proc/{}/limits", node.child.id())).unwrap();
+        let line = limits.lines().find_map(|line| line.strip_prefix("Max core file size"));
+        line.and_then(|line| line.split_whitespace().next()).unwrap().to_owned()
+    };
+    let node = place.start_with("arm-1.toml", plain);
+    assert_eq!((sees(&node), core(&node)), (false, "0".to_owned()));
+    node.end();
+    let node = place.start_with("arm-1.toml", |mut command| {
+        command.env("SGC_ALLOW_CORE_DUMPS", "1");
+        plain(command)
+    });
+    assert!(sees(&node));
+    node.end();
+    let node = place.start_with("arm-1.toml", |mut command| {
+        command.arg("--allow-core-dumps");
+        plain(command)
+    });
+    assert!(sees(&node));
     node.end();
 }
 

@@ -59,9 +59,11 @@ pub(crate) fn command(namespace: Option<&Namespace>, dir: &Path, program: &Path)
     command
 }
 
-/// The same of the program that is tested.
+/// The same of the program that is tested. Tests look into its memory and at its open files.
 pub(crate) fn sgc(namespace: Option<&Namespace>, dir: &Path) -> Command {
-    command(namespace, dir, Path::new(env!("CARGO_BIN_EXE_sgc")))
+    let mut command = command(namespace, dir, Path::new(env!("CARGO_BIN_EXE_sgc")));
+    command.env("SGC_ALLOW_CORE_DUMPS", "1");
+    command
 }
 
 /// The same of a Python program of `tests/peers/py`.
