@@ -1,4 +1,5 @@
-//! The documents cite what exists: each test that `docs/security.md` names is in the repository.
+//! The documents cite what exists: each test that `docs/security.md` names is in the repository, and each link and path of
+//! every document leads somewhere.
 //!
 //! How tests are cited stands in that document, before its first table. A citation that cannot be checked is a fault.
 
@@ -28,6 +29,66 @@ fn every_test_that_the_security_document_cites_exists() {
         checker.faults.join("\n  ")
     );
     assert!(checker.cited > 150, "only {} citations were recognised", checker.cited);
+}
+
+/// Folders of the repository that documents name paths in.
+const FOLDERS: [&str; 6] = ["bench/", "clients/", "crates/", "docs/", "fuzz/", "scripts/"];
+
+#[test]
+fn every_link_and_path_of_a_document_leads_somewhere() {
+    let root = root();
+    let mut documents: Vec<_> =
+        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"].map(|d| root.join(d)).into();
+    let mut folders = vec![root.join("docs")];
+    while let Some(folder) = folders.pop() {
+        for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+            match path.is_dir() {
+                true => folders.push(path),
+                false if path.extension().is_some_and(|extension| extension == "md") => documents.push(path),
+                false => {}
+            }
+        }
+    }
+    let (mut faults, mut checked) = (Vec::new(), 0);
+    for document in &documents {
+        let text = fs::read_to_string(document).unwrap();
+        let mut is_code = false;
+        for (at, line) in text.lines().enumerate() {
+            is_code ^= line.trim_start().starts_with("```");
+            if is_code {
+                continue;
+            }
+            let links = line.split("](").skip(1).filter_map(|rest| rest.split(')').next());
+            let links = links.filter(|link| !link.contains("://"));
+            let links = links.map(|link| (link, leads_somewhere(document, link)));
+            let is_path = |span: &&str| {
+                FOLDERS.iter().any(|folder| span.starts_with(folder)) && !span.contains([' ', '*', '…'])
+            };
+            let paths = spans(line).into_iter().filter(is_path).map(|path| (path, root.join(path).exists()));
+            for (cited, exists) in links.chain(paths) {
+                checked += 1;
+                if !exists {
+                    faults.push(format!("{}:{}: {cited}", document.display(), at + 1));
+                }
+            }
+        }
+    }
+    assert!(faults.is_empty(), "these links and paths lead nowhere:\n  {}", faults.join("\n  "));
+    assert!(checked > 100, "only {checked} links and paths were recognised");
+}
+
+/// Whether a link of a document names a file that exists, and a heading of it.
+fn leads_somewhere(document: &Path, link: &str) -> bool {
+    let (file, heading) = link.split_once('#').map_or((link, None), |(file, heading)| (file, Some(heading)));
+    let target = if file.is_empty() { document.to_owned() } else { document.parent().unwrap().join(file) };
+    let Some(heading) = heading else { return target.exists() };
+    let text = fs::read_to_string(target).unwrap_or_default();
+    text.lines().filter(|line| line.starts_with('#')).any(|line| {
+        // As GitHub makes them.
+        let line = line.trim_start_matches('#').trim().to_lowercase();
+        let anchor = line.chars().filter(|c| c.is_alphanumeric() || matches!(c, '-' | '_' | ' '));
+        anchor.map(|c| if c == ' ' { '-' } else { c }).eq(heading.chars())
+    })
 }
 
 /// Looks up the citations of a document.
