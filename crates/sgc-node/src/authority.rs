@@ -303,6 +303,9 @@ impl FleetDesk {
 /// An answer, and the serial number of the certificate that was made for it.
 type Found = (Result<Credentials, RenewalRefusal>, Option<Arc<[u8]>>);
 
+/// Credentials, and the serial number of the certificate that was made for them.
+type Renewed = (Credentials, Option<Arc<[u8]>>);
+
 fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<Found> {
     error!(requests, "cannot give credentials: {why}");
     vec![(Err(RenewalRefusal::File), None); requests]
@@ -318,11 +321,7 @@ fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Found {
     }
 }
 
-fn try_renew(
-    fleet: &mut Fleet,
-    request: &RenewalRequest,
-    now: Now,
-) -> Result<(Credentials, Option<Arc<[u8]>>), FleetError> {
+fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Renewed, FleetError> {
     let RenewalRequest { peer, csr, .. } = request;
     let unknown = || FleetError::UnknownNode { node: peer.pseudonym.short() };
     let node = fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
