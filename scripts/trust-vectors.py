@@ -6,8 +6,11 @@ With --write it makes that file anew; the packets that Rust signs with RSA are t
     cargo test -p sgc-trust --test vectors -- --ignored --nocapture | scripts/trust-vectors.py --take
 It also checks grants.json beside it, which --write-grants makes: grants sealed with HPKE (RFC 9180, base mode), put
 together here from HKDF, X25519 and AES-GCM. Of X-Wing the shared secret is the draft's own, from xwing.txt.
+And revocation.json, which --write-revocation makes: a CA, a node's certificate and a fleet's revocation list, byte for
+byte as Rust makes it.
 Rules: docs/spec/trust.md, docs/spec/wire.md.
 """
+import datetime
 import hashlib
 import hmac
 import json
@@ -15,11 +18,13 @@ import pathlib
 import struct
 import sys
 
+from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ed25519, padding, rsa, x25519
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
 GRANTS = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/grants.json"
+REVOCATION = GRANTS.with_name("revocation.json")
 XWING = GRANTS.with_name("xwing.txt")
 FILE = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/sealing.json"
 SUITES = {
@@ -233,7 +238,81 @@ def write_grants():
     GRANTS.write_text(json.dumps(grants(), indent=1) + "\n")
 
 
+def der(tag, *content):
+    """One element of DER."""
+    content = b"".join(content)
+    length = len(content).to_bytes((len(content).bit_length() + 7) // 8 or 1, "big")
+    head = length if len(content) < 0x80 else bytes([0x80 | len(length)]) + length
+    return bytes([tag]) + head + content
+
+
+def der_integer(number):
+    return der(0x02, number.to_bytes(number.bit_length() // 8 + 1, "big"))
+
+
+def revocation():
+    """A CA with an Ed25519 key, whose signatures are the same each time."""
+    begin = datetime.datetime.fromtimestamp(1_795_000_000, datetime.UTC)
+    day = datetime.timedelta(days=1)
+    key = ed25519.Ed25519PrivateKey.from_private_bytes(b"\x33" * 32)
+    pkcs8 = key.private_bytes(
+        serialization.Encoding.DER, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "golden CA")])
+    key_id = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+    usage = dict.fromkeys(
+        "digital_signature content_commitment key_encipherment data_encipherment key_agreement "
+        "encipher_only decipher_only".split(), False
+    )
+    ca = (
+        x509.CertificateBuilder(name, name, key.public_key(), 1, begin - day, begin + 3650 * day)
+        .add_extension(x509.BasicConstraints(True, 1), True)
+        .add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **usage), True)
+        .add_extension(key_id, False)
+        .sign(key, None)
+    )
+    pseudonym = bytes(range(32))
+    uris = ["sgc:node:" + pseudonym.hex(), "sgc:incarnation:3"]
+    node_key = ed25519.Ed25519PrivateKey.from_private_bytes(b"\x44" * 32)
+    node_name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, pseudonym.hex())])
+    leaf = (
+        x509.CertificateBuilder(name, node_name, node_key.public_key(), 2, begin - day, begin + 90 * day)
+        .add_extension(x509.SubjectAlternativeName([x509.UniformResourceIdentifier(u) for u in uris]), False)
+        .sign(key, None)
+    )
+    # Pseudonym, highest revoked incarnation, since when: by rising pseudonym.
+    nodes = [(pseudonym, 2, 1_795_000_000), (b"\x80" * 32, 128, 1_600_000_000), (b"\xff" * 32, 0xFFFFFFFF, 0)]
+    value = der(0x30, *(der(0x30, der(0x04, n), der_integer(i), der_integer(t)) for n, i, t in nodes))
+    oid = x509.ObjectIdentifier("2.25.119781345836387798361097549824228883350")
+    number = 1_795_000_001
+    crl = (
+        x509.CertificateRevocationListBuilder(name, begin, begin + 30 * day)
+        .add_extension(x509.AuthorityKeyIdentifier(key_id.digest, None, None), False)
+        .add_extension(x509.CRLNumber(number), False)
+        .add_extension(x509.UnrecognizedExtension(oid, value), False)
+        .sign(key, None)
+    )
+    encoding = serialization.Encoding.DER
+    return {
+        "note": "Keys of tests, which protect nothing.",
+        "now_secs": int(begin.timestamp()),
+        "ca": ca.public_bytes(encoding).hex(),
+        "ca_key": pkcs8.hex(),
+        "leaf": leaf.public_bytes(encoding).hex(),
+        "incarnation": 3,
+        "number": number,
+        "nodes": [{"pseudonym": n.hex(), "incarnation": i, "revoked_secs": t} for n, i, t in nodes],
+        "list": crl.public_bytes(encoding).hex(),
+    }
+
+
+def write_revocation():
+    REVOCATION.write_text(json.dumps(revocation(), indent=1) + "\n")
+
+
 def check():
+    assert json.loads(REVOCATION.read_text()) == revocation(), "revocation list"
+    print(f"a revocation list agrees with {REVOCATION.name}")
     assert json.loads(GRANTS.read_text()) == grants(), "grants"
     print(f"2 kinds of grants agree with {GRANTS.name}")
     content = json.loads(FILE.read_text())
@@ -256,4 +335,10 @@ def check():
 
 
 if __name__ == "__main__":
-    {(): check, ("--write",): write, ("--take",): take, ("--write-grants",): write_grants}[tuple(sys.argv[1:])]()
+    {
+        (): check,
+        ("--write",): write,
+        ("--take",): take,
+        ("--write-grants",): write_grants,
+        ("--write-revocation",): write_revocation,
+    }[tuple(sys.argv[1:])]()

@@ -112,6 +112,7 @@ impl TrustAnchors {
             return Err(CrlError::Partial);
         }
         let number = fields.number.ok_or(CrlError::NoNumber)?;
+        let nodes = fields.revoked_nodes.map(read_revoked_nodes).transpose()?;
         let named = self.anchors.iter().zip(self.paths.iter());
         let mut named = named.filter(|(_, path)| *path.subject == *fields.issuer).peekable();
         if named.peek().is_none() {
@@ -134,7 +135,6 @@ impl TrustAnchors {
             let at = UnixMillis(entry.revocation_date.as_secs().saturating_mul(1000));
             serials.insert(without_zeros(entry.serial_number).into(), at);
         }
-        let nodes = fields.revoked_nodes.map(read_revoked_nodes).transpose()?;
         let list = RevocationList { der: Bytes::copy_from_slice(der), number: number.into(), serials, nodes };
         Ok((anchor.fingerprint, list))
     }
@@ -157,7 +157,7 @@ fn read_revoked_nodes(extension: &[u8]) -> Result<RevokedNodes, CrlError> {
     let broken = || CrlError::Malformed("its revoked nodes cannot be read".into());
     let entries = RevokedNodeFields::all(extension).ok_or_else(broken)?;
     if entries.len() > REVOKED_NODES_MAX {
-        return Err(CrlError::TooManyNodes);
+        return Err(broken());
     }
     let mut nodes = RevokedNodes::new();
     for entry in entries {

@@ -19,7 +19,7 @@ use crate::key::Key;
 use crate::label::{GroupName, NodeName};
 use crate::member::Membership;
 use crate::roster::{IssuedCertificate, ROSTER_NODES_MAX, RosterNode};
-use crate::verify::GROUPS_MAX;
+use crate::verify::{GROUPS_MAX, VerifiedPeer};
 use crate::x509::{Validity, serial_of};
 
 impl Fleet {
@@ -112,7 +112,26 @@ impl Fleet {
         if peer.pseudonym != self.secret.pseudonym(node.as_str()) {
             return Err(FleetError::Adopt("it is that of a node of another name"));
         }
+        self.enter(node, &peer, now).map(drop)
+    }
+
+    /// Enters the certificate of a node of the roster that another copy of this fleet's file made, if that is news, and
+    /// its incarnation. `Ok(false)`: the roster has it, or it is none of this fleet.
+    pub fn recognize(&mut self, peer: &VerifiedPeer, now: UnixMillis) -> Result<bool, FleetError> {
+        let is_ours = self.anchors.fingerprints().next() == Some(peer.cert.ca);
+        match self.node_by_pseudonym(&peer.pseudonym).map(|n| n.name.clone()) {
+            Some(node) if is_ours && now <= peer.not_after => self.enter(node, peer, now),
+            _ => Ok(false),
+        }
+    }
+
+    /// Enters a verified certificate; true if it was not there.
+    fn enter(&mut self, node: NodeName, peer: &VerifiedPeer, now: UnixMillis) -> Result<bool, FleetError> {
         self.begin_roster_if_none(now)?;
+        let known = self.roster.nodes.get(&node).map_or(&[][..], |n| &n.certificates);
+        if known.iter().any(|c| c.serial == peer.cert.serial) {
+            return Ok(false);
+        }
         let entry = self.roster.nodes.entry(node.clone()).or_insert_with(|| RosterNode {
             name: node,
             incarnation: 0,
@@ -130,7 +149,8 @@ impl Fleet {
             incarnation: peer.incarnation,
             revoked: None,
         }]);
-        self.sign_roster()
+        self.sign_roster()?;
+        Ok(true)
     }
 
     fn enroll_key(

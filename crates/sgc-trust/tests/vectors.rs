@@ -1,13 +1,16 @@
-//! Golden vectors of sealing and signing in every suite, and of grants. `scripts/trust-vectors.py` made them with another
+//! Golden vectors of sealing and signing in every suite, of grants, and of a fleet's revocation list. `scripts/trust-vectors.py` made them with another
 //! implementation, and checks the same file.
 
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
+use rustls_pki_types::CertificateDer;
 use sgc_trust::{
-    Batch, BatchVerifier, GrantError, Kem, MessageKey, OpenError, ReplyKey, SourceKey, Suite, TAG_BYTES,
-    opened_bytes, seal_grant, sealed_bytes,
+    Batch, BatchVerifier, CertError, Fleet, GrantError, Kem, MessageKey, OpenError, ReplyKey, Revocation,
+    SourceKey, Suite, TAG_BYTES, opened_bytes, seal_grant, sealed_bytes,
 };
 use sgc_wire::{
     Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader,
-    SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant,
+    Pseudonym, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant, UnixMillis,
 };
 
 const NAME: Name = Name([0xaa; 32]);
@@ -177,4 +180,36 @@ fn the_grants_of_the_vectors_open() {
         assert_eq!(key.open(&NAME, &SINK, 1, &enc, &sealed), Ok(content.clone()));
         assert!(ReplyKey::from_private(kem, &private[1..]).is_none());
     }
+}
+
+#[test]
+fn the_revocation_list_of_the_vectors_is_made_and_read() {
+    let all: serde_json::Value =
+        serde_json::from_str(include_str!("vectors/revocation.json")).expect("the file is JSON");
+    let millis = |v: &serde_json::Value| UnixMillis(v.as_u64().expect("a number") * 1000);
+    let nodes = all["nodes"].as_array().expect("a list").iter().map(|node| {
+        let pseudonym = hex(&node["pseudonym"]).try_into().expect("32 bytes");
+        let incarnation = node["incarnation"].as_u64().and_then(|n| n.try_into().ok()).expect("32 bits");
+        (Pseudonym(pseudonym), Revocation { incarnation, at: millis(&node["revoked_secs"]) })
+    });
+    let nodes: Vec<_> = nodes.collect();
+    let (now, ca) = (millis(&all["now_secs"]), CertificateDer::from(hex(&all["ca"])));
+    let rng = &mut ChaCha20Rng::seed_from_u64(1);
+    let fleet = Fleet::import("acme".parse().expect("a name"), ca, &hex(&all["ca_key"]), now, rng);
+    let fleet = fleet.expect("a CA and its key");
+    let number = all["number"].as_u64().expect("a number");
+    let list = fleet.revocation_list_of_nodes(&nodes, number, now).expect("a list");
+    assert_eq!(list, hex(&all["list"]));
+    let anchors = fleet.anchors().with_crl(&list, now).expect("a list of that CA").expect("news");
+    let ca = anchors.fingerprints().next().expect("a CA");
+    assert_eq!(anchors.revoked_nodes(&ca).collect::<Vec<_>>(), nodes);
+    assert_eq!(anchors.fleet_list_number(&ca), Some(number));
+
+    let leaf = [CertificateDer::from(hex(&all["leaf"]))];
+    let peer = anchors.verify(&leaf, now).expect("its incarnation before is revoked, not this one");
+    assert_eq!(Some(u64::from(peer.incarnation)), all["incarnation"].as_u64());
+    let revocation = Revocation { incarnation: peer.incarnation, at: now };
+    let list = fleet.revocation_list_of_nodes(&[(peer.pseudonym, revocation)], number + 1, now);
+    let anchors = anchors.with_crl(&list.expect("a list"), now).expect("a list").expect("news");
+    assert!(matches!(anchors.verify(&leaf, now), Err(CertError::Revoked { at }) if at == now));
 }
