@@ -207,8 +207,9 @@ fn certs() -> Vec<Vec<u8>> {
     fleet.rotate_secret(NOW, rng).expect("a secret");
     fleet.revoke(&["arm-1".parse().expect("a name")], NOW).expect("a list");
     let list = fleet.revocation_list(NOW).expect("a list");
+    let again = fleet.enroll(&EnrollRequest { again: true, ..request }, rng).expect("an identity");
     let csr = KeyRequest::generate(None, rng).expect("a request").csr_text();
-    let seeds: [(u8, Vec<u8>); 9] = [
+    let seeds: [(u8, Vec<u8>); 10] = [
         (0, arm.to_text().as_bytes().to_vec()),
         (1, arm.to_text().as_bytes().to_vec()),
         (2, fleet.to_text().as_bytes().to_vec()),
@@ -218,6 +219,7 @@ fn certs() -> Vec<Vec<u8>> {
         (5, arm.chain()[0].to_vec()),
         (5, fleet.ca_certificate().to_vec()),
         (6, arm.csr()),
+        (5, again.chain()[0].to_vec()),
     ];
     seeds.into_iter().map(|(which, seed)| [&[which], &seed[..]].concat()).collect()
 }

@@ -512,8 +512,9 @@ async fn carry_out(
         AdminRequest::Crl(der) => {
             let (reply, done) = oneshot::channel();
             events.send(CoreEvent::Crl { der: der.into(), reply }).await.map_err(|_| stopping())?;
-            let is_news = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
-            Ok(serde_json::json!({ "news": is_news }).to_string())
+            let (is_news, lists) = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
+            let lists: Vec<_> = lists.iter().map(|list| STANDARD.encode(list)).collect();
+            Ok(serde_json::json!({ "news": is_news, "lists": lists }).to_string())
         }
     }
 }

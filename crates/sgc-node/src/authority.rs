@@ -13,7 +13,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore};
-use sgc_trust::{CertId, Fleet, FleetError, VerifiedPeer, requested_key_hash, serial_of};
+use sgc_trust::{
+    Absorbed, CertId, Fleet, FleetError, TrustAnchors, VerifiedPeer, requested_key_hash, serial_of,
+};
 use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId};
 use tracing::{error, info, warn};
 
@@ -166,6 +168,12 @@ impl Authority {
         let desk = self.desk.clone();
         Some(move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).answer(batch, now))
     }
+
+    /// Returns a blocking job that lets the file learn what these lists revoke.
+    pub(crate) fn catch_up_job(&self, anchors: Arc<TrustAnchors>) -> impl FnOnce(Now) + Send + use<> {
+        let desk = self.desk.clone();
+        move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).catch_up(&anchors, now)
+    }
 }
 
 /// A version of a file, which another writer replaces as a whole.
@@ -269,8 +277,10 @@ impl FleetDesk {
             Ok(mut locked) => {
                 // Whoever had the lock may have replaced the file.
                 self.stamp = FileStamp::of(&self.file);
-                let found: Vec<_> = batch.iter().map(|(r, _)| renew(&mut locked.fleet, r, now)).collect();
-                self.save(&locked, found)
+                let fleet = &mut locked.fleet;
+                let has_learnt = batch.iter().fold(false, |any, (r, _)| recognize(fleet, r, now) || any);
+                let found: Vec<_> = batch.iter().map(|(r, _)| renew(fleet, r, now)).collect();
+                self.save(&locked, has_learnt, found)
             }
             Err(why) => refuse_all(&why, batch.len()),
         };
@@ -286,9 +296,9 @@ impl FleetDesk {
         answers
     }
 
-    /// Writes the file if certificates were made: the roster has them before an answer leaves.
-    fn save(&mut self, locked: &LockedFleet, found: Vec<Found>) -> Vec<Found> {
-        if found.iter().all(|(_, made)| made.is_none()) {
+    /// Writes the file if certificates were made, which the roster has before an answer leaves, or others are new to it.
+    fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<Found>) -> Vec<Found> {
+        if !has_learnt && found.iter().all(|(_, made)| made.is_none()) {
             return found;
         }
         let saved = locked.save();
@@ -296,6 +306,47 @@ impl FleetDesk {
         match saved {
             Ok(()) => found,
             Err(why) => refuse_all(&why, found.len()),
+        }
+    }
+}
+
+impl FleetDesk {
+    /// Takes over into the file what the lists in force revoke and it does not know: another copy of it made them.
+    fn catch_up(&self, anchors: &TrustAnchors, now: Now) {
+        let absorb = || -> Result<Absorbed, FleetFileError> {
+            let mut locked = LockedFleet::open(&self.file)?;
+            let absorbed = locked.fleet.absorb(anchors, now.unix).map_err(|why| locked.error(why))?;
+            if absorbed != Absorbed::default() {
+                locked.save()?;
+            }
+            Ok(absorbed)
+        };
+        match absorb() {
+            Ok(Absorbed { revoked, .. }) if !revoked.is_empty() => {
+                warn!(
+                    nodes = revoked.join(", "),
+                    "another copy of the fleet's file revoked nodes; the file here knows it now. What else that copy did \
+                     is unknown here: `sgc fleet merge` brings it in"
+                );
+            }
+            Ok(_) => {}
+            Err(why) => error!("the fleet's file does not learn what was revoked elsewhere: {why}"),
+        }
+    }
+}
+
+/// Enters the certificate that a node asks with, if another copy of the file made it; true if so.
+fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
+    let peer = request.peer.node_id.short();
+    match fleet.recognize(&request.peer, now.unix) {
+        Ok(false) => false,
+        Ok(true) => {
+            warn!(%peer, "another copy of the fleet's file made its certificate; the file here knows it now");
+            true
+        }
+        Err(why) => {
+            error!(%peer, %why, "the fleet's file does not take its certificate");
+            false
         }
     }
 }

@@ -160,12 +160,12 @@ pub(crate) enum CoreEvent {
     },
     /// What the fleet's file holds for those who asked this authority.
     RenewalsReady(Vec<RenewalAnswer>),
-    /// The user brings a revocation list; answered with whether it is news.
+    /// The user brings a revocation list; answered with whether it is news, and with the lists that were in force before.
     Crl {
         /// The list, DER.
         der: bytes::Bytes,
         /// Where to answer.
-        reply: oneshot::Sender<Result<bool, CrlError>>,
+        reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
     },
     /// Keys that messages of these suites are signed with are made.
     MessageKeys(MessageKeys),
@@ -518,7 +518,8 @@ impl<N: RosNetwork> Core<N> {
                     Ok(false) => self.audit.write(record.reason("known already")),
                     Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
                 }
-                let _ = reply.send(taken);
+                let lists = self.credentials.anchors().crls().cloned().collect();
+                let _ = reply.send(taken.map(|is_news| (is_news, lists)));
                 // Whoever brings a list may have changed the fleet's file.
                 self.answer_renewals();
             }

@@ -1,4 +1,4 @@
-//! Tells a router of a revocation list, for one who keeps a fleet and runs no node.
+//! Tells a router of a revocation list and hears of its own ones, for one who keeps a fleet and runs no node.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -35,20 +35,28 @@ pub enum TellError {
     },
 }
 
-/// Dials a router, greets it, gives it the list, and leaves. It has the list once this returns.
-pub async fn tell_router(url: &LinkUrl, identity: Arc<Identity>, list: Bytes) -> Result<(), TellError> {
+/// Most lists that are heard of a router: all that it can have of as many CAs as can be trusted.
+const HEARD_MAX: usize = sgc_trust::ANCHORS_MAX * (sgc_trust::FLEET_LISTS_MAX + 1);
+
+/// Dials a router, greets it, gives it the list, and leaves. It has the list once this returns. Returns the lists that
+/// the router has, which it gives every neighbour.
+pub async fn tell_router(
+    url: &LinkUrl,
+    identity: Arc<Identity>,
+    list: Bytes,
+) -> Result<Vec<Bytes>, TellError> {
     let dialer = Dialer::new(identity, LinkOptions::default(), Arc::new(TransportMetrics::default()));
     let link = dialer.dial(url).await?;
     let told = tokio::time::timeout(ANSWER_MAX, tell(&link, list)).await;
     dialer.close(CloseReason::Goodbye).await;
     match told {
-        Ok(Ok(())) => Ok(()),
+        Ok(Ok(heard)) => Ok(heard),
         Ok(Err(source)) => Err(TellError::Link { url: url.clone(), source }),
         Err(_) => Err(TellError::Silent { url: url.clone() }),
     }
 }
 
-async fn tell(link: &impl Link, list: Bytes) -> Result<(), LinkError> {
+async fn tell(link: &impl Link, list: Bytes) -> Result<Vec<Bytes>, LinkError> {
     let mut incarnation = [0; 8];
     // Another number than any run of a node has; nothing rests on it.
     incarnation.copy_from_slice(&link.peer().node_id.0[..8]);
@@ -58,7 +66,15 @@ async fn tell(link: &impl Link, list: Bytes) -> Result<(), LinkError> {
     while !matches!(Control::from_slice(&link.recv_control().await?), Ok(Control::Hello(_))) {}
     link.send_control(Control::Crl { der: list }.to_bytes()).await?;
     link.send_control(Control::Goodbye.to_bytes()).await?;
-    // It answers a goodbye by closing, and took what came before.
+    // It gave its lists behind its greeting. It answers a goodbye by closing, and took what came before.
+    let mut heard = Vec::new();
+    while let Ok(frame) = link.recv_control().await {
+        if let Ok(Control::Crl { der }) = Control::from_slice(&frame)
+            && heard.len() < HEARD_MAX
+        {
+            heard.push(der);
+        }
+    }
     link.closed().await;
-    Ok(())
+    Ok(heard)
 }

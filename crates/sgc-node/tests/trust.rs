@@ -9,6 +9,7 @@ mod support;
 use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use lab::*;
@@ -196,6 +197,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
             request.now.0 -= 630_000;
         });
     }
+    let mut old_copy = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
     let cloud = lab.cloud();
     let share_it = |c: &mut Config| c.shares = vec![share("/chatter", &["desk"])];
     let use_it = |c: &mut Config| c.uses = vec![uses("/chatter")];
@@ -258,16 +260,25 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     wait("it is cut off", || cloud.refused("revoked") > 0);
 
-    // A revocation covers what was renewed.
+    // A revocation covers what was renewed, also by a copy of the fleet's file that knows nothing of it.
     let (_talker, last) = stream.end();
     // Two ways are made anew, each within a few round trips; what is said meanwhile is not said again.
     let lost = hears_some(&listener, 1, last);
     eprintln!("renewal: {lost} of {last} messages lost while the links were replaced");
     listener.hears_nothing();
-    let list = lab.revoke("desk");
-    assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
+    let desk_name = "desk".parse().unwrap();
+    old_copy.revoke(std::slice::from_ref(&desk_name), unix_now()).unwrap();
+    let list = old_copy.revocation_list(unix_now()).unwrap();
+    let answer = cloud.ask(&AdminRequest::Crl(list));
+    assert_eq!(answer["ok"]["news"], true);
+    assert_eq!(answer["ok"]["lists"].as_array().map(Vec::len), Some(1), "the thief's");
     let id = lab.id("desk").to_string();
     wait("the renewed one is cut off, too", || !cloud.peers().contains(&id));
+    // The file of the authority learns of it, and keeps what it knew.
+    wait("the authority's file knows", || {
+        let fleet = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+        fleet.nodes().filter(|n| fleet.revoked_at(n).is_some()).count() == 2
+    });
     drop((robot, desk, thief));
 }
 
@@ -314,6 +325,31 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
         drop(desk);
     }
     assert_eq!(certificates(), 2);
+}
+
+#[test]
+fn telling_a_router_a_list_returns_those_that_it_has() {
+    let lab = Lab::new(&["desk", "tab"]);
+    let mut old_copy = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+    let cloud = lab.cloud();
+    let theirs = lab.revoke("desk");
+    assert_eq!(cloud.ask(&AdminRequest::Crl(theirs.clone()))["ok"]["news"], true);
+
+    old_copy.revoke(&["tab".parse().unwrap()], unix_now()).unwrap();
+    let ours = old_copy.revocation_list(unix_now()).unwrap();
+    let request = EnrollRequest { router: true, ..EnrollRequest::new("keeper".parse().unwrap(), unix_now()) };
+    let keeper = Arc::new(old_copy.issue(&request, &mut OsRng.unwrap_err()).unwrap());
+    let url = lab.url().parse().unwrap();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let heard = runtime.block_on(sgc_node::tell_router(&url, keeper, ours.into())).unwrap();
+    assert_eq!(heard, [theirs]);
+    // So the copy knows now that it is not the newest, and both are revoked everywhere.
+    let anchors = old_copy.anchors().with_crl(&heard[0], unix_now()).unwrap().unwrap();
+    let absorbed = old_copy.absorb(&anchors, unix_now()).unwrap();
+    assert_eq!(absorbed.revoked, ["desk"]);
+    wait("the router has both", || {
+        fs::read_dir(lab.state("cloud").join("crl")).is_ok_and(|d| d.count() == 2)
+    });
 }
 
 #[test]

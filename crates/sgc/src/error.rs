@@ -13,7 +13,7 @@ use sgc_gateway::AccessTokenError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
 use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
-use sgc_trust::{FleetError, IdentityError, LabelError, PemError, TokenError};
+use sgc_trust::{CrlError, FleetError, IdentityError, LabelError, PemError, TokenError};
 
 use crate::output;
 use crate::run::LogFilterError;
@@ -113,6 +113,14 @@ pub(crate) enum CliError {
         path: PathBuf,
         /// What is wrong.
         source: FleetError,
+    },
+    /// A revocation list that is not believed.
+    #[error("{}: {source}", path.display())]
+    List {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: CrlError,
     },
     /// A fleet file that cannot be used.
     #[error(transparent)]
@@ -339,6 +347,7 @@ impl CliError {
             | Self::Identity { .. }
             | Self::Fleet { .. }
             | Self::FleetFile(FleetFileError::Exposed { .. } | FleetFileError::Content { .. })
+            | Self::List { .. }
             | Self::Making(_)
             | Self::NoFleetHere
             | Self::SeveralFleets { .. }

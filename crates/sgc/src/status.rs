@@ -9,6 +9,8 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use serde::Deserialize;
 use sgc_node::SocketError;
@@ -203,15 +205,20 @@ fn only_socket() -> Result<PathBuf, CliError> {
 }
 
 /// Tells a revocation list to every node that this user runs here; who took it. One of another fleet does not.
-pub(crate) fn tell_local(list: &[u8]) -> Vec<String> {
+pub(crate) fn tell_local(list: &[u8]) -> (Vec<String>, Vec<bytes::Bytes>) {
     let request = AdminRequest::Crl(list.to_vec());
-    let took = |socket: &PathBuf| {
+    let mut heard = Vec::new();
+    let mut took = |socket: &PathBuf| {
         let answer = ask(socket, &request, ANSWER_MAX).ok()?;
         let answer: serde_json::Value = serde_json::from_str(&answer).ok()?;
-        answer.get("ok")?;
+        // A node of an earlier version does not say which lists it has.
+        let lists = answer.get("ok")?.get("lists").and_then(serde_json::Value::as_array);
+        let lists = lists.into_iter().flatten().filter_map(serde_json::Value::as_str);
+        heard.extend(lists.filter_map(|text| STANDARD.decode(text).ok()).map(bytes::Bytes::from));
         Some(socket.file_stem()?.to_string_lossy().into_owned())
     };
-    usual_sockets().iter().filter_map(took).collect()
+    let names = usual_sockets().iter().filter_map(&mut took).collect();
+    (names, heard)
 }
 
 /// Why nobody answers there.

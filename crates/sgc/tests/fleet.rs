@@ -232,6 +232,141 @@ fn a_revoked_node_is_out() {
     assert!(place.files().iter().all(|f| !f.starts_with('.')), "{:?}", place.files());
 }
 
+/// Two copies of the fleet's file, each in a place of its own, and two nodes that both know.
+fn two_copies() -> (Place, Place) {
+    let (new, old) = (Place::with_fleet(), Place::new());
+    for node in ["va", "vb"] {
+        new.good(&["fleet", "enroll", node]);
+    }
+    new.bring("lab.fleet", &old);
+    (new, old)
+}
+
+/// What a node believes that was told these lists in this order.
+fn told(lists: &[&Place]) -> TrustAnchors {
+    let anchors = lists[0].fleet().anchors().clone();
+    lists.iter().fold(anchors, |anchors, place| {
+        let list = fs::read(place.path("lab.crl")).unwrap();
+        anchors.with_crl(&list, now()).unwrap().unwrap_or(anchors)
+    })
+}
+
+fn is_revoked(anchors: &TrustAnchors, place: &Place, node: &str) -> bool {
+    let identity = place.identity(&format!("{node}.identity"));
+    matches!(anchors.verify(identity.chain(), now()), Err(CertError::Revoked { .. }))
+}
+
+#[test]
+fn an_old_copy_of_the_file_revokes_what_the_new_one_renewed() {
+    let (new, old) = two_copies();
+    new.good(&["fleet", "renew", "va"]);
+    old.good(&["fleet", "revoke", "va"]);
+    let anchors = told(&[&old]);
+    assert!(is_revoked(&anchors, &new, "va") && !is_revoked(&anchors, &new, "vb"));
+    new.good(&["fleet", "renew", "va"]);
+    assert!(is_revoked(&anchors, &new, "va"), "nor does the next renewal help");
+}
+
+#[test]
+fn two_copies_of_the_file_do_not_undo_each_others_revocations() {
+    let (new, old) = two_copies();
+    new.good(&["fleet", "revoke", "vb"]);
+    old.good(&["fleet", "revoke", "va"]);
+    for order in [[&new, &old], [&old, &new]] {
+        let anchors = told(&order);
+        assert!(is_revoked(&anchors, &new, "va") && is_revoked(&anchors, &new, "vb"));
+    }
+}
+
+#[test]
+fn copies_of_the_file_are_merged_and_nothing_is_lost() {
+    let (new, old) = two_copies();
+    new.good(&["fleet", "enroll", "vc", "--group", "arms"]);
+    new.good(&["fleet", "revoke", "vb"]);
+    new.good(&["fleet", "enroll", "vb", "--again", "--force"]);
+    old.good(&["fleet", "revoke", "va"]);
+    old.good(&["fleet", "renew", "vb", "-o", "vb.identity"]);
+    fs::copy(old.path("lab.fleet"), new.path("old.fleet")).unwrap();
+    let said = new.good(&["fleet", "merge", "old.fleet"]);
+    assert!(said.starts_with("lab.fleet: took over from old.fleet\n  revoked: va\n"), "{said}");
+    assert!(said.contains("changed or renewed: vb\n"), "{said}");
+    assert!(said.contains("old.fleet is older or went its own way: put a copy of lab.fleet"), "{said}");
+    let fleet = new.fleet();
+    let names: Vec<_> = fleet.nodes().map(|n| (n.name.as_str(), n.incarnation)).collect();
+    assert_eq!(names, [("va", 0), ("vb", 1), ("vc", 0)]);
+    assert!(fleet.revoked_at(fleet.node(&"va".parse().unwrap()).unwrap()).is_some());
+    let anchors = told(&[&new]);
+    assert!(is_revoked(&anchors, &new, "va") && !is_revoked(&anchors, &new, "vb"));
+    assert!(is_revoked(&anchors, &old, "vb"), "it was enrolled again with the other copy");
+    // Once more there is nothing to take, and the merged one has all that the other has.
+    let said = new.good(&["fleet", "merge", "old.fleet"]);
+    assert!(said.starts_with("lab.fleet: knows everything that old.fleet does\n"), "{said}");
+    new.bring("lab.fleet", &old);
+    fs::copy(new.path("lab.fleet"), old.path("new.fleet")).unwrap();
+    let said = old.good(&["fleet", "merge", "new.fleet"]);
+    assert!(said.contains("knows everything") && !said.contains("put a copy"), "{said}");
+    // A file of another fleet is none of its copies.
+    let other = Place::with_fleet();
+    fs::copy(other.path("lab.fleet"), new.path("other.fleet")).unwrap();
+    let said = new.bad(&["fleet", "merge", "other.fleet", "--fleet", "lab.fleet"]);
+    assert!(said.contains("only copies of one fleet's file are merged"), "{said}");
+}
+
+#[test]
+fn an_old_copy_of_the_file_says_so_and_learns_from_the_list() {
+    let (new, old) = two_copies();
+    new.good(&["fleet", "revoke", "vb"]);
+    new.bring("lab.crl", &old);
+    let ran = old.run(&["fleet", "list"]);
+    let (said, shown) = (String::from_utf8(ran.stderr).unwrap(), String::from_utf8(ran.stdout).unwrap());
+    assert!(
+        said.contains("another copy of lab.fleet made lab.crl, so this copy is not the newest"),
+        "{said}"
+    );
+    assert!(said.contains("It revokes vb") && said.contains("sgc fleet merge OTHER.fleet"), "{said}");
+    assert!(shown.lines().any(|l| l.starts_with("vb ") && l.contains("revoked")), "{shown}");
+    // A command that changes the file keeps what it learnt, and its list says it.
+    let ran = old.run(&["fleet", "revoke", "va"]);
+    assert!(ran.status.success() && String::from_utf8(ran.stderr).unwrap().contains("not the newest"));
+    let anchors = told(&[&old]);
+    assert!(is_revoked(&anchors, &new, "va") && is_revoked(&anchors, &new, "vb"));
+    old.good(&["fleet", "list"]);
+    assert!(old.bad(&["fleet", "renew", "vb"]).contains("was revoked at"));
+    // A broken list is said and keeps nobody from anything.
+    let broken = new.run(&["fleet", "list"]);
+    assert!(broken.stderr.is_empty());
+    fs::write(new.path("lab.crl"), b"no list").unwrap();
+    let broken = new.run(&["fleet", "revoke"]);
+    let said = String::from_utf8(broken.stderr).unwrap();
+    assert!(
+        broken.status.success() && said.starts_with("Note: lab.crl: the revocation list cannot be read"),
+        "{said}"
+    );
+    // The list alone does for a merge, too.
+    fs::copy(old.path("lab.crl"), new.path("old.crl")).unwrap();
+    let said = new.good(&["fleet", "merge", "old.crl"]);
+    assert!(said.starts_with("lab.fleet: took over from old.crl\n  revoked: va\n"), "{said}");
+    assert!(is_revoked(&told(&[&new]), &new, "va"));
+}
+
+#[test]
+fn a_certificate_that_another_copy_made_is_entered_when_it_is_renewed() {
+    let (new, old) = two_copies();
+    new.good(&["fleet", "revoke", "va"]);
+    new.good(&["fleet", "enroll", "va", "--again", "--force"]);
+    new.bring("va.identity", &old);
+    let ran = old.run(&["fleet", "renew", "va"]);
+    let said = String::from_utf8(ran.stderr).unwrap();
+    assert!(
+        ran.status.success() && said.contains("another copy of lab.fleet made the certificate"),
+        "{said}"
+    );
+    assert_eq!(old.identity("va.identity").as_peer().incarnation, 1);
+    old.good(&["fleet", "revoke", "va"]);
+    let anchors = told(&[&old]);
+    assert!(is_revoked(&anchors, &old, "va") && is_revoked(&anchors, &new, "va"));
+}
+
 #[test]
 fn commands_at_once_lose_nothing() {
     let place = Place::with_fleet();

@@ -62,6 +62,18 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
+    /// Lets the fleet's file learn what these lists revoke, if this node is the authority.
+    fn catch_up_file(&self, anchors: Arc<TrustAnchors>) {
+        let Some(job) = self.authority.as_ref().map(|authority| authority.catch_up_job(anchors)) else {
+            return;
+        };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            job(now());
+        });
+    }
+
     /// Gives everyone of a batch what the fleet's file says.
     pub(super) fn renewals_ready(&mut self, answers: Vec<RenewalAnswer>) {
         answers.into_iter().for_each(|answer| self.renewal_ready(answer));
@@ -185,6 +197,7 @@ impl<N: RosNetwork> Core<N> {
     /// Believes others from here on, everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
         self.keeper.anchors(anchors.clone());
+        self.catch_up_file(anchors.clone());
         self.credentials.set_anchors(TrustAnchors::clone(&anchors));
         self.gateway.set_anchors(&anchors);
         self.endpoint.set_anchors(now(), anchors);

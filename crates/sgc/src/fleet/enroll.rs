@@ -9,7 +9,7 @@ use sgc_trust::{EnrollRequest, GroupName, Identity, LEAF_VALIDITY_DEFAULT, NodeN
 use sgc_wire::UnixMillis;
 use zeroize::Zeroizing;
 
-use super::{DAY, WhichFleet, parse_span, system_rng, unix_now};
+use super::{DAY, WhichFleet, copies, parse_span, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
@@ -152,6 +152,10 @@ pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
     let old = if files::exists(&path) { Some(sgc_node::load_identity(&path)?) } else { None };
     let new = match old.filter(|old| !args.made.force && old.node_id() == file.fleet.node_id_of(&node)) {
         Some(old) => {
+            let done = file.fleet.recognize(old.as_peer(), now);
+            if done.map_err(|e| file.error(e))? {
+                copies::say_unknown(file.path(), &path);
+            }
             let member = file.fleet.renew_member(&old.csr(), &node, valid, now, rng);
             let new = old.with_membership(member.map_err(|e| file.error(e))?);
             new.map_err(|source| CliError::Identity { path: path.clone(), source })?

@@ -12,12 +12,12 @@ use sgc_transport::LinkUrl;
 use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents, pem_text};
 use sgc_wire::UnixMillis;
 
-use super::{WhichFleet, system_rng, unix_now};
+use super::{WhichFleet, copies, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files;
 use crate::{output, status};
 
-const LIST_EXTENSION: &str = "crl";
+pub(super) const LIST_EXTENSION: &str = "crl";
 /// What the keeper of a fleet calls itself when it tells a router something.
 const KEEPER_NAME: &str = "fleet-keeper";
 /// For how long that certificate holds.
@@ -156,19 +156,16 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
         text.push_str(&format!("{node}: revoked\n"));
     }
     text.push_str(&format!("{}: revocation list {}\n", path.display(), file.fleet.crl_number()));
-    let (told, failed) = tell(&file.fleet, &list, &args.routers)?;
-    match told.is_empty() {
+    let told = tell(&mut file, &list, &args.routers)?;
+    match told.names.is_empty() {
         true => text.push_str(
             "Nobody was told yet. Tell one node, and all will know:\n  sgc fleet revoke --router quic://…   \
              or, where a node runs:  sgc fleet revoke",
         ),
-        false => text.push_str(&format!("Told {}: nodes tell it to each other.", told.join(", "))),
+        false => text.push_str(&format!("Told {}: nodes tell it to each other.", told.names.join(", "))),
     }
     output::line(text)?;
-    match failed {
-        Some(error) => Err(error),
-        None => Ok(()),
-    }
+    told.failed.map_or(Ok(()), Err)
 }
 
 pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
@@ -191,7 +188,7 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
     file.save()?;
     // An authority that runs here looks into the file again when it is told a list.
     let (_, list) = write_list(&file, unix_now())?;
-    tell(&file.fleet, &list, &[])?;
+    tell(&mut file, &list, &[])?;
     output::line(format!(
         "{}: generation {generation} of the naming secret\n\
          Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
@@ -209,45 +206,55 @@ pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     output::line(format!("{}: generations in use: {}", file.path().display(), left.join(", ")))
 }
 
-/// Tells a list to the nodes that this user runs here and to these routers; who was told, and the last router that
-/// could not be.
-fn tell(
-    fleet: &Fleet,
-    list: &[u8],
-    routers: &[LinkUrl],
-) -> Result<(Vec<String>, Option<CliError>), CliError> {
-    let mut told = status::tell_local(list);
-    let mut failed = None;
-    if routers.is_empty() {
-        return Ok((told, failed));
-    }
-    // A certificate for this errand alone; the roster does not know it.
-    let keeper = KEEPER_NAME.parse().map_err(CliError::Label)?;
-    let request =
-        EnrollRequest { router: true, valid: KEEPER_VALID, ..EnrollRequest::new(keeper, unix_now()) };
-    let identity = fleet.issue(&request, &mut system_rng()?);
-    let identity = Arc::new(identity.map_err(CliError::Making)?);
-    let runtime = tokio::runtime::Runtime::new();
-    let runtime =
-        runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
-    for url in routers {
-        let list = bytes::Bytes::copy_from_slice(list);
-        match runtime.block_on(sgc_node::tell_router(url, identity.clone(), list)) {
-            Ok(()) => told.push(url.to_string()),
-            Err(source) => failed = Some(CliError::Tell(source)),
-        }
-    }
-    Ok((told, failed))
+/// Whom a list was told.
+pub(super) struct Told {
+    pub(super) names: Vec<String>,
+    /// The last router that could not be.
+    pub(super) failed: Option<CliError>,
 }
 
-fn write_list(file: &LockedFleet, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
+/// Tells a list to the nodes that this user runs here and to these routers. What they know besides is taken over: then
+/// the list is written once more, and those who were told know it anyway.
+pub(super) fn tell(file: &mut LockedFleet, list: &[u8], routers: &[LinkUrl]) -> Result<Told, CliError> {
+    let (mut names, mut heard) = status::tell_local(list);
+    let mut failed = None;
+    if !routers.is_empty() {
+        // A certificate for this errand alone; the roster does not know it.
+        let keeper = KEEPER_NAME.parse().map_err(CliError::Label)?;
+        let request =
+            EnrollRequest { router: true, valid: KEEPER_VALID, ..EnrollRequest::new(keeper, unix_now()) };
+        let identity = file.fleet.issue(&request, &mut system_rng()?);
+        let identity = Arc::new(identity.map_err(CliError::Making)?);
+        let runtime = tokio::runtime::Runtime::new();
+        let runtime =
+            runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
+        for url in routers {
+            let list = bytes::Bytes::copy_from_slice(list);
+            match runtime.block_on(sgc_node::tell_router(url, identity.clone(), list)) {
+                Ok(lists) => {
+                    names.push(url.to_string());
+                    heard.extend(lists);
+                }
+                Err(source) => failed = Some(CliError::Tell(source)),
+            }
+        }
+    }
+    let now = unix_now();
+    if copies::take_heard(file, &heard, now)? {
+        file.save()?;
+        write_list(file, now)?;
+    }
+    Ok(Told { names, failed })
+}
+
+pub(super) fn write_list(file: &LockedFleet, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
     let list = file.fleet.revocation_list(now).map_err(|e| file.error(e))?;
     let path = list_path(file.path());
     files::write_public(&path, &list)?;
     Ok((path, list))
 }
 
-fn list_path(fleet: &Path) -> PathBuf {
+pub(super) fn list_path(fleet: &Path) -> PathBuf {
     fleet.with_extension(LIST_EXTENSION)
 }
 

@@ -3,6 +3,7 @@
 //! The files stay where they are written; bringing them to their machines is the user's. What is in them is the
 //! business of `sgc-trust`.
 
+mod copies;
 mod create;
 mod enroll;
 mod keeping;
@@ -44,6 +45,7 @@ enum FleetCommand {
     Ca(keeping::CaArgs),
     Renew(enroll::RenewArgs),
     Revoke(keeping::RevokeArgs),
+    Merge(copies::MergeArgs),
     Adopt(keeping::AdoptArgs),
     RotateSecret(keeping::RotateArgs),
     RetireSecret(keeping::RetireArgs),
@@ -63,6 +65,7 @@ pub(crate) fn fleet(args: FleetArgs) -> Result<(), CliError> {
         FleetCommand::Ca(args) => keeping::ca(&args),
         FleetCommand::Renew(args) => enroll::renew(&args),
         FleetCommand::Revoke(args) => keeping::revoke(&args),
+        FleetCommand::Merge(args) => copies::merge(&args),
         FleetCommand::Adopt(args) => keeping::adopt(&args),
         FleetCommand::RotateSecret(args) => keeping::rotate(&args),
         FleetCommand::RetireSecret(args) => keeping::retire(&args),
@@ -82,20 +85,26 @@ impl WhichFleet {
     fn path(&self) -> Result<PathBuf, CliError> {
         match &self.fleet {
             Some(path) => Ok(path.clone()),
-            None => fleet_here(),
+            None => fleet_here(None),
         }
     }
 
     /// To be looked at.
     fn read(&self) -> Result<(PathBuf, Fleet), CliError> {
         let path = self.path()?;
-        let fleet = sgc_node::read_fleet(&path)?;
+        let mut fleet = sgc_node::read_fleet(&path)?;
+        copies::catch_up(&mut fleet, &path)?;
         Ok((path, fleet))
     }
 
-    /// To be changed.
+    /// To be changed. What the revocation list beside it says is taken over.
     fn open(&self) -> Result<LockedFleet, CliError> {
-        Ok(LockedFleet::open(&self.path()?)?)
+        let mut file = LockedFleet::open(&self.path()?)?;
+        let path = file.path().to_owned();
+        if copies::catch_up(&mut file.fleet, &path)? {
+            file.save()?;
+        }
+        Ok(file)
     }
 }
 
@@ -117,10 +126,14 @@ pub(crate) fn unix_now() -> UnixMillis {
     UnixMillis(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
 }
 
-fn fleet_here() -> Result<PathBuf, CliError> {
+/// The one fleet of this directory, apart from `other`.
+fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
     let dir = Path::new(".");
-    let found = files::with_extension(dir, FLEET_EXTENSION)
+    let mut found = files::with_extension(dir, FLEET_EXTENSION)
         .map_err(|source| CliError::Read { path: dir.to_owned(), source })?;
+    found.retain(|path| {
+        other.is_none_or(|other| path.file_name() != other.file_name() || is_elsewhere(other))
+    });
     let name = |path: &PathBuf| path.strip_prefix(dir).unwrap_or(path).to_owned();
     match &found[..] {
         [] => Err(CliError::NoFleetHere),
@@ -130,6 +143,11 @@ fn fleet_here() -> Result<PathBuf, CliError> {
             Err(CliError::SeveralFleets { files })
         }
     }
+}
+
+/// True of a path with a directory in it that is not this one.
+fn is_elsewhere(path: &Path) -> bool {
+    path.parent().is_some_and(|parent| parent != Path::new("") && parent != Path::new("."))
 }
 
 /// `90d`, `12h`, `30m`.

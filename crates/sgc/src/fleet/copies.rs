@@ -1,0 +1,167 @@
+//! `sgc fleet merge`, and how any command notices that its copy of a fleet's file is not the newest.
+//!
+//! What of two copies counts is the business of `sgc-trust`; here it is found out that there are two, and said.
+
+use std::path::{Path, PathBuf};
+
+use bytes::Bytes;
+use clap::Args;
+use sgc_node::LockedFleet;
+use sgc_transport::LinkUrl;
+use sgc_trust::{Absorbed, Fleet, Merged, NodeName};
+use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
+
+use super::keeping::{LIST_EXTENSION, list_path, tell, write_list};
+use super::{WhichFleet, fleet_here, unix_now};
+use crate::error::CliError;
+use crate::{files, output};
+
+/// Take over what another copy of the fleet's file knows, or a revocation list.
+///
+/// No revocation, enrolment or renewal of either copy is lost. Use one copy from then on.
+#[derive(Debug, Args)]
+pub(super) struct MergeArgs {
+    /// The other copy, or a revocation list that was made with it (.crl)
+    other: PathBuf,
+    /// Tell this router what is revoked, too; repeat for more. Nodes of this user on this machine are told anyway
+    #[arg(long = "router", value_name = "URL")]
+    routers: Vec<LinkUrl>,
+    #[command(flatten)]
+    which: WhichFleet,
+}
+
+pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
+    let path = match &args.which.fleet {
+        Some(path) => path.clone(),
+        None => fleet_here(Some(&args.other))?,
+    };
+    let mut file = LockedFleet::open(&path)?;
+    catch_up(&mut file.fleet, &path)?;
+    let now = unix_now();
+    let (mine, theirs) = (path.display(), args.other.display());
+    let mut text = String::new();
+    if args.other.extension().is_some_and(|e| e == LIST_EXTENSION) {
+        let absorbed = take_list(&mut file.fleet, &args.other, now)?;
+        text.push_str(&match absorbed.revoked.is_empty() {
+            true => format!("{mine}: knows everything that {theirs} does\n"),
+            false => format!("{mine}: took over from {theirs}\n  revoked: {}\n", absorbed.revoked.join(", ")),
+        });
+    } else {
+        let mut other = sgc_node::read_fleet(&args.other)?;
+        let done = file.fleet.merge(&other, now);
+        let gained = done.map_err(|source| CliError::Fleet { path: args.other.clone(), source })?;
+        text.push_str(&match gained == Merged::default() {
+            true => format!("{mine}: knows everything that {theirs} does\n"),
+            false => format!("{mine}: took over from {theirs}\n{}", gained_text(&gained)),
+        });
+        let lacked = other.merge(&file.fleet, now).map_err(|source| file.error(source))?;
+        if lacked != Merged::default() {
+            text.push_str(&format!(
+                "{theirs} is older or went its own way: put a copy of {mine} in its place.\n"
+            ));
+        }
+    }
+    file.save()?;
+    let (list_path, list) = write_list(&file, now)?;
+    text.push_str(&format!("{}: revocation list {}\n", list_path.display(), file.fleet.crl_number()));
+    let told = tell(&mut file, &list, &args.routers)?;
+    if !told.names.is_empty() {
+        text.push_str(&format!("Told {}: nodes tell it to each other.\n", told.names.join(", ")));
+    }
+    output::line(text.trim_end())?;
+    told.failed.map_or(Ok(()), Err)
+}
+
+fn gained_text(gained: &Merged) -> String {
+    let names = |nodes: &[NodeName]| nodes.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let numbers = |numbers: &[u32]| numbers.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let mut text = String::new();
+    for (what, which) in [
+        ("revoked", gained.revoked.clone()),
+        ("enrolled", names(&gained.enrolled)),
+        ("changed or renewed", names(&gained.changed)),
+        ("secret generations", numbers(&gained.generations)),
+    ] {
+        if !which.is_empty() {
+            text.push_str(&format!("  {what}: {}\n", which.join(", ")));
+        }
+    }
+    if gained.settings {
+        text.push_str("  authority and post-quantum: as they were set last\n");
+    }
+    if !gained.replaced.is_empty() {
+        text.push_str(&format!(
+            "Both copies had made generation {} of the secret, and the later one counts: nodes with the other one find \
+             the rest of the fleet when they are renewed.\n",
+            numbers(&gained.replaced).join(", ")
+        ));
+    }
+    text
+}
+
+/// Looks at the list beside a fleet's file: another copy of the file may have made it. What it revokes is taken over; that
+/// there is another copy is said. Returns `true` if the fleet changed.
+pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError> {
+    let path = list_path(file);
+    if !files::exists(&path) {
+        return Ok(false);
+    }
+    match take_list(fleet, &path, unix_now()) {
+        Ok(absorbed) => {
+            say_behind(file, &path.display().to_string(), &absorbed);
+            Ok(absorbed != Absorbed::default())
+        }
+        // A file that is no list of this fleet must not keep anybody from revoking. The next list replaces it.
+        Err(error @ (CliError::List { .. } | CliError::Read { .. })) => {
+            output::diagnostic(&format!("Note: {error}; it is left out"));
+            Ok(false)
+        }
+        Err(other) => Err(other),
+    }
+}
+
+/// Takes over what a list revokes.
+fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<Absorbed, CliError> {
+    let list = files::read_limited(path, CRL_BYTES_MAX as u64)?;
+    let anchors = fleet.anchors().with_crl(&list, now);
+    let anchors = anchors.map_err(|source| CliError::List { path: path.to_owned(), source })?;
+    let absorbed = anchors.map_or(Ok(Absorbed::default()), |anchors| fleet.absorb(&anchors, now));
+    absorbed.map_err(|source| CliError::Fleet { path: path.to_owned(), source })
+}
+
+/// Takes over what the lists revoke that nodes have in force, which is then said. Returns `true` if the fleet changed.
+pub(super) fn take_heard(file: &mut LockedFleet, heard: &[Bytes], now: UnixMillis) -> Result<bool, CliError> {
+    let mut anchors = file.fleet.anchors().clone();
+    for list in heard {
+        // Lists of partners' CAs are among them.
+        if let Ok(Some(more)) = anchors.with_crl(list, now) {
+            anchors = more;
+        }
+    }
+    let absorbed = file.fleet.absorb(&anchors, now).map_err(|source| file.error(source))?;
+    say_behind(file.path(), "a revocation list that nodes have", &absorbed);
+    Ok(absorbed != Absorbed::default())
+}
+
+fn say_behind(fleet: &Path, list: &str, absorbed: &Absorbed) {
+    let fleet = fleet.display();
+    let revoked = match &absorbed.revoked[..] {
+        [] if !absorbed.is_behind => return,
+        [] => String::new(),
+        nodes => format!(" It revokes {}, which {fleet} did not know and knows now.", nodes.join(", ")),
+    };
+    output::diagnostic(&format!(
+        "Note: another copy of {fleet} made {list}, so this copy is not the newest.{revoked} Nodes that the other copy \
+         enrolled or renewed may be missing here, and one that it enrolled again cannot be revoked here. Bring the \
+         other copy here and run: sgc fleet merge OTHER.fleet"
+    ));
+}
+
+/// Says that a certificate is none that this copy of the fleet's file made.
+pub(super) fn say_unknown(fleet: &Path, identity: &Path) {
+    let (fleet, identity) = (fleet.display(), identity.display());
+    output::diagnostic(&format!(
+        "Note: another copy of {fleet} made the certificate in {identity}, so this copy is not the newest. It knows the \
+         certificate now. For what else was done with the other copy, bring it here and run: sgc fleet merge OTHER.fleet"
+    ));
+}
