@@ -14,7 +14,7 @@ use sgc_wire::{CRL_BYTES_MAX, Pseudonym, UnixMillis};
 use webpki::BorrowedCertRevocationList;
 
 use crate::revocations::{
-    CaLists, FLEET_LISTS_MAX, REVOKED_NODES_MAX, Revocation, RevocationList, RevokedNodes,
+    CaLists, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation, RevocationList, RevokedNodes,
 };
 use crate::signed::CLOCK_SKEW_MAX;
 use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchors, VerifiedPeer, sha256};
@@ -156,7 +156,7 @@ impl Anchor {
 fn read_revoked_nodes(extension: &[u8]) -> Result<RevokedNodes, CrlError> {
     let broken = || CrlError::Malformed("its revoked nodes cannot be read".into());
     let entries = RevokedNodeFields::all(extension).ok_or_else(broken)?;
-    if entries.len() > REVOKED_NODES_MAX {
+    if entries.len() > LIST_NODES_MAX {
         return Err(broken());
     }
     let mut nodes = RevokedNodes::new();

@@ -25,7 +25,7 @@ use crate::key::Key;
 use crate::label::{GroupName, NodeName};
 use crate::member::KEY_BLOCK;
 use crate::pem;
-use crate::revocations::{REVOKED_NODES_MAX, RevokedNodes};
+use crate::revocations::{LIST_NODES_MAX, RevokedNodes};
 use crate::secret::FleetSecret;
 use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI, sha256};
 use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Validity};
@@ -49,10 +49,9 @@ const SERIAL_ENTRY_BYTES_MAX: usize = 2 + 22 + 17;
 const EXTENSIONS_BYTES_MAX: usize = 0xffff;
 const OTHER_EXTENSIONS_BYTES_MAX: usize = 256;
 const _: () = assert!(
-    OTHER_EXTENSIONS_BYTES_MAX + REVOKED_NODES_MAX * RevokedNodeFields::BYTES_MAX <= EXTENSIONS_BYTES_MAX
+    OTHER_EXTENSIONS_BYTES_MAX + LIST_NODES_MAX * RevokedNodeFields::BYTES_MAX <= EXTENSIONS_BYTES_MAX
 );
-const _: () =
-    assert!(LIST_HEAD_BYTES_MAX + REVOKED_NODES_MAX * RevokedNodeFields::BYTES_MAX <= CRL_BYTES_MAX);
+const _: () = assert!(LIST_HEAD_BYTES_MAX + LIST_NODES_MAX * RevokedNodeFields::BYTES_MAX <= CRL_BYTES_MAX);
 
 /// A certificate that takes revocation is known by this; big-endian, without leading zeros.
 pub(crate) type Serial = Arc<[u8]>;
@@ -119,8 +118,8 @@ pub(crate) fn self_signed_ca(
     Ok(params.self_signed(key).map_err(FleetError::making)?.into())
 }
 
-/// A fleet's revocation list, DER: it revokes nodes, for nodes of SGC, and as many of the serial numbers as there is
-/// room for, the last ones first, for everyone else.
+/// A fleet's revocation list, DER: it revokes nodes, the last ones, for nodes of SGC, and as many of the serial numbers as
+/// there is room for, the last ones first, for everyone else.
 pub(crate) fn fleet_list(
     ca: &CertificateDer<'_>,
     ca_key: &Key,
@@ -129,13 +128,16 @@ pub(crate) fn fleet_list(
     number: u64,
     now: UnixMillis,
 ) -> Result<Vec<u8>, FleetError> {
-    if nodes.len() > REVOKED_NODES_MAX {
-        return Err(FleetError::TooManyRevoked);
+    let mut nodes: Vec<_> = nodes.iter().collect();
+    if nodes.len() > LIST_NODES_MAX {
+        nodes.sort_by_key(|(node, revocation)| (revocation.at, **node));
+        nodes.drain(..nodes.len() - LIST_NODES_MAX);
+        nodes.sort_by_key(|(node, _)| **node);
     }
     let room = CRL_BYTES_MAX - LIST_HEAD_BYTES_MAX - nodes.len() * RevokedNodeFields::BYTES_MAX;
     let first = serials.len().saturating_sub(room / SERIAL_ENTRY_BYTES_MAX);
     let list = revocation_list(ca, ca_key, serials.get(first..).unwrap_or_default(), number, now)?;
-    let value = RevokedNodeFields::write_all(nodes.iter().map(|(node, revocation)| RevokedNodeFields {
+    let value = RevokedNodeFields::write_all(nodes.into_iter().map(|(node, revocation)| RevokedNodeFields {
         pseudonym: node.0,
         incarnation: revocation.incarnation,
         revoked_secs: revocation.at.secs(),

@@ -53,7 +53,7 @@ pub use names::{TopicSecret, derive_name, name_of, renewal_blind, types_blind};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
-pub use revocations::{FLEET_LISTS_MAX, REVOKED_NODES_MAX, Revocation};
+pub use revocations::{FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
 pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};

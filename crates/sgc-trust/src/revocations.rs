@@ -12,10 +12,15 @@ use sgc_wire::{Pseudonym, UnixMillis};
 use crate::crl::CrlError;
 
 /// Most nodes that one CA has revoked, in all of its lists together. A list that would add more is refused.
-pub const REVOKED_NODES_MAX: usize = 1024;
-/// Most lists of one fleet's CA of which each says something that the others do not: one for each copy of the fleet's
-/// file that went its own way. A further one is refused until the copies are merged.
-pub const FLEET_LISTS_MAX: usize = 16;
+pub const REVOKED_NODES_MAX: usize = 8192;
+/// Most nodes in one list: those that were revoked last. Nodes keep the lists before it for the others.
+pub const LIST_NODES_MAX: usize = 1024;
+/// Most lists of one fleet's CA of which each says something that the others do not: those that [`REVOKED_NODES_MAX`]
+/// nodes need, and as many for copies of the fleet's file that went their own ways. A further one is refused until the
+/// copies are merged.
+pub const FLEET_LISTS_MAX: usize = 2 * LISTS_OF_ONE_COPY_MAX;
+/// Lists of a growing set that do not cover each other name each node at most twice.
+const LISTS_OF_ONE_COPY_MAX: usize = 2 * REVOKED_NODES_MAX / LIST_NODES_MAX;
 
 /// Up to which incarnation a node is revoked. Of two revocations of a node the one that covers more counts; of two
 /// that cover the same, the earlier one. So their order does not matter.

@@ -323,26 +323,49 @@ fn a_list_that_would_be_one_too_many_is_refused_until_the_copies_are_merged() {
     assert_eq!((anchors.crls().count(), revoked(&anchors).len()), (1, FLEET_LISTS_MAX + 1));
 }
 
+/// The revocation of a node that is known by its number, an hour after that of the one before.
+fn numbered(n: usize) -> (Pseudonym, Revocation) {
+    let mut pseudonym = [0xff; 32];
+    pseudonym[..8].copy_from_slice(&(n as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15).to_be_bytes());
+    (Pseudonym(pseudonym), Revocation { incarnation: u32::MAX, at: at(n as u64) })
+}
+
 #[test]
 fn no_more_nodes_are_revoked_than_there_is_room_for() {
     let (fleet, _) = two_copies(&[]);
-    let revocation = Revocation { incarnation: u32::MAX, at: UnixMillis(NOW.0) };
-    let node = |n: u32| {
-        let mut pseudonym = [0xff; 32];
-        pseudonym[..4].copy_from_slice(&n.to_be_bytes());
-        (Pseudonym(pseudonym), revocation)
+    let hours = 2 * REVOKED_NODES_MAX as u64;
+    let list = |numbers: std::ops::Range<usize>| {
+        let nodes: Vec<_> = numbers.map(numbered).collect();
+        fleet.revocation_list_of_nodes(&nodes, 1 + nodes.len() as u64, at(hours)).unwrap()
     };
-    let nodes = |numbers: std::ops::Range<u32>| numbers.map(node).collect::<Vec<_>>();
-    let max = REVOKED_NODES_MAX as u32;
-    let full = fleet.revocation_list_of_nodes(&nodes(0..max), 1, NOW).unwrap();
-    assert!(full.len() <= sgc_wire::CRL_BYTES_MAX);
-    let anchors = with(fleet.anchors(), &full, 0);
+    let mut anchors = fleet.anchors().clone();
+    for first in (0..REVOKED_NODES_MAX).step_by(LIST_NODES_MAX) {
+        let full = list(first..first + LIST_NODES_MAX);
+        assert!(full.len() <= sgc_wire::CRL_BYTES_MAX);
+        anchors = with(&anchors, &full, hours);
+    }
     assert_eq!(revoked(&anchors).len(), REVOKED_NODES_MAX);
-    let one_more = fleet.revocation_list_of_nodes(&[node(max)], 2, NOW).unwrap();
-    assert_eq!(anchors.with_crl(&one_more, NOW).unwrap_err(), CrlError::TooManyNodes);
-    assert_eq!(revoked(&anchors).len(), REVOKED_NODES_MAX);
-    let made = fleet.revocation_list_of_nodes(&nodes(0..max + 1), 1, NOW);
-    assert!(matches!(made, Err(FleetError::TooManyRevoked)));
+    let one_more = list(REVOKED_NODES_MAX..REVOKED_NODES_MAX + 1);
+    assert_eq!(anchors.with_crl(&one_more, at(hours)).unwrap_err(), CrlError::TooManyNodes);
+    assert_eq!(revoked(&anchors).len(), REVOKED_NODES_MAX, "what was revoked stays revoked");
+}
+
+#[test]
+fn a_list_names_the_nodes_that_were_revoked_last_and_the_lists_before_it_stay() {
+    let (fleet, _) = two_copies(&[]);
+    let count = 2 * LIST_NODES_MAX + 7;
+    let mut anchors = fleet.anchors().clone();
+    for n in (1..=count).step_by(509).chain([count]) {
+        let all: Vec<_> = (0..n).map(numbered).collect();
+        let list = fleet.revocation_list_of_nodes(&all, n as u64, at(n as u64)).unwrap();
+        anchors = with(&anchors, &list, n as u64);
+        let known = revoked(&anchors);
+        assert!(all.iter().all(|(node, _)| known.contains_key(node)), "{n} nodes");
+        assert!(anchors.crls().count() <= 2 + n / (LIST_NODES_MAX - 509), "{} lists", anchors.crls().count());
+    }
+    // A fresh node learns all of them from what is passed on.
+    let fresh = anchors.crls().fold(fleet.anchors().clone(), |known, list| with(&known, list, count as u64));
+    assert_eq!(revoked(&fresh).len(), count);
 }
 
 #[test]
