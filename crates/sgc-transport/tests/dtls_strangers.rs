@@ -265,3 +265,62 @@ async fn listener_is_told_why_a_dialer_does_not_go_on() {
         assert_eq!(server.metrics.refused(RefusalKind::OtherCa), 1);
     }
 }
+
+/// A HelloRetryRequest (RFC 8446, 4.1.4) whose cookie has this length, in datagrams that are not too long.
+fn retry_with_cookie(bytes: usize) -> Vec<Vec<u8>> {
+    let random = "cf21ad74e59a6111be1d8c021e65b891c2a211167abb8c5e079e09e2c8a8339c";
+    let random = (0..32).map(|at| u8::from_str_radix(&random[at * 2..at * 2 + 2], 16).unwrap());
+    let mut extensions = vec![0, 43, 0, 2, 0xfe, 0xfc, 0, 44];
+    extensions.extend((bytes as u16 + 2).to_be_bytes());
+    extensions.extend((bytes as u16).to_be_bytes());
+    extensions.resize(extensions.len() + bytes, 7);
+    let mut body = vec![0xfe, 0xfd];
+    body.extend(random);
+    body.extend([0, 0x13, 0x01, 0]);
+    body.extend((extensions.len() as u16).to_be_bytes());
+    body.extend(extensions);
+    let length = &(body.len() as u32).to_be_bytes()[1..];
+    let pieces = body.chunks(2000).enumerate().map(|(number, piece)| {
+        let mut datagram = vec![22, 0xfe, 0xfd, 0, 0, 0, 0, 0, 0, 0, number as u8];
+        datagram.extend((piece.len() as u16 + 12).to_be_bytes());
+        datagram.push(2);
+        datagram.extend(length);
+        datagram.extend([0, 0]);
+        datagram.extend(&((number * 2000) as u32).to_be_bytes()[1..]);
+        datagram.extend(&(piece.len() as u32).to_be_bytes()[1..]);
+        datagram.extend(piece);
+        datagram
+    });
+    pieces.collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn dialer_survives_long_cookies() {
+    let fleet = fleet(1);
+    let options = LinkOptions { handshake_timeout: Duration::from_secs(1), ..LinkOptions::default() };
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
+    for bytes in [500, 9000, 13_000, 20_000, 50_000] {
+        let fake = tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("dtls://{}", fake.local_addr().unwrap()).parse().unwrap();
+        let answering = tokio::spawn(async move {
+            let mut hello = vec![0; 2048];
+            let (_, from) = fake.recv_from(&mut hello).await.unwrap();
+            for datagram in retry_with_cookie(bytes) {
+                fake.send_to(&datagram, from).await.unwrap();
+            }
+            let (len, _) = fake.recv_from(&mut hello).await.unwrap();
+            hello.truncate(len);
+            // The next would be its repetition.
+            (hello, fake)
+        });
+        let error = dial_with(&dialer, &url).await.unwrap_err();
+        if bytes == 500 {
+            assert!(matches!(error, LinkError::HandshakeTimedOut { .. }), "{error}");
+            let (hello, _fake) = soon(answering).await.unwrap();
+            assert!(hello.windows(bytes).any(|window| window.iter().all(|byte| *byte == 7)), "no cookie");
+        } else if bytes > 10_000 {
+            // A dialer that panicked would say that nobody answered.
+            assert!(matches!(error, LinkError::Transport(_)), "{bytes}: {error}");
+        }
+    }
+}

@@ -43,7 +43,7 @@ const REFUSAL_COPIES: usize = 2;
 const DATAGRAM_BYTES_MAX: usize = 2048;
 /// Most datagrams that dimpl keeps of messages that are not complete.
 const QUEUE_RX_DATAGRAMS: usize = 30;
-/// Most datagrams of a flight of ours.
+/// Most datagrams of a flight of ours. A peer's cookie, which a dialer repeats, fills any number of them with a record each.
 const QUEUE_TX_DATAGRAMS: usize = 10;
 /// Most records of a flight of ours: one more, and dimpl panics (`dtls13/engine.rs`, `flight_saved_records`).
 const FLIGHT_RECORDS_MAX: usize = 12;
@@ -59,6 +59,7 @@ const FLIGHT_DATAGRAMS: usize =
     (CERT_BYTES_MAX + FLIGHT_REST_BYTES).div_ceil(FLIGHT_BYTES_MAX - RECORD_OVERHEAD_BYTES);
 // A flight has at most six messages, and every further datagram begins with the rest of one.
 const _: () = assert!(FLIGHT_DATAGRAMS + 5 <= FLIGHT_RECORDS_MAX && FLIGHT_DATAGRAMS <= QUEUE_TX_DATAGRAMS);
+const _: () = assert!(QUEUE_TX_DATAGRAMS + 1 < FLIGHT_RECORDS_MAX);
 /// `protocol_version`: of what is spoken inside.
 const ALERT_VERSION: u8 = 70;
 /// `handshake_failure`: what listeners without DTLS 1.3 answer as well.
