@@ -113,6 +113,12 @@ impl Counts {
         })
     }
 
+    /// Limits units of room for long messages to those that there are: a longer message takes all.
+    fn units(&self, wanted: u32) -> u32 {
+        let all = LONG_BYTES[self.pool as usize] / crate::budget::UNIT_BYTES;
+        wanted.min(u32::try_from(all).unwrap_or(u32::MAX))
+    }
+
     fn share(&self) -> usize {
         match self.pool {
             Pool::Credential => CREDENTIAL_SHARE,
@@ -215,20 +221,20 @@ impl Quota {
 
     /// Waits for a thread that may wait for local programs.
     pub(crate) async fn thread(&self) -> Result<Permits, GatewayError> {
-        let semaphores = self.pools.iter().map(|counts| &counts.threads);
-        acquire(semaphores, 1).await.ok_or(GatewayError::Stopping)
+        let semaphores = self.pools.iter().map(|counts| (&counts.threads, 1));
+        acquire(semaphores).await.ok_or(GatewayError::Stopping)
     }
 
     /// Waits for so many units of room for long messages.
     pub(crate) async fn room(&self, units: u32) -> Option<Permits> {
-        acquire(self.pools.iter().map(|counts| &counts.long_bytes), units).await
+        acquire(self.pools.iter().map(|counts| (&counts.long_bytes, counts.units(units)))).await
     }
 
     /// Takes so many units of room for long messages, unless a pool has less.
     pub(crate) fn room_at_once(&self, units: u32) -> Result<Permits, GatewayError> {
         let mut permits = Vec::with_capacity(self.pools.len());
         for counts in &*self.pools {
-            match Arc::clone(&counts.long_bytes).try_acquire_many_owned(units) {
+            match Arc::clone(&counts.long_bytes).try_acquire_many_owned(counts.units(units)) {
                 Ok(permit) => permits.push(permit),
                 Err(_) => {
                     let max = LONG_BYTES[counts.pool as usize];
@@ -245,9 +251,9 @@ impl Quota {
 pub(crate) struct Permits(#[expect(dead_code, reason = "they are for their end")] Vec<OwnedSemaphorePermit>);
 
 /// Takes permits of all pools, the smallest first: a client that waits for its own pool holds nothing of a larger one.
-async fn acquire<'a>(pools: impl Iterator<Item = &'a Arc<Semaphore>>, permits: u32) -> Option<Permits> {
+async fn acquire<'a>(pools: impl Iterator<Item = (&'a Arc<Semaphore>, u32)>) -> Option<Permits> {
     let mut held = Vec::new();
-    for semaphore in pools {
+    for (semaphore, permits) in pools {
         held.push(Arc::clone(semaphore).acquire_many_owned(permits).await.ok()?);
     }
     Some(Permits(held))
@@ -389,6 +395,16 @@ mod tests {
         // Whoever counts gives back.
         fifth.sub(0);
         assert_eq!(fifth.bytes(), 0);
+    }
+
+    #[tokio::test]
+    async fn a_message_that_is_longer_than_a_pool_takes_all_of_it() {
+        let quotas: Arc<Quotas> = Arc::default();
+        let quota = quotas.quota(&client("10.0.0.1:1"));
+        let all = tokio::time::timeout(std::time::Duration::from_secs(10), quota.room(u32::MAX)).await;
+        assert!(all.unwrap().is_some());
+        let _held = quota.room_at_once(u32::MAX).unwrap();
+        assert!(quota.room_at_once(1).is_err());
     }
 
     #[tokio::test]
