@@ -18,12 +18,12 @@ use tokio::time::Instant;
 
 use crate::access::Right;
 use crate::aside::aside_if_long;
-use crate::content::{Content, Form, write};
+use crate::content::{Content, Form, serialise, write};
 use crate::error::GatewayError;
 use crate::feed::Subscription;
 use crate::hub::{Shared, lock};
 use crate::publisher::Publication;
-use crate::quota::{Charge, Quota, Resource};
+use crate::quota::{Charge, Quota, Resource, Waiting};
 use crate::service::{Caller, Replier, Request, Serving};
 use crate::session::{Session, Subscribe};
 use crate::types::InterfaceType;
@@ -36,6 +36,8 @@ const FEEDBACK_DEPTH: usize = 100;
 const EVENTS_MAX: usize = 256;
 /// Goals that an action remembers; the oldest that ended give way.
 const GOALS_MAX: usize = 1024;
+/// Bytes that a kept result costs beside its payload.
+const RESULT_COST_BYTES: usize = 256;
 /// How long the result of a goal is kept (`rcl_action`'s default).
 const RESULT_KEPT: Duration = Duration::from_secs(900);
 /// How long an action that nobody serves any more says how its goals ended.
@@ -211,7 +213,8 @@ impl Session {
         self.check(Right::Serve, action)?;
         let of = self.action_type(action, type_name)?;
         let charge = self.quota().take(Resource::Servings, self.limits())?;
-        ActionServing::new(&self.hub().shared, action, &of, (self.quota().clone(), charge)).await
+        let quota = (self.quota().clone(), charge);
+        ActionServing::new(&self.hub().shared, action, &of, quota, self.limits().waiting_bytes_max).await
     }
 }
 
@@ -340,6 +343,8 @@ struct ActionServer {
     action: String,
     layouts: Layouts,
     goals: Mutex<Goals>,
+    /// Bytes of results that are kept.
+    kept: Arc<Waiting>,
     send_goal: Replier,
     get_result: Replier,
     cancel_goal: Replier,
@@ -356,10 +361,24 @@ struct Served {
     /// The request that has not been answered yet.
     asked: Option<RequestId>,
     taken_ns: i64,
-    result: Option<Value>,
+    result: Option<KeptResult>,
     /// Those who wait for the result.
     waiting: Vec<RequestId>,
     ended: Option<Instant>,
+}
+
+/// The result of a goal, for those that ask later. It takes room among the bytes that wait for the client that serves.
+#[derive(Debug)]
+struct KeptResult {
+    /// The result, serialised.
+    payload: Bytes,
+    waiting: Arc<Waiting>,
+}
+
+impl Drop for KeptResult {
+    fn drop(&mut self) {
+        self.waiting.sub(self.payload.len() + RESULT_COST_BYTES);
+    }
 }
 
 impl ActionServing {
@@ -368,6 +387,7 @@ impl ActionServing {
         action: &str,
         of: &str,
         (quota, charge): (Quota, Charge),
+        results_bytes_max: usize,
     ) -> Result<Self, GatewayError> {
         let name = of.to_owned();
         let layouts = shared.run(move |shared| Layouts::find(shared, &name)).await?;
@@ -380,6 +400,7 @@ impl ActionServing {
         let feedback =
             Publication::new(shared, part("feedback"), feedback_type, Qos::default(), (quota.clone(), None))
                 .await?;
+        let kept = Arc::new(Waiting::new(results_bytes_max, quota.clone()));
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
@@ -388,6 +409,7 @@ impl ActionServing {
             action: action.to_owned(),
             layouts,
             goals: Mutex::default(),
+            kept,
             send_goal: goals.replier(),
             get_result: results.replier(),
             cancel_goal: cancels.replier(),
@@ -475,14 +497,19 @@ impl ActionServer {
 
     async fn finish(&self, id: &GoalId, status: GoalStatus, result: Value) -> Result<(), GatewayError> {
         let status = if status.is_end() { status } else { GoalStatus::Aborted };
+        let payload = serialise(&self.layouts.result, &result)?;
         let waiting = {
             let mut goals = lock(&self.goals);
             let goal = goals.get_mut(id).filter(|goal| !goal.status.is_end() && goal.asked.is_none());
             let goal = goal.ok_or_else(|| self.no_goal())?;
             goal.status = status;
             goal.ended = Some(Instant::now());
-            goal.result = Some(result.clone());
-            std::mem::take(&mut goal.waiting)
+            let waiting = std::mem::take(&mut goal.waiting);
+            let kept = self.keep(&mut goals, id, payload);
+            if let Some(goal) = goals.get_mut(id) {
+                goal.result = kept;
+            }
+            waiting
         };
         // Who has the result finds the status as it says.
         let published = self.publish_status().await;
@@ -490,6 +517,20 @@ impl ActionServer {
             self.reply_result(asked, status, result.clone()).await;
         }
         published
+    }
+
+    /// Keeps the result of a goal, if there is room once the results of goals that ended before have given way.
+    fn keep(&self, goals: &mut Goals, id: &GoalId, payload: Bytes) -> Option<KeptResult> {
+        let bytes = payload.len() + RESULT_COST_BYTES;
+        while !self.kept.has_room(bytes) {
+            let ended = |(other, goal): (&GoalId, &Served)| {
+                Some((goal.ended?, *other)).filter(|(_, other)| other != id && goal.result.is_some())
+            };
+            let (_, oldest) = goals.iter().filter_map(ended).min()?;
+            goals.remove(&oldest);
+        }
+        self.kept.add(bytes);
+        Some(KeptResult { payload, waiting: Arc::clone(&self.kept) })
     }
 
     async fn reply_result(&self, asked: RequestId, status: GoalStatus, result: Value) {
@@ -570,15 +611,19 @@ impl ActionServer {
             let mut goals = lock(&self.goals);
             match id.and_then(|id| goals.get_mut(&id)) {
                 None => Some((GoalStatus::Unknown, self.no_result())),
-                Some(goal) => match &goal.result {
-                    Some(result) => Some((goal.status, result.clone())),
-                    None => {
-                        if goal.waiting.len() < EVENTS_MAX {
-                            goal.waiting.push(request.id);
-                        }
-                        None
+                Some(goal) if goal.ended.is_some() => {
+                    let kept = goal.result.as_ref();
+                    let result = kept.and_then(|kept| self.layouts.result.decode(&kept.payload).ok());
+                    // A result that found no room is forgotten, and so is its goal.
+                    let forgotten = || (GoalStatus::Unknown, self.no_result());
+                    Some(result.map_or_else(forgotten, |result| (goal.status, result)))
+                }
+                Some(goal) => {
+                    if goal.waiting.len() < EVENTS_MAX {
+                        goal.waiting.push(request.id);
                     }
-                },
+                    None
+                }
             }
         };
         if let Some((status, result)) = ended {

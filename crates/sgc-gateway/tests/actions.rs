@@ -5,7 +5,10 @@ mod support;
 
 use std::time::Duration;
 
-use sgc_gateway::{ActionEvent, CancelAnswer, Content, Form, GatewayError, GoalStatus, Session, Subscribe};
+use sgc_gateway::{
+    ActionEvent, CancelAnswer, Content, Form, GatewayError, Goal, GoalStatus, Session, SessionLimits,
+    Subscribe,
+};
 
 use support::Site;
 
@@ -101,4 +104,36 @@ async fn goals_of_a_server_that_goes_are_aborted() {
     drop(served.await.unwrap());
     let outcome = waiting.await.unwrap();
     assert_eq!((outcome.status, &outcome.result[..]), (GoalStatus::Aborted, &br#"{"sequence":[]}"#[..]));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn results_that_are_kept_are_bounded_in_bytes() {
+    let site = Site::new().await;
+    let server = site.session("server");
+    let limits = SessionLimits { waiting_bytes_max: 4096, ..SessionLimits::default() };
+    let server = Session::new(&site.hub, server.client().clone(), limits);
+    let mut serving = server.serve_action(ACTION, Some(TYPE)).await.unwrap();
+    let client = site.session("client");
+    let mut goals = Vec::new();
+    // Of results of 2 kB and more one fits, and of such as have 8 kB none.
+    for numbers in [500, 501, 2000] {
+        let wanted = order(7);
+        let (sent, taken) = tokio::join!(client.send_goal(ACTION, None, &wanted), async {
+            let Some(ActionEvent::Goal { id, .. }) = serving.next().await else { panic!("a goal was sent") };
+            serving.replier().answer(&id, true).await.unwrap();
+            id
+        });
+        let result = Content::json(format!(r#"{{"sequence":[0{}]}}"#, ",1".repeat(numbers - 1)));
+        serving.replier().finish(&taken, GoalStatus::Succeeded, &result).await.unwrap();
+        goals.push(sent.unwrap().0);
+        let status = async |goal: &Goal| goal.outcome(Form::Json, PATIENCE).await.unwrap().status;
+        let expected: &[GoalStatus] = match numbers {
+            500 => &[GoalStatus::Succeeded],
+            501 => &[GoalStatus::Unknown, GoalStatus::Succeeded],
+            _ => &[GoalStatus::Unknown; 3],
+        };
+        for (goal, expected) in goals.iter().zip(expected) {
+            assert_eq!(status(goal).await, *expected, "{numbers}");
+        }
+    }
 }
