@@ -3,6 +3,8 @@
 //!
 //! How tests are cited stands in that document, before its first table. A citation that cannot be checked is a fault.
 
+#![allow(clippy::unwrap_used)]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
