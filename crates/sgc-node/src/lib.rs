@@ -39,6 +39,7 @@ mod peer_rate;
 pub mod policy;
 mod queue;
 mod records;
+mod refusal_log;
 mod reload;
 mod replays;
 mod roaming;

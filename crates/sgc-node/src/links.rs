@@ -2,7 +2,6 @@
 //!
 //! Control frames go to the control task; packets go straight to the data path, on the task that read them.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,9 +10,8 @@ use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
     AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
-    Refusal, prompt,
+    prompt,
 };
-use sgc_trust::CertError;
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
@@ -28,6 +26,7 @@ use crate::heart::Activity;
 use crate::labels::{LabelBook, NameLabel, Progress};
 use crate::lanes::{Dial, LaneDoor, Lanes};
 use crate::peer_rate::PeerRate;
+use crate::refusal_log::RefusalLog;
 use crate::roaming::{self, Move, Origin, source_towards};
 use crate::stats::DataDrop;
 
@@ -250,11 +249,14 @@ pub(crate) struct Door {
 /// Accepts links until the node ends.
 pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop: oneshot::Receiver<()>) {
     let Door { core, credentials, claims, audit, lanes } = door;
-    // At most one for each CA that is trusted.
-    let mut strangers = BTreeSet::new();
+    let mut refusals = RefusalLog::default();
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
+            () = refusals.is_due() => {
+                refusals.summarise();
+                continue;
+            }
             _ = &mut stop => None,
         };
         match accepted {
@@ -279,13 +281,7 @@ pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop:
                 });
             }
             Some(Err(refused)) => {
-                match &refused.reason {
-                    // It is said once what to do about it.
-                    Refusal::Certificate(CertError::NotAdmitted { ca }) if !strangers.insert(*ca) => {
-                        debug!("{refused}");
-                    }
-                    _ => warn!("{refused}"),
-                }
+                refusals.note(&refused);
                 let record = AuditRecord::new(AuditEvent::LinkRefused).remote(refused.remote);
                 audit.write(record.reason(&refused.reason));
             }

@@ -270,6 +270,9 @@ pub enum LinkError {
         "the connection was cut: the peer was stopped or restarted, or something between the two ended it"
     )]
     Cut,
+    /// What came is not what the peer sent.
+    #[error("what came was altered on the way: somebody, or a broken device, is between the two nodes")]
+    Altered,
     /// The peer is there and has forgotten the link.
     #[error("the peer restarted and no longer knows this link")]
     PeerRestarted,
@@ -434,27 +437,18 @@ pub enum Refusal {
         after: Duration,
     },
     /// Too many connect at once.
-    #[error(
-        "{pending} nodes are connecting already; {unreported} more were refused since this was last said"
-    )]
+    #[error("{pending} nodes are connecting already")]
     TooMany {
         /// How many.
         pending: usize,
-        /// How many were refused since the last such report.
-        unreported: u64,
     },
     /// Too many connect at once from its address.
-    #[error(
-        "{pending} connections from {prefix} are connecting already; {unreported} more were refused since this was \
-         last said"
-    )]
+    #[error("{pending} connections from {prefix} are connecting already")]
     TooManyFromAddress {
         /// The address.
         prefix: AddressPrefix,
         /// How many connect from it.
         pending: usize,
-        /// How many were refused since the last such report.
-        unreported: u64,
     },
     /// It refused us, or gave up.
     #[error("{0}")]

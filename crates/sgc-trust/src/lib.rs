@@ -37,7 +37,10 @@ mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
 pub use crl::CrlError;
-pub use crowd::{AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places};
+pub use crowd::{
+    AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places, REPEAT_SOURCES_MAX, REPEAT_WINDOW,
+    Repeated, Repeats,
+};
 pub use enrol::EnrollRequest;
 pub use fleet::{
     Absorbed, CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, Merged, ROSTER_BYTES_MAX,

@@ -28,9 +28,9 @@ use super::front::{self, Echo, Front, Token};
 use super::paths::Paths;
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, LinkError, PeerRefusal, Refusal};
+use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::metrics::{Pending, TransportMetrics};
 use crate::options::LinkOptions;
-use crate::overload::{Entry, Handshakes, Holder};
 
 /// Most unproven handshakes from one [`AddressPrefix`] before the next has to answer a challenge.
 const UNPROVEN_PER_ADDRESS_MAX: usize = 8;
@@ -400,10 +400,10 @@ impl Mux {
             }
             return;
         }
-        let Entry { is_admitted, evicted, report } = lock(&self.places).make_room(remote, now, &self.metrics);
-        if let Some(report) = report {
+        let Entry { is_admitted, evicted, refused } = lock(&self.places).make_room(remote, now, &self.metrics);
+        if let Some(refused) = refused {
             // A listener that does not keep up has the counters.
-            let _ = self.reports.try_send(report);
+            let _ = self.reports.try_send(refused);
         }
         if let Some(Slot { peer, .. }) = evicted {
             let mut state = lock(&peer.state);

@@ -26,10 +26,10 @@ use crate::credentials::CredentialStore;
 use crate::dtls::{Claim, Mux};
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, Pieces};
+use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::overload::{Entry, Handshakes, Holder};
 use crate::prompt::PromptRuntime;
 use crate::race;
 use crate::socket;
@@ -141,7 +141,7 @@ impl QuicListener {
         shut(&self.endpoint, reason).await;
     }
 
-    /// Starts the handshake of a peer that has a place, and returns a refusal that is to be reported.
+    /// Starts the handshake of a peer that has a place, and returns the refusal that comes of it.
     fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
         let pending = self.places.pending();
@@ -152,7 +152,7 @@ impl QuicListener {
             return None;
         }
         let (remote, now) = (canonical(incoming.remote_address()), Instant::now());
-        let Entry { is_admitted, evicted, report } =
+        let Entry { is_admitted, evicted, refused } =
             self.places.make_room(remote, now, &self.acceptor.metrics);
         if let Some(slot) = evicted {
             // Quinn closes the connection when its last handle goes.
@@ -160,7 +160,7 @@ impl QuicListener {
         }
         if !is_admitted {
             incoming.refuse();
-            return report;
+            return refused;
         }
         let acceptor = Arc::clone(&self.acceptor);
         let pending = acceptor.metrics.pending();
@@ -171,7 +171,7 @@ impl QuicListener {
             (remote, acceptor.handshake(incoming, &validated).await)
         });
         self.places.take(now, Slot { remote, task, is_validated });
-        report
+        refused
     }
 }
 

@@ -18,9 +18,9 @@ use super::{About, Shared, StreamLink};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
+use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::overload::{Entry, Handshakes, Holder};
 use crate::prompt;
 use crate::race;
 use crate::url::{LinkUrl, ListenAddr, Scheme};
@@ -125,18 +125,18 @@ impl StreamListener {
         self.acceptor.links.close(reason).await;
     }
 
-    /// Starts the handshake of a peer that has a place, and returns a refusal that is to be reported. Connections that
+    /// Starts the handshake of a peer that has a place, and returns the refusal that comes of it. Connections that
     /// are opened and left alone keep nobody out: they are not engaged, and give way.
     fn admit(&mut self, tcp: TcpStream, remote: SocketAddr) -> Option<(SocketAddr, Refusal)> {
         let now = Instant::now();
-        let Entry { is_admitted, evicted, report } =
+        let Entry { is_admitted, evicted, refused } =
             self.places.make_room(remote, now, &self.acceptor.metrics);
         if let Some(slot) = evicted {
             slot.task.abort();
         }
         if !is_admitted {
             self.acceptor.turn_away(tcp);
-            return report;
+            return refused;
         }
         let acceptor = Arc::clone(&self.acceptor);
         let has_spoken = Arc::<AtomicBool>::default();
@@ -146,7 +146,7 @@ impl StreamListener {
             (remote, acceptor.handshake(tcp, remote, &spoken).await)
         });
         self.places.take(now, Slot { remote, task, has_spoken });
-        report
+        refused
     }
 }
 

@@ -6,6 +6,8 @@
 
 mod places;
 mod prefix;
+mod repeats;
 
 pub use places::{Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places};
 pub use prefix::AddressPrefix;
+pub use repeats::{REPEAT_SOURCES_MAX, REPEAT_WINDOW, Repeated, Repeats};

@@ -1,16 +1,13 @@
-//! Places for the handshakes of one listener, and how often refusals for want of one are reported.
+//! Places for the handshakes of one listener. The rule for which handshake gives way is in `sgc-trust`.
 
 use std::net::SocketAddr;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use sgc_trust::{AddressPrefix, Crowded, PlaceDecision, PlaceLimits, Places};
 
 use crate::error::Refusal;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-
-/// How often refusals for want of capacity are reported one by one.
-const OVERLOAD_REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A handshake that holds a place.
 pub(crate) trait Holder {
@@ -27,8 +24,6 @@ pub(crate) trait Holder {
 /// The handshakes under way at one listener, in any transport.
 pub(crate) struct Handshakes<T> {
     places: Places<T>,
-    last_report: Option<Instant>,
-    unreported: u64,
 }
 
 /// What a listener does with a newcomer.
@@ -37,15 +32,15 @@ pub(crate) struct Entry<T> {
     pub(crate) is_admitted: bool,
     /// The handshake that gave way, which the listener ends.
     pub(crate) evicted: Option<T>,
-    /// A refusal to report: the newcomer's, or that of the handshake that gave way to it.
-    pub(crate) report: Option<(SocketAddr, Refusal)>,
+    /// The newcomer's refusal, or that of the handshake that gave way to it.
+    pub(crate) refused: Option<(SocketAddr, Refusal)>,
 }
 
 impl<T: Holder> Handshakes<T> {
     pub(crate) fn new(options: &LinkOptions) -> Self {
         let limits =
             PlaceLimits { all: options.handshakes_max, per_prefix: options.handshakes_per_address_max };
-        Self { places: Places::new(limits), last_report: None, unreported: 0 }
+        Self { places: Places::new(limits) }
     }
 
     /// Returns the number of handshakes under way.
@@ -68,36 +63,21 @@ impl<T: Holder> Handshakes<T> {
     ) -> Entry<T> {
         self.places.retain(Holder::is_pending);
         let (evicted, crowded) = match self.places.make_room(remote.ip().into(), now, T::is_engaged) {
-            PlaceDecision::Admit => return Entry { is_admitted: true, evicted: None, report: None },
+            PlaceDecision::Admit => return Entry { is_admitted: true, evicted: None, refused: None },
             PlaceDecision::Evict(holder, crowded) => (Some(holder), crowded),
             PlaceDecision::Refuse(crowded) => (None, crowded),
         };
-        metrics.count_refused(refusal(crowded, 0).kind());
-        let refused = evicted.as_ref().map_or(remote, Holder::remote);
-        let report = self.note(crowded, now).map(|refusal| (refused, refusal));
-        Entry { is_admitted: evicted.is_some(), evicted, report }
+        let refusal = match crowded {
+            Crowded::All { held } => Refusal::TooMany { pending: held },
+            Crowded::Prefix { prefix, held } => Refusal::TooManyFromAddress { prefix, pending: held },
+        };
+        metrics.count_refused(refusal.kind());
+        let remote = evicted.as_ref().map_or(remote, Holder::remote);
+        Entry { is_admitted: evicted.is_some(), evicted, refused: Some((remote, refusal)) }
     }
 
     /// Gives the place that was made to a handshake.
     pub(crate) fn take(&mut self, now: Instant, holder: T) {
         self.places.take(holder.remote().ip().into(), now, holder);
-    }
-
-    /// Returns the refusal to report now, if one is due.
-    fn note(&mut self, crowded: Crowded, now: Instant) -> Option<Refusal> {
-        self.unreported += 1;
-        let is_due =
-            self.last_report.is_none_or(|at| now.saturating_duration_since(at) >= OVERLOAD_REPORT_INTERVAL);
-        is_due.then(|| {
-            self.last_report = Some(now);
-            refusal(crowded, std::mem::take(&mut self.unreported) - 1)
-        })
-    }
-}
-
-fn refusal(crowded: Crowded, unreported: u64) -> Refusal {
-    match crowded {
-        Crowded::All { held } => Refusal::TooMany { pending: held, unreported },
-        Crowded::Prefix { prefix, held } => Refusal::TooManyFromAddress { prefix, pending: held, unreported },
     }
 }

@@ -1,0 +1,138 @@
+//! What a log says of events that strangers cause: the first of each kind and address, then a count.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use super::prefix::AddressPrefix;
+
+/// Over how long repeated events are counted into one line.
+pub const REPEAT_WINDOW: Duration = Duration::from_secs(10);
+/// Most pairs of an address and a kind that are told apart. Events of others are counted together.
+pub const REPEAT_SOURCES_MAX: usize = 64;
+
+/// Events within the last [`REPEAT_WINDOW`], by address and kind `K`.
+///
+/// Of a pair that is new the event is to be logged. What comes after it within the window is counted, and so is what comes
+/// in the windows after that, until one passes without any. So a flood writes [`REPEAT_SOURCES_MAX`] lines and a line for
+/// each of their windows at most, and one for all other addresses.
+#[derive(Debug)]
+pub struct Repeats<K> {
+    sources: BTreeMap<(AddressPrefix, K), Window>,
+    others: Option<Window>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Window {
+    since: Instant,
+    count: u64,
+}
+
+/// Events that were counted instead of logged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Repeated<K> {
+    /// The address and the kind; `None` stands for all addresses that were not told apart.
+    pub source: Option<(AddressPrefix, K)>,
+    /// How many events.
+    pub count: u64,
+    /// In how long.
+    pub within: Duration,
+}
+
+impl<K> Default for Repeats<K> {
+    fn default() -> Self {
+        Self { sources: BTreeMap::new(), others: None }
+    }
+}
+
+impl<K: Ord + Copy> Repeats<K> {
+    /// Counts an event; returns `true` if it is to be logged by itself.
+    pub fn note(&mut self, prefix: AddressPrefix, kind: K, now: Instant) -> bool {
+        if let Some(window) = self.sources.get_mut(&(prefix, kind)) {
+            window.count += 1;
+            return false;
+        }
+        if self.sources.len() < REPEAT_SOURCES_MAX {
+            self.sources.insert((prefix, kind), Window { since: now, count: 0 });
+            return true;
+        }
+        self.others.get_or_insert(Window { since: now, count: 0 }).count += 1;
+        false
+    }
+
+    /// Returns when [`Self::take_due`] has something to do.
+    pub fn due(&self) -> Option<Instant> {
+        self.sources.values().chain(&self.others).map(|window| window.since + REPEAT_WINDOW).min()
+    }
+
+    /// Returns what was counted in the windows that have ended, and forgets addresses of which nothing came.
+    pub fn take_due(&mut self, now: Instant) -> Vec<Repeated<K>> {
+        let mut all = Vec::new();
+        let mut end = |window: &mut Window, source| {
+            let within = now.saturating_duration_since(window.since);
+            if within < REPEAT_WINDOW {
+                return true;
+            }
+            let count = std::mem::take(&mut window.count);
+            window.since = now;
+            if count > 0 {
+                all.push(Repeated { source, count, within });
+            }
+            count > 0
+        };
+        self.sources.retain(|source, window| end(window, Some(*source)));
+        if let Some(window) = &mut self.others
+            && !end(window, None)
+        {
+            self.others = None;
+        }
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{IpAddr, Ipv4Addr};
+
+    use super::*;
+
+    fn host(number: u32) -> AddressPrefix {
+        IpAddr::V4(Ipv4Addr::from_bits(0x0a00_0000 + number)).into()
+    }
+
+    fn start() -> Instant {
+        #[allow(clippy::disallowed_methods)]
+        Instant::now()
+    }
+
+    #[test]
+    fn a_flood_of_one_address_is_one_line_and_a_count_for_each_window() {
+        let (mut repeats, start) = (Repeats::default(), start());
+        let said = (0..1000).filter(|_| repeats.note(host(1), 'x', start)).count();
+        assert_eq!(said, 1);
+        assert!(repeats.note(host(1), 'y', start), "another kind is news");
+        assert!(repeats.note(host(2), 'x', start), "so is another address");
+        assert_eq!(repeats.due(), Some(start + REPEAT_WINDOW));
+        assert_eq!(repeats.take_due(start + REPEAT_WINDOW / 2), []);
+        let end = start + REPEAT_WINDOW;
+        let counted = Repeated { source: Some((host(1), 'x')), count: 999, within: REPEAT_WINDOW };
+        assert_eq!(repeats.take_due(end), [counted]);
+        assert!(!repeats.note(host(1), 'x', end), "it goes on, and is still counted");
+        assert!(repeats.note(host(2), 'x', end), "what had ended is news again");
+        let counted = Repeated { count: 1, ..counted };
+        assert_eq!(repeats.take_due(end + REPEAT_WINDOW), [counted]);
+        assert_eq!(repeats.take_due(end + 2 * REPEAT_WINDOW), []);
+        assert_eq!(repeats.due(), None, "nothing is kept of it");
+    }
+
+    #[test]
+    fn a_flood_from_many_addresses_is_bounded_in_lines_and_memory() {
+        let (mut repeats, start) = (Repeats::default(), start());
+        let said = (0..100_000).filter(|n| repeats.note(host(*n), 'x', start)).count();
+        assert_eq!(said, REPEAT_SOURCES_MAX);
+        assert_eq!(repeats.sources.len(), REPEAT_SOURCES_MAX);
+        let count = 100_000 - REPEAT_SOURCES_MAX as u64;
+        let counted = Repeated { source: None, count, within: REPEAT_WINDOW };
+        assert_eq!(repeats.take_due(start + REPEAT_WINDOW), [counted]);
+        assert!(repeats.note(host(1), 'x', start + REPEAT_WINDOW), "and then there is room again");
+    }
+}
