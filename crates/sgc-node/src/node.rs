@@ -284,7 +284,7 @@ pub async fn run_on<N: RosNetwork>(
     let file_watch = options.file.filter(|_| config.watch).map(|file| FileWatch::begin(file, &config));
     let state = state_dir(&config, identity.node_name().as_str())?;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
-    rules.warnings.iter().for_each(|warning| warn!("{warning}"));
+    config.warnings().iter().chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
     let transport = Arc::new(TransportMetrics::default());
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());

@@ -59,6 +59,23 @@ fn texts(values: &[impl ToString]) -> Vec<String> {
 }
 
 #[test]
+fn links_that_can_be_read_on_their_way_are_warned_of() {
+    let config = good(
+        r#"
+        identity = "x"
+        node.routers = ["quic://a:1,tcp://a:2", "udp://b:3", "tls://c:4"]
+        router.listen = ["quic://[::]:7447", "tcp://[::]:7447", "wss://[::]:443"]
+        "#,
+    );
+    let warnings = config.warnings();
+    let about: Vec<_> = warnings.iter().filter_map(|line| line.split_once(' ')).collect();
+    let addresses: Vec<_> = about.iter().map(|(address, _)| *address).collect();
+    assert_eq!(addresses, ["tcp://[::]:7447", "tcp://a:2", "udp://b:3"]);
+    assert!(about.iter().all(|(_, text)| text.starts_with("can be read by everybody")), "{warnings:#?}");
+    assert_eq!(good(NODE).warnings(), Vec::<String>::new());
+}
+
+#[test]
 fn the_example_of_the_design_is_valid() {
     let config = good(
         r#"

@@ -29,7 +29,7 @@ pub enum Scheme {
     Udp,
     /// TLS 1.3 (RFC 8446) over TCP.
     Tls,
-    /// TCP, in the clear once both ends have proven who they are.
+    /// TCP whose records are authenticated and can be read by everyone, once both ends have proven who they are.
     Tcp,
     /// WebSocket (RFC 6455) over TCP, with TLS inside.
     Ws,
@@ -58,6 +58,11 @@ impl Scheme {
             Self::Wss => 443,
             _ => DEFAULT_PORT,
         }
+    }
+
+    /// Returns `true` if what a link says can be read by everyone on its way; payloads of topics are sealed all the same.
+    pub fn is_readable(self) -> bool {
+        matches!(self, Self::Udp | Self::Tcp)
     }
 
     fn has_path(self) -> bool {

@@ -507,3 +507,107 @@ async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else(
     near.send_control("through".into()).await.unwrap();
     assert_eq!(soon(far.recv_control()).await.unwrap(), "through");
 }
+
+/// A relay between two ends of TCP whose owner decides, piece by piece, what reaches the listener.
+struct Interceptor {
+    /// What the dialer sent.
+    sent: tokio::sync::mpsc::Receiver<Vec<u8>>,
+    /// What the listener is to get.
+    to_listener: tokio::net::tcp::OwnedWriteHalf,
+}
+
+impl Interceptor {
+    /// Lets one dialer through until `made`, and then passes what it says to the owner.
+    async fn dial(
+        scheme: &str,
+        server: &mut Server,
+        identity: Arc<Identity>,
+    ) -> (Self, AnyLink, AnyLink) {
+        let front = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let addr = front.local_addr().unwrap();
+        let (pass, passes) = tokio::sync::watch::channel(true);
+        let (tx, sent) = tokio::sync::mpsc::channel(64);
+        let listener = server.addr;
+        let relay = tokio::spawn(async move {
+            let (dialer, _) = front.accept().await.unwrap();
+            let (mut from_dialer, mut to_dialer) = dialer.into_split();
+            let (mut from_listener, mut to_listener) =
+                TcpStream::connect(listener).await.unwrap().into_split();
+            tokio::spawn(async move { tokio::io::copy(&mut from_listener, &mut to_dialer).await });
+            let mut passes = passes;
+            let mut buffer = vec![0; 64 << 10];
+            while *passes.borrow() {
+                tokio::select! {
+                    n = from_dialer.read(&mut buffer) => to_listener.write_all(&buffer[..n.unwrap()]).await.unwrap(),
+                    _ = passes.changed() => {}
+                }
+            }
+            tokio::spawn(async move {
+                while let Ok(n @ 1..) = from_dialer.read(&mut buffer).await {
+                    if tx.send(buffer[..n].to_vec()).await.is_err() {
+                        return;
+                    }
+                }
+            });
+            to_listener
+        });
+        let url = format!("{scheme}://{addr}").parse().unwrap();
+        let near = dial(identity, &url).await.unwrap();
+        let far = server.link().await;
+        // What both say of themselves is through.
+        for (from, to) in [(&near, &far), (&far, &near)] {
+            from.send_control("ready".into()).await.unwrap();
+            assert_eq!(soon(to.recv_control()).await.unwrap(), "ready");
+        }
+        pass.send_replace(false);
+        let to_listener = soon(relay).await.unwrap();
+        (Self { sent, to_listener }, near, far)
+    }
+
+    /// What the dialer sends until this is in it.
+    async fn wait_for(&mut self, text: &[u8]) -> Vec<u8> {
+        let mut all = Vec::new();
+        while !contains(&all, text) {
+            all.extend(soon(self.sent.recv()).await.unwrap());
+        }
+        all
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nobody_between_two_ends_of_tcp_alters_injects_or_repeats_anything() {
+    /// What an attacker makes of what the dialer sent, given the position of a control frame in it.
+    type Attack = fn(&[u8], usize) -> Vec<u8>;
+    let attacks: [(&str, Attack); 5] = [
+        ("alters a control frame", |sent, at| {
+            let mut altered = sent.to_vec();
+            altered[at] ^= 1;
+            altered
+        }),
+        ("closes the link in the name of the peer", |_, _| vec![12, 0, 0]),
+        ("leaves bytes out", |sent, at| [&sent[..at], &sent[at + 1..]].concat()),
+        ("repeats what was sent", |sent, _| [sent, sent].concat()),
+        ("sends a control frame of its own", |sent, _| {
+            [sent, &[1, 0, 9], &frame(b"leave")].concat()
+        }),
+    ];
+    let fleet = fleet(1);
+    for (name, attack) in attacks {
+        let mut server = Server::start_on("tcp", enroll(&fleet, "router"), LinkOptions::default());
+        let (mut between, near, far) =
+            Interceptor::dial("tcp", &mut server, enroll(&fleet, "arm-1")).await;
+        near.send_control("join".into()).await.unwrap();
+        let sent = between.wait_for(b"join").await;
+        let at = sent.windows(4).position(|w| w == b"join").unwrap();
+        between.to_listener.write_all(&attack(&sent, at)).await.unwrap();
+        loop {
+            match soon(far.recv_control()).await {
+                Ok(frame) => assert_eq!(frame, "join", "who {name}: the listener believes it"),
+                Err(error) => {
+                    assert!(matches!(error, LinkError::Altered), "who {name}: {error}");
+                    break;
+                }
+            }
+        }
+    }
+}

@@ -351,6 +351,20 @@ impl DiscoveryRange {
 }
 
 impl Config {
+    /// Returns what to tell the user about links that can be read on their way, one line for each address.
+    pub fn warnings(&self) -> Vec<String> {
+        let listens = self.listen.iter().filter(|addr| addr.scheme.is_readable()).map(ToString::to_string);
+        let ways = self.routers.iter().flat_map(RouterUrl::ways);
+        let dials = ways.filter(|url| url.scheme.is_readable()).map(ToString::to_string);
+        let line = |address| {
+            format!(
+                "{address} can be read by everybody on its way: who talks to whom, how much and when, and the hashes that stand \
+                 for topics. Nobody can alter it, and payloads are sealed; quic:// and tls:// hide the rest, too"
+            )
+        };
+        listens.chain(dials).map(line).collect()
+    }
+
     /// Takes part in ROS 2 not at all and only passes packets on.
     pub fn is_pure_router(&self) -> bool {
         self.ros.is_none()

@@ -12,6 +12,7 @@ use bytes::{Buf as _, Bytes};
 use tokio::io::{AsyncRead as _, AsyncReadExt as _, AsyncWrite as _, AsyncWriteExt as _, ReadBuf};
 use tokio::time::{Sleep, sleep_until, timeout};
 
+use super::record::RecordError;
 use super::wire::Wire;
 use super::{Shared, State};
 use crate::error::{CloseReason, LinkError, ProtocolError};
@@ -205,7 +206,10 @@ pub(super) fn lost(error: io::Error, idle_timeout: Duration) -> LinkError {
         | io::ErrorKind::BrokenPipe
         | io::ErrorKind::WriteZero => LinkError::Cut,
         io::ErrorKind::TimedOut => LinkError::TimedOut { after: idle_timeout },
-        io::ErrorKind::InvalidData => LinkError::Transport(error.to_string()),
+        io::ErrorKind::InvalidData => match error.get_ref().and_then(|e| e.downcast_ref()) {
+            Some(RecordError::Altered) => LinkError::Altered,
+            _ => LinkError::Transport(error.to_string()),
+        },
         _ => error.into(),
     }
 }

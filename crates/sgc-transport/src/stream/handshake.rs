@@ -3,7 +3,7 @@
 //! | scheme | from the outside in |
 //! |---|---|
 //! | `tls` | TCP, TLS |
-//! | `tcp` | TCP, TLS until both ends are known, then nothing |
+//! | `tcp` | TCP, TLS until both ends are known, then records that are authenticated (`record.rs`) |
 //! | `ws` | TCP, WebSocket, TLS |
 //! | `wss` | TCP, TLS that authenticates nobody, WebSocket, TLS |
 //!
@@ -24,6 +24,7 @@ use tokio::net::TcpStream;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
 use super::driver::part;
+use super::record::{Keys, RecordError, Tagged};
 use super::wire::{Below, Counted, Counters, Wire};
 use super::ws::{self, UpgradeError};
 use crate::credentials::CredentialStore;
@@ -44,7 +45,7 @@ const UNSENT_BYTES_MAX: u32 = 64 << 10;
 /// other.
 fn alpn(scheme: Scheme) -> &'static [u8] {
     match scheme {
-        Scheme::Tcp => b"sgc-tcp/1",
+        Scheme::Tcp => b"sgc-tcp/2",
         Scheme::Ws | Scheme::Wss => b"sgc-ws/1",
         _ => b"sgc-tls/1",
     }
@@ -81,6 +82,14 @@ enum Failure {
     Protocol(ProtocolError),
     /// The peer agreed on no application protocol.
     Alpn,
+    /// Its certificate is not accepted.
+    Certificate(CertError),
+}
+
+impl From<RecordError> for Failure {
+    fn from(error: RecordError) -> Self {
+        Self::Io(error.into())
+    }
 }
 
 impl From<io::Error> for Failure {
@@ -150,7 +159,7 @@ pub(super) async fn accept(
     let rtt = Duration::ZERO;
     let mut secured = Secured { tls, findings, counters, mtu_bytes, scheme, asked, rtt };
     match secured.be_greeted().await {
-        Ok(greeting) => secured.made(greeting).map_err(Refusal::Certificate),
+        Ok(greeting) => secured.made(greeting).map_err(refused),
         Err(failure) => {
             let refusal = refusal(&secured.findings, failure);
             part(Box::new(secured.tls)).await;
@@ -200,7 +209,7 @@ impl Secured {
     /// The dialer's greeting; the listener's answer says that it accepts us.
     pub(super) async fn greet(mut self, greeting: Greeting) -> Result<Made, LinkError> {
         match self.exchange(&greeting).await {
-            Ok(()) => self.made(greeting).map_err(LinkError::RefusedHere),
+            Ok(()) => self.made(greeting).map_err(|failure| link_error(&Findings::default(), failure)),
             Err(failure) => {
                 let error = link_error(&self.findings, failure);
                 part(Box::new(self.tls)).await;
@@ -268,7 +277,7 @@ impl Secured {
         Greeting::from_slice(&body).map_err(ProtocolError::Greeting).map_err(Failure::Protocol)
     }
 
-    /// Waits for the authenticated end of TLS, behind which the stream goes on in the clear.
+    /// Waits for the authenticated end of TLS, behind which the stream goes on without it.
     async fn hear_end(&mut self) -> Result<(), Failure> {
         match self.tls.read(&mut [0]).await? {
             0 => Ok(()),
@@ -276,9 +285,10 @@ impl Secured {
         }
     }
 
-    fn made(self, Greeting { lane }: Greeting) -> Result<Made, CertError> {
+    fn made(self, Greeting { lane }: Greeting) -> Result<Made, Failure> {
         // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
-        let peer = self.findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
+        let verdict = self.findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate));
+        let peer = verdict.map_err(Failure::Certificate)?;
         let group = self.tls.get_ref().1.negotiated_key_exchange_group().map(|group| group.name());
         let key_exchange = match group {
             Some(NamedGroup::X25519) => KeyExchange::X25519,
@@ -286,8 +296,16 @@ impl Secured {
             _ => KeyExchange::Unknown,
         };
         let wire: Wire = match (self.scheme, self.tls) {
-            (Scheme::Tcp, TlsStream::Client(tls)) => tls.into_inner().0.into_wire(),
-            (Scheme::Tcp, TlsStream::Server(tls)) => tls.into_inner().0.into_wire(),
+            (Scheme::Tcp, TlsStream::Client(tls)) => {
+                let (below, tls) = tls.into_inner();
+                let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), true)?;
+                Box::new(Tagged::new(below.into_wire(), keys))
+            }
+            (Scheme::Tcp, TlsStream::Server(tls)) => {
+                let (below, tls) = tls.into_inner();
+                let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), false)?;
+                Box::new(Tagged::new(below.into_wire(), keys))
+            }
             (_, tls) => Box::new(tls),
         };
         Ok(Made {
@@ -319,6 +337,7 @@ fn refusal(findings: &Findings, failure: Failure) -> Refusal {
     }
     let error = match failure {
         Failure::Alpn => return Refusal::Version("it names no application protocol".into()),
+        Failure::Certificate(why) => return Refusal::Certificate(why),
         Failure::Protocol(ProtocolError::Greeting(e @ DecodeError::Version { .. })) => {
             return Refusal::Version(e.to_string());
         }
@@ -350,6 +369,7 @@ fn link_error(findings: &Findings, failure: Failure) -> LinkError {
     }
     let error = match failure {
         Failure::Alpn => return LinkError::RefusedByPeer(PeerRefusal::Version),
+        Failure::Certificate(why) => return LinkError::RefusedHere(why),
         Failure::Protocol(why) => return why.into(),
         Failure::Upgrade(UpgradeError::Io(error)) | Failure::Io(error) => error,
         Failure::Upgrade(UpgradeError::Status(503)) => {

@@ -11,6 +11,7 @@ mod endpoint;
 mod frame;
 mod handshake;
 mod mux;
+mod record;
 mod window;
 mod wire;
 mod ws;

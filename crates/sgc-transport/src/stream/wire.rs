@@ -1,5 +1,5 @@
 //! The streams of bytes below a link: what all of them can do, what is counted, and the end of TLS on a stream that goes
-//! on in the clear.
+//! on without it.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
