@@ -9,6 +9,7 @@
 //! authenticated only, or a stream of bytes: TLS, TCP, WebSocket.
 #![forbid(unsafe_code)]
 
+mod budget;
 mod congestion;
 mod credentials;
 mod dtls;
@@ -42,6 +43,7 @@ pub mod benchmarks {
     pub use crate::stream::Conversation;
 }
 
+pub use budget::{RECEIVE_BUDGET_BYTES, RECEIVE_WINDOW_BYTES_MIN, ReceiveBudget};
 pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
 #[cfg(feature = "fuzzing")]

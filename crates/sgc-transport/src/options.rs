@@ -3,6 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use crate::budget::ReceiveBudget;
 use crate::congestion::Congestion;
 
 /// Settings of the links of one listener or dialer. The default is meant for all.
@@ -16,10 +17,13 @@ pub struct LinkOptions {
     pub keep_alive: Duration,
     /// How long nothing may arrive before a link counts as lost.
     pub idle_timeout: Duration,
-    /// Most bytes that the peer may have sent and we not read, all flows of a link together.
+    /// Most bytes that the peer may have sent and we not read, all flows of a link together. Where there are many links it
+    /// is less, by [`Self::receive_budget`].
     pub receive_window_bytes: u32,
-    /// The same for one flow.
+    /// The same for one flow; at most half of what the link has.
     pub flow_window_bytes: u32,
+    /// What the windows of all links come from. Clones of these settings share it.
+    pub receive_budget: ReceiveBudget,
     /// Most bytes that we may have sent and the peer not acknowledged, all flows of a link together.
     pub send_window_bytes: u32,
     /// Most flows that the peer may have open at once.
@@ -64,6 +68,7 @@ impl Default for LinkOptions {
             idle_timeout: Duration::from_secs(10),
             receive_window_bytes: 64 << 20,
             flow_window_bytes: 32 << 20,
+            receive_budget: ReceiveBudget::default(),
             send_window_bytes: 64 << 20,
             flows_max: 4096,
             datagram_send_bytes: 64 << 10,

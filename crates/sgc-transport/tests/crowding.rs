@@ -128,8 +128,64 @@ async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str
     assert!(server.metrics.refused(RefusalKind::TooMany) >= 1, "one of theirs gave way");
 }
 
+/// How long a packet is not taken where the far end takes no more.
+const STUCK: Duration = Duration::from_millis(500);
+
+/// However many peers send and are not read, the node holds what its budget says.
+async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
+    const LINKS: u64 = 12;
+    const BUDGET_BYTES: u64 = 8 << 20;
+    let fleet = fleet(1);
+    let arm = enroll(&fleet, "arm-1");
+    let receive_budget = ReceiveBudget::new(BUDGET_BYTES);
+    let options = LinkOptions { receive_budget: receive_budget.clone(), ..LinkOptions::default() };
+    let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options);
+    // What they have under way counts as received here: so it is little.
+    let sends = LinkOptions { send_window_bytes: 64 << 10, ..LinkOptions::default() };
+    let dialer = Dialer::new(arm, sends, Default::default());
+    let (mut links, mut senders) = (Vec::new(), tokio::task::JoinSet::new());
+    for _ in 0..LINKS {
+        let near = soon(dialer.dial(&server.url)).await.unwrap();
+        let far = server.link().await;
+        let sender = near.clone();
+        senders.spawn(async move {
+            // Two flows fill what a link may have, since one may have half.
+            let mut taken = 0;
+            for _ in 0..2 {
+                let mut flow = sender.open_flow(sgc_wire::Class::Default).await.unwrap();
+                let packet = packet(1, vec![7; 16 << 10].into());
+                while let Ok(sent) = tokio::time::timeout(STUCK, flow.send(&packet)).await {
+                    sent.unwrap();
+                    taken += packet.payload.len() as u64;
+                }
+                std::mem::forget(flow);
+            }
+            taken
+        });
+        links.push((near, far));
+    }
+    let mut taken = 0;
+    while let Some(bytes) = soon(senders.join_next()).await {
+        taken += bytes.unwrap();
+    }
+    let granted = receive_budget.granted_bytes();
+    // 8 + 4 + 2.7 + 2 + 1.6 + 1.3 + 1.1 + 5 · 1 MiB.
+    assert!(granted < 27 << 20, "{granted} bytes granted");
+    // What waits at the senders is theirs: as much as is under way, and what is queued for each flow.
+    let waiting = LINKS * (1 << 20);
+    assert!(taken <= granted + waiting, "{taken} bytes taken of {granted} granted");
+    drop((links, dialer));
+    soon(async {
+        while receive_budget.granted_bytes() > 0 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
+}
+
 each_transport! {
     [
+        links_that_nobody_reads_share_one_budget
         one_address_that_stalls_keeps_nobody_else_out
         a_few_addresses_that_take_all_places_make_room_for_another
     ]: quic dtls udp tls tcp ws wss

@@ -518,11 +518,7 @@ struct Interceptor {
 
 impl Interceptor {
     /// Lets one dialer through until `made`, and then passes what it says to the owner.
-    async fn dial(
-        scheme: &str,
-        server: &mut Server,
-        identity: Arc<Identity>,
-    ) -> (Self, AnyLink, AnyLink) {
+    async fn dial(scheme: &str, server: &mut Server, identity: Arc<Identity>) -> (Self, AnyLink, AnyLink) {
         let front = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let addr = front.local_addr().unwrap();
         let (pass, passes) = tokio::sync::watch::channel(true);
@@ -587,15 +583,12 @@ async fn nobody_between_two_ends_of_tcp_alters_injects_or_repeats_anything() {
         ("closes the link in the name of the peer", |_, _| vec![12, 0, 0]),
         ("leaves bytes out", |sent, at| [&sent[..at], &sent[at + 1..]].concat()),
         ("repeats what was sent", |sent, _| [sent, sent].concat()),
-        ("sends a control frame of its own", |sent, _| {
-            [sent, &[1, 0, 9], &frame(b"leave")].concat()
-        }),
+        ("sends a control frame of its own", |sent, _| [sent, &[1, 0, 9], &frame(b"leave")].concat()),
     ];
     let fleet = fleet(1);
     for (name, attack) in attacks {
         let mut server = Server::start_on("tcp", enroll(&fleet, "router"), LinkOptions::default());
-        let (mut between, near, far) =
-            Interceptor::dial("tcp", &mut server, enroll(&fleet, "arm-1")).await;
+        let (mut between, near, far) = Interceptor::dial("tcp", &mut server, enroll(&fleet, "arm-1")).await;
         near.send_control("join".into()).await.unwrap();
         let sent = between.wait_for(b"join").await;
         let at = sent.windows(4).position(|w| w == b"join").unwrap();

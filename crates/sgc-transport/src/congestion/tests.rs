@@ -117,14 +117,15 @@ impl World {
             let options = LinkOptions { congestion: *congestion, ..LinkOptions::default() };
             let mut roots = rustls::RootCertStore::empty();
             roots.add(key.cert.der().clone()).unwrap();
-            let (transport, _) = transport_with(Flavor::Quic, &options);
+            let lease = options.receive_budget.lease(options.receive_window_bytes);
+            let (transport, _) = transport_with(Flavor::Quic, &options, &lease);
             let mut server = ServerConfig::with_single_cert(
                 vec![key.cert.der().clone()],
                 rustls_pki_types::PrivateKeyDer::Pkcs8(key.signing_key.serialize_der().into()),
             )
             .unwrap();
             server.transport_config(transport);
-            let (transport, gate) = transport_with(Flavor::Quic, &options);
+            let (transport, gate) = transport_with(Flavor::Quic, &options, &lease);
             let mut client = ClientConfig::with_root_certificates(Arc::new(roots)).unwrap();
             client.transport_config(transport);
             let config = |seed: u8| {

@@ -11,15 +11,13 @@ use tokio::time::timeout;
 
 use super::keys;
 use super::mux::{Mux, Progress, Reports, wait_for_end, wait_until_up};
-use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, ProtocolError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::prompt::PromptRuntime;
-use crate::quic::{self, Flavor, QuicLink, QuicListener};
-use crate::tls::Findings;
+use crate::quic::{self, Flavor, Parts, QuicLink, QuicListener};
 use crate::url::LinkUrl;
 use crate::{race, socket};
 
@@ -109,8 +107,7 @@ impl Drop for Attempt {
 struct Connected {
     attempt: Attempt,
     connection: Connection,
-    findings: Arc<Findings>,
-    gate: Arc<Gate>,
+    parts: Parts,
     peer: Box<VerifiedPeer>,
     progress: watch::Receiver<Progress>,
 }
@@ -144,14 +141,14 @@ impl DtlsDialer {
     }
 
     async fn greet(&self, connected: Connected, greeting: Greeting) -> Result<QuicLink, LinkError> {
-        let Connected { attempt, connection, findings, gate, peer, mut progress } = connected;
-        let inner = findings.verdict().and_then(|verdict| verdict.as_ref().ok());
+        let Connected { attempt, connection, parts, peer, mut progress } = connected;
+        let inner = parts.findings.verdict().and_then(|verdict| verdict.as_ref().ok());
         if inner.is_none_or(|inner| inner.node_id != peer.node_id) {
             let (code, text) = CloseReason::Protocol(ProtocolError::OtherNode.to_string()).to_wire();
             connection.close(quinn::VarInt::from_u32(code), text.as_bytes());
             return Err(ProtocolError::OtherNode.into());
         }
-        let link = quic::greet(connection, findings, gate, greeting, &self.shared.options).await?;
+        let link = quic::greet(connection, parts, greeting, &self.shared.options).await?;
         link.end_with(async move { wait_for_end(&mut progress).await });
         let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
         links.retain(|link| link.endpoint.open_connections() > 0);
@@ -199,16 +196,16 @@ impl Shared {
         let dialed = &attempt.0;
         let mut progress = dialed.mux.dial(remote).ok_or(LinkError::KeyUnsupported)?;
         let peer = wait_until_up(&mut progress).await?;
-        let (client, findings, gate) = quic::client(Flavor::Dtls, &self.credentials, &self.options);
+        let (client, parts) = quic::client(Flavor::Dtls, &self.credentials, &self.options);
         let connecting = dialed
             .endpoint
             .connect_with(client, remote, quic::SERVER_NAME)
             .map_err(|e| LinkError::Transport(e.to_string()))?;
-        let connecting = quic::finish(connecting, &findings, &self.options);
+        let connecting = quic::finish(connecting, &parts.findings, &self.options);
         let connection = tokio::select! {
             connection = connecting => connection?,
             error = wait_for_end(&mut progress) => return Err(error),
         };
-        Ok(Connected { attempt, connection, findings, gate, peer, progress })
+        Ok(Connected { attempt, connection, parts, peer, progress })
     }
 }

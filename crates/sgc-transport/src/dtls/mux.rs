@@ -400,7 +400,8 @@ impl Mux {
             }
             return;
         }
-        let Entry { is_admitted, evicted, refused } = lock(&self.places).make_room(remote, now, &self.metrics);
+        let Entry { is_admitted, evicted, refused } =
+            lock(&self.places).make_room(remote, now, &self.metrics);
         if let Some(refused) = refused {
             // A listener that does not keep up has the counters.
             let _ = self.reports.try_send(refused);

@@ -12,6 +12,7 @@ use quinn::{
 
 use super::clear::Clear;
 use super::places;
+use crate::budget::WindowLease;
 use crate::congestion::Gate;
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
@@ -55,8 +56,20 @@ const DTLS_MTU: u16 = 1340;
 const RESET_DOMAIN: &[u8] = b"sgc stateless reset v1";
 const CONNECTION_ID_BYTES: usize = 8;
 
+/// What belongs to one connection besides its settings.
+pub(crate) struct Parts {
+    pub(crate) findings: Arc<Findings>,
+    pub(crate) gate: Arc<Gate>,
+    /// Its receive window, which it has from its handshake on.
+    pub(crate) lease: WindowLease,
+}
+
 /// Everything that belongs to neither side's handshake, for one connection, and the gate of that one.
-pub(crate) fn transport(flavor: Flavor, options: &LinkOptions) -> (Arc<TransportConfig>, Arc<Gate>) {
+pub(crate) fn transport(
+    flavor: Flavor,
+    options: &LinkOptions,
+    lease: &WindowLease,
+) -> (Arc<TransportConfig>, Arc<Gate>) {
     let millis = |d: Duration| VarInt::from_u32(u32::try_from(d.as_millis()).unwrap_or(u32::MAX));
     let mut config = TransportConfig::default();
     config
@@ -65,8 +78,8 @@ pub(crate) fn transport(flavor: Flavor, options: &LinkOptions) -> (Arc<Transport
         .max_concurrent_uni_streams(VarInt::from_u32(places::at_first(options.flows_max)))
         .max_idle_timeout(Some(IdleTimeout::from(millis(options.idle_timeout))))
         .keep_alive_interval(Some(options.keep_alive))
-        .receive_window(VarInt::from_u32(options.receive_window_bytes))
-        .stream_receive_window(VarInt::from_u32(options.flow_window_bytes))
+        .receive_window(VarInt::from_u32(lease.link_bytes()))
+        .stream_receive_window(VarInt::from_u32(lease.flow_bytes(options.flow_window_bytes)))
         .send_window(options.send_window_bytes.into())
         .packet_threshold(PACKET_THRESHOLD)
         .initial_rtt(INITIAL_RTT)
@@ -88,7 +101,7 @@ pub(super) fn server(
     flavor: Flavor,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> (quinn::ServerConfig, Arc<Findings>, Arc<Gate>) {
+) -> (quinn::ServerConfig, Parts) {
     let (tls, findings) = tls::server(credentials, options, flavor.alpn());
     let crypto =
         QuicServerConfig::try_from(tls).expect("the provider has the cipher suite of QUIC's first packets");
@@ -97,11 +110,12 @@ pub(super) fn server(
         Flavor::Udp => Arc::new(Clear(Arc::new(crypto))),
     };
     let mut config = quinn::ServerConfig::with_crypto(crypto);
-    let (transport, gate) = transport(flavor, options);
+    let lease = options.receive_budget.lease(options.receive_window_bytes);
+    let (transport, gate) = transport(flavor, options, &lease);
     config.transport_config(transport);
     // Retry makes its own tokens; those for later connections are not worth their state.
     config.validation_token.sent(0);
-    (config, findings, gate)
+    (config, Parts { findings, gate, lease })
 }
 
 /// For the listening endpoint itself.
@@ -123,7 +137,7 @@ pub(crate) fn client(
     flavor: Flavor,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> (quinn::ClientConfig, Arc<Findings>, Arc<Gate>) {
+) -> (quinn::ClientConfig, Parts) {
     let (tls, findings) = tls::client(credentials, options, flavor.alpn());
     let crypto =
         QuicClientConfig::try_from(tls).expect("the provider has the cipher suite of QUIC's first packets");
@@ -132,10 +146,11 @@ pub(crate) fn client(
         Flavor::Udp => Arc::new(Clear(Arc::new(crypto))),
     };
     let mut config = quinn::ClientConfig::new(crypto);
-    let (transport, gate) = transport(flavor, options);
+    let lease = options.receive_budget.lease(options.receive_window_bytes);
+    let (transport, gate) = transport(flavor, options, &lease);
     config.transport_config(transport);
     config.token_store(Arc::new(quinn::NoneTokenStore));
-    (config, findings, gate)
+    (config, Parts { findings, gate, lease })
 }
 
 /// For the socket of a listener. With the identity's reset key, peers of a listener that was killed and started again on

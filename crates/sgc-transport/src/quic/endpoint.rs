@@ -17,11 +17,11 @@ use sgc_wire::{Decode, DecodeError, Encode};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
-use super::config::Flavor;
+use super::config::{Flavor, Parts};
 use super::{
     ControlRx, Fate, Inlet, Outlet, Places, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
 };
-use crate::congestion::Gate;
+use crate::budget::WindowLease;
 use crate::credentials::CredentialStore;
 use crate::dtls::{Claim, Mux};
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
@@ -188,7 +188,8 @@ impl Acceptor {
     }
 
     async fn link(&self, incoming: Incoming, validated: &AtomicBool) -> Result<QuicLink, Refusal> {
-        let (server, findings, gate) = config::server(self.flavor, &self.credentials, &self.options);
+        let (server, Parts { findings, gate, lease }) =
+            config::server(self.flavor, &self.credentials, &self.options);
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         validated.store(true, Relaxed);
@@ -214,7 +215,8 @@ impl Acceptor {
             Ok((greeting, control)) => {
                 let ended = claim.as_ref().map(Claim::ended);
                 let places = Places::new(self.options.flows_max);
-                let link = link(connection, &findings, false, greeting, control, (fate, places), claim);
+                let held = Held { fate, places, lease, claim };
+                let link = link(connection, &findings, false, greeting, control, held);
                 let link = link.map_err(Refusal::Certificate)?;
                 if let Some(ended) = ended {
                     link.end_with(ended);
@@ -263,13 +265,12 @@ impl QuicDialer {
             let started = self.start(address);
             let options = self.options.clone();
             async move {
-                let (connecting, findings, gate) = started?;
-                Ok((finish(connecting, &findings, &options).await?, (findings, gate)))
+                let (connecting, parts) = started?;
+                Ok((finish(connecting, &parts.findings, &options).await?, parts))
             }
         };
-        let (remote, (connection, (findings, gate))) =
-            race::first(addresses, connect).await.map_err(failed)?;
-        let greeted = greet(connection, findings, gate, greeting, &self.options).await;
+        let (remote, (connection, parts)) = race::first(addresses, connect).await.map_err(failed)?;
+        let greeted = greet(connection, parts, greeting, &self.options).await;
         let link = greeted.map_err(|e| failed(vec![(remote, e)]))?;
         self.metrics.count_dialed();
         Ok(link)
@@ -283,13 +284,13 @@ impl QuicDialer {
         }
     }
 
-    fn start(&self, address: SocketAddr) -> Result<(Connecting, Arc<Findings>, Arc<Gate>), LinkError> {
-        let (client, findings, gate) = config::client(self.flavor, &self.credentials, &self.options);
+    fn start(&self, address: SocketAddr) -> Result<(Connecting, Parts), LinkError> {
+        let (client, parts) = config::client(self.flavor, &self.credentials, &self.options);
         let endpoint = self.endpoint(address)?;
         let connecting = endpoint
             .connect_with(client, address, SERVER_NAME)
             .map_err(|e| LinkError::Transport(e.to_string()))?;
-        Ok((connecting, findings, gate))
+        Ok((connecting, parts))
     }
 
     fn endpoint(&self, remote: SocketAddr) -> Result<Endpoint, LinkError> {
@@ -321,8 +322,7 @@ impl QuicDialer {
 /// Makes a link of an outgoing connection.
 pub(crate) async fn greet(
     connection: Connection,
-    findings: Arc<Findings>,
-    gate: Arc<Gate>,
+    Parts { findings, gate, lease }: Parts,
     greeting: Greeting,
     options: &LinkOptions,
 ) -> Result<QuicLink, LinkError> {
@@ -340,8 +340,8 @@ pub(crate) async fn greet(
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
         Ok(control) => {
             let places = Places::new(options.flows_max);
-            link(connection, &findings, true, greeting, control, (fate, places), None)
-                .map_err(LinkError::RefusedHere)
+            let held = Held { fate, places, lease, claim: None };
+            link(connection, &findings, true, greeting, control, held).map_err(LinkError::RefusedHere)
         }
         Err(error) => {
             if let LinkError::Protocol(why) = &error {
@@ -374,14 +374,21 @@ async fn hear_greeting(rx: &mut ControlRx) -> Result<Greeting, LinkError> {
     Ok(Greeting::from_slice(&frame).map_err(ProtocolError::Greeting)?)
 }
 
+/// What a link keeps until it ends.
+struct Held {
+    fate: Arc<Fate>,
+    places: Arc<Places>,
+    lease: WindowLease,
+    claim: Option<Claim>,
+}
+
 fn link(
     connection: Connection,
     findings: &Findings,
     is_dialer: bool,
     Greeting { lane }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
-    (fate, places): (Arc<Fate>, Arc<Places>),
-    claim: Option<Claim>,
+    Held { fate, places, lease, claim }: Held,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
@@ -402,6 +409,7 @@ fn link(
         fate,
         gate,
         places,
+        _lease: lease,
         _claim: claim,
     };
     Ok(QuicLink { shared: Arc::new(shared) })

@@ -10,7 +10,7 @@ mod places;
 
 #[cfg(test)]
 pub(crate) use config::transport;
-pub(crate) use config::{Flavor, client, endpoint as endpoint_config};
+pub(crate) use config::{Flavor, Parts, client, endpoint as endpoint_config};
 pub(crate) use endpoint::{DRAIN_TIMEOUT, QuicDialer, QuicListener, SERVER_NAME, finish, greet};
 
 use std::fmt;
@@ -31,6 +31,7 @@ use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::Mutex;
 
 use self::places::{Place, Places};
+use crate::budget::WindowLease;
 use crate::congestion::Gate;
 use crate::dtls::Claim;
 use crate::error::{CloseReason, FlowEnd, FlowError, LabelError, LinkError, ProtocolError};
@@ -64,6 +65,7 @@ struct Shared {
     fate: Arc<Fate>,
     gate: Arc<Gate>,
     places: Arc<Places>,
+    _lease: WindowLease,
     /// Its hold on what it travels in.
     _claim: Option<Claim>,
 }

@@ -50,6 +50,7 @@ use tokio::sync::{Notify, futures::Notified};
 use self::frame::DATAGRAM_BYTES_MAX;
 use self::mux::{Event, Limits, Mux, Read, RxId, TxId};
 use self::wire::Counters;
+use crate::budget::WindowLease;
 use crate::error::{CloseReason, FlowEnd, FlowError, LabelError, LinkError, ProtocolError};
 use crate::flow::{self, Chunks, FlowRx, FlowTx};
 use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
@@ -86,6 +87,7 @@ struct About {
 
 /// What a link's users and its task share.
 struct Shared {
+    _lease: WindowLease,
     state: Mutex<State>,
     counters: Arc<Counters>,
     incoming: Notify,
@@ -111,9 +113,10 @@ struct State {
 
 impl Shared {
     fn new(options: &LinkOptions, counters: Arc<Counters>) -> Arc<Self> {
+        let lease = options.receive_budget.lease(options.receive_window_bytes);
         let limits = Limits {
-            flow_window: options.flow_window_bytes.into(),
-            link_window: options.receive_window_bytes.into(),
+            flow_window: lease.flow_bytes(options.flow_window_bytes).into(),
+            link_window: lease.link_bytes().into(),
             flows_max: options.flows_max.into(),
             send_bytes: options.send_window_bytes.into(),
             datagram_send_bytes: options.datagram_send_bytes,
@@ -131,6 +134,7 @@ impl Shared {
             is_drained: false,
         };
         Arc::new(Self {
+            _lease: lease,
             state: Mutex::new(state),
             counters,
             incoming: Notify::new(),

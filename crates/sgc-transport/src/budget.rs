@@ -1,0 +1,128 @@
+//! Memory of a node for what its links received and nobody has read yet.
+//!
+//! A window is what a peer may fill without anybody reading, and a peer that means harm fills it. So windows shrink with the number of
+//! links: each link is given its part of one budget when it begins, and keeps it. What a window is used for is the transport's.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// Bytes that the links of a node share unless it says otherwise: the n-th link is given an n-th.
+pub const RECEIVE_BUDGET_BYTES: u64 = 128 << 20;
+/// The least that a link is given, bytes: 160 Mbit/s at a round trip of 50 ms.
+pub const RECEIVE_WINDOW_BYTES_MIN: u32 = 1 << 20;
+
+/// The budget of the receive windows of one node. Clones share it, so one [`crate::LinkOptions`] is to be cloned for all
+/// listeners and dialers of the node.
+///
+/// The n-th link that is there at once gets at most an n-th of the budget, and no less than [`RECEIVE_WINDOW_BYTES_MIN`]. Links
+/// that end leave their place to others. So the windows of n links are less than the budget · (1 + ln n) + n · 1 MiB together,
+/// whatever comes and goes.
+#[derive(Clone, Debug)]
+pub struct ReceiveBudget {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    budget_bytes: u64,
+    links: AtomicU64,
+    granted_bytes: AtomicU64,
+}
+
+impl Default for ReceiveBudget {
+    fn default() -> Self {
+        Self::new(RECEIVE_BUDGET_BYTES)
+    }
+}
+
+impl ReceiveBudget {
+    /// Creates a budget of so many bytes.
+    pub fn new(budget_bytes: u64) -> Self {
+        let (links, granted_bytes) = (AtomicU64::new(0), AtomicU64::new(0));
+        Self { shared: Arc::new(Shared { budget_bytes, links, granted_bytes }) }
+    }
+
+    /// Returns how many bytes all links may have received and not read now.
+    pub fn granted_bytes(&self) -> u64 {
+        self.shared.granted_bytes.load(Relaxed)
+    }
+
+    /// Grants a link its window, of at most `max` bytes.
+    pub(crate) fn lease(&self, max: u32) -> WindowLease {
+        let count = self.shared.links.fetch_add(1, Relaxed) + 1;
+        let part = u32::try_from(self.shared.budget_bytes / count).unwrap_or(u32::MAX);
+        let bytes = part.max(RECEIVE_WINDOW_BYTES_MIN).min(max);
+        self.shared.granted_bytes.fetch_add(bytes.into(), Relaxed);
+        WindowLease { budget: self.clone(), bytes }
+    }
+}
+
+/// The window of one link, for as long as the link is there.
+#[derive(Debug)]
+pub(crate) struct WindowLease {
+    budget: ReceiveBudget,
+    bytes: u32,
+}
+
+impl WindowLease {
+    /// Returns how many bytes of all flows together the peer may have sent and we not read.
+    pub(crate) fn link_bytes(&self) -> u32 {
+        self.bytes
+    }
+
+    /// Returns the same for one flow, at most `max`: a flow that nobody reads takes half, so others go on.
+    pub(crate) fn flow_bytes(&self, max: u32) -> u32 {
+        max.min(self.bytes / 2).max(1)
+    }
+}
+
+impl Drop for WindowLease {
+    fn drop(&mut self) {
+        self.budget.shared.links.fetch_sub(1, Relaxed);
+        self.budget.shared.granted_bytes.fetch_sub(self.bytes.into(), Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_chacha::ChaCha20Rng;
+    use rand_core::{RngCore as _, SeedableRng as _};
+
+    use super::*;
+
+    const MAX: u32 = 64 << 20;
+
+    #[test]
+    fn few_links_have_the_whole_window_and_many_share() {
+        let budget = ReceiveBudget::default();
+        let leases: Vec<_> = (0..256).map(|_| budget.lease(MAX)).collect();
+        let mib = |n: usize| leases[n - 1].link_bytes() >> 20;
+        assert_eq!([mib(1), mib(2), mib(4), mib(16), mib(128), mib(256)], [64, 64, 32, 8, 1, 1]);
+        assert_eq!(leases[0].flow_bytes(32 << 20), 32 << 20);
+        assert_eq!(leases[255].flow_bytes(32 << 20), RECEIVE_WINDOW_BYTES_MIN / 2);
+        let sum: u64 = leases.iter().map(|lease| u64::from(lease.link_bytes())).sum();
+        assert_eq!(budget.granted_bytes(), sum);
+        assert!(sum < 800 << 20, "{sum} bytes for 256 links");
+        drop(leases);
+        assert_eq!((budget.granted_bytes(), budget.lease(MAX).link_bytes()), (0, MAX));
+    }
+
+    #[test]
+    fn whatever_comes_and_goes_the_sum_is_bounded() {
+        let mut rng = ChaCha20Rng::seed_from_u64(1);
+        let budget = ReceiveBudget::default();
+        let mut leases = Vec::new();
+        for step in 0..20_000_u32 {
+            // Herds come, and any may go.
+            if leases.is_empty() || rng.next_u32() % 1000 < 400 + 200 * (step / 1000 % 2) {
+                leases.push(budget.lease(MAX));
+            } else {
+                leases.swap_remove(rng.next_u32() as usize % leases.len());
+            }
+            let n = leases.len() as f64;
+            let bound = RECEIVE_BUDGET_BYTES as f64 * (1.0 + n.max(1.0).ln())
+                + n * f64::from(RECEIVE_WINDOW_BYTES_MIN);
+            assert!(budget.granted_bytes() as f64 <= bound, "{} bytes for {n} links", budget.granted_bytes());
+        }
+    }
+}
