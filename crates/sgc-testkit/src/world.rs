@@ -301,6 +301,11 @@ impl World {
     /// Lays a cable and connects it.
     pub fn link(&mut self, a: NodeKey, b: NodeKey) {
         let latency = self.dice.time(&self.config.latency.clone());
+        self.link_over(a, b, latency);
+    }
+
+    /// Lays a cable of that latency and connects it.
+    pub fn link_over(&mut self, a: NodeKey, b: NodeKey, latency: Duration) {
         self.note(format!("link {a:?} {b:?} {latency:?}"));
         let cable = Cable {
             ends: [a, b],
@@ -347,6 +352,12 @@ impl World {
         let cable = self.cable(a, b);
         self.cables[cable].whole = true;
         self.connect(cable);
+    }
+
+    /// Returns true if a cable connects the two and both know it.
+    pub fn is_linked(&self, a: NodeKey, b: NodeKey) -> bool {
+        let wire = self.cables[self.cable(a, b)].wire;
+        wire.is_some_and(|wire| self.wires[wire].carries && self.wires[wire].ends.iter().all(|end| end.up))
     }
 
     // ---- Wishes.

@@ -1,0 +1,723 @@
+//! Random honest networks beside an adversary: a router of another fleet and a member of the own one, who have recorded all
+//! signed frames of the network, work together, and draw hostile actions from a grammar.
+//!
+//! The adversary's links are slower than any honest way, so no way between two honest nodes leads over it while an honest one is
+//! there; what a router may do to those behind it is in `docs/security.md`. With such a way, no honest pair loses its route, its
+//! allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and says which fail.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::rc::Rc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use sgc_endpoint::JoinStatus;
+use sgc_router::{DropReason, MappingKind};
+use sgc_testkit::{
+    CapturedPacket, Dice, Member, MessageId, NodeKey, Sharing, What, World, WorldConfig, identity,
+    revocation_list, serial_list,
+};
+use sgc_trust::{CertError, Kem, ReplyKey, SignedError};
+use sgc_wire::{
+    Adjacency, AdvertBody, Blind, Control, JoinBody, LinkStateBody, Name, Recover, RejectReason, Request,
+    Signed, SinkId, SourceId,
+};
+
+/// Seeds that every run of the tests replays.
+const COMMITTED: &[u64] = &[1, 2, 3, 4, 5, 6, 7, 8];
+/// Latency of the adversary's links, one way: more than any honest way.
+const SLOW: Duration = Duration::from_millis(450);
+/// How often the adversary acts and the network is looked at.
+const TICK: Duration = Duration::from_millis(500);
+/// Announcements that are replayed in each tick of a siege.
+const SIEGE_FRAMES: usize = 60;
+/// How long a pair may take after an honest node or link went away: the longest wait of any retry, twice.
+const GRACE: Duration = Duration::from_secs(60);
+/// How long a topic that is new may take to be granted to one who wants it.
+const NEW_MAX: Duration = Duration::from_secs(10);
+/// How long a reliable message may take.
+const MESSAGE_MAX: Duration = Duration::from_secs(20);
+
+const fn ms(n: u64) -> Duration {
+    Duration::from_millis(n)
+}
+
+/// What honest nodes do.
+#[derive(Clone, Copy, Debug)]
+enum Honest {
+    Nothing(Duration),
+    NewTopic,
+    Publish,
+    Renew(NodeKey),
+    RestartMember(NodeKey),
+    RestartRouter(NodeKey),
+    Revoke,
+    Rotate,
+}
+
+/// What the adversary does, over one of its links.
+#[derive(Clone, Copy, Debug)]
+enum Hostile {
+    /// Plays recorded frames again, the last ones or any.
+    Replay(usize, bool),
+    ReplayPackets(usize),
+    /// Plays recorded announcements of one owner again and again, to spend what it may announce.
+    Siege(NodeKey),
+    /// Changes a recorded frame a little, or a packet.
+    Spoil,
+    /// Says unsigned things about names and sinks of others.
+    Pretend,
+    /// Keeps back what its machines say; says it later, the other way round.
+    Withhold,
+    Release,
+    BeHonest,
+    /// Advertises and withdraws names of its own, many or with strange numbers.
+    Advertise(usize),
+    /// Says that it is next to everybody.
+    ClaimAll,
+    Ask(usize),
+    Join(usize),
+    /// Hands around lists that know less, or of another CA.
+    OldList,
+    Restart,
+}
+
+/// What the adversary keeps back on its links.
+#[derive(Default)]
+struct Hold {
+    is_on: bool,
+    frames: Vec<(usize, Control)>,
+}
+
+struct Run {
+    world: World,
+    dice: Dice,
+    routers: Vec<NodeKey>,
+    members: Vec<NodeKey>,
+    thief: NodeKey,
+    /// The adversary's nodes, and its links to honest ones.
+    rogues: Vec<NodeKey>,
+    attached: Vec<(NodeKey, NodeKey)>,
+    hold: Rc<RefCell<Hold>>,
+    /// Who wants what of whom.
+    uses: BTreeSet<(NodeKey, NodeKey, String)>,
+    topics: usize,
+    /// Who has to get what, and until when.
+    expected: BTreeMap<MessageId, (BTreeSet<NodeKey>, Duration)>,
+    /// What each member announced, as far as it was looked for, and the siege under way.
+    announced: BTreeMap<NodeKey, Vec<Control>>,
+    announced_to: usize,
+    siege: Option<(NodeKey, NodeKey, NodeKey)>,
+    lists: Vec<Bytes>,
+    is_revoked: bool,
+    seq: u64,
+    /// How much of the log was looked at.
+    looked_at: usize,
+    actions: usize,
+}
+
+impl Run {
+    fn new(seed: u64) -> Self {
+        let mut dice = Dice::new(seed ^ 0xad5e_75a2);
+        let mut config = WorldConfig::new(dice.number());
+        config.jitter = Duration::ZERO..=ms([0, 3][dice.below(2)]);
+        let (flood, query) = (MappingKind::Flood, MappingKind::Query);
+        config.mappings = [vec![flood], vec![query], vec![flood, query]][dice.below(3)].clone();
+        // Small, so that a flood of a few frames is one.
+        config.router_limits.announcements_burst = 32;
+        config.router_limits.stale_burst = 16;
+        let mut world = World::with(config);
+        world.capture();
+        let routers: Vec<_> = (0..dice.within(2..=4)).map(|n| world.router(&format!("router-{n}"))).collect();
+        for router in &routers {
+            world.trust_fleet(*router, "umbrella");
+        }
+        for (n, router) in routers.iter().enumerate().skip(1) {
+            world.link(routers[dice.below(n)], *router);
+        }
+        if routers.len() > 2 {
+            world.link(routers[0], routers[routers.len() - 1]);
+        }
+        let mut members = Vec::new();
+        for n in 0..dice.within(2..=4) {
+            let member = world.proxy(&format!("member-{n}"));
+            let first = dice.below(routers.len());
+            world.link(routers[first], member);
+            if dice.chance(50) {
+                world.link(routers[(first + 1) % routers.len()], member);
+            }
+            members.push(member);
+        }
+        let thief = world.proxy("thief");
+        world.link(routers[0], thief);
+        let stranger = Member { fleet: "umbrella".into(), router: true, ..Member::new("rogue") };
+        let rogue = world.node(stranger, true);
+        world.trust_fleet(rogue, "acme");
+        let insider = world.node(Member::new("mallory"), dice.chance(40));
+        let rogues = vec![rogue, insider];
+        let hold = Rc::<RefCell<Hold>>::default();
+        let mut attached = Vec::new();
+        for rogue in &rogues {
+            let mut to: Vec<_> = routers.clone();
+            while to.len() > 1 && dice.chance(60) {
+                to.remove(dice.below(to.len()));
+            }
+            for router in to {
+                world.link_over(*rogue, router, SLOW);
+                let (index, hold) = (attached.len(), hold.clone());
+                world.tamper(*rogue, router, move |frame| {
+                    let mut hold = hold.borrow_mut();
+                    if hold.is_on && !matches!(frame, Control::Hello(_)) {
+                        hold.frames.push((index, frame.clone()));
+                        return vec![];
+                    }
+                    vec![frame.clone()]
+                });
+                attached.push((*rogue, router));
+            }
+        }
+        if dice.chance(50) {
+            world.link_over(rogues[0], rogues[1], SLOW);
+        }
+        Self {
+            world,
+            dice,
+            routers,
+            members,
+            thief,
+            rogues,
+            attached,
+            hold,
+            uses: BTreeSet::new(),
+            topics: 0,
+            expected: BTreeMap::new(),
+            announced: BTreeMap::new(),
+            announced_to: 0,
+            siege: None,
+            lists: (0..3).map(|n| revocation_list("acme", &[], n + 1)).collect(),
+            is_revoked: false,
+            seq: 0,
+            looked_at: 0,
+            actions: 0,
+        }
+    }
+
+    // ---- The honest.
+
+    /// Two different members.
+    fn pair(&mut self) -> (NodeKey, NodeKey) {
+        let first = self.dice.below(self.members.len());
+        let second = (first + 1 + self.dice.below(self.members.len() - 1)) % self.members.len();
+        (self.members[first], self.members[second])
+    }
+
+    fn draw_honest(&mut self) -> Honest {
+        let member = self.members[self.dice.below(self.members.len())];
+        let router = self.routers[self.dice.below(self.routers.len())];
+        match self.dice.below(100) {
+            0..25 => Honest::NewTopic,
+            25..55 => Honest::Publish,
+            55..60 => Honest::Renew(member),
+            60..68 => Honest::RestartMember(member),
+            68..76 => Honest::RestartRouter(router),
+            76..79 => Honest::Revoke,
+            79..84 => Honest::Rotate,
+            84..90 => Honest::Nothing(Duration::from_secs(130)),
+            _ => Honest::Nothing(Duration::from_secs(10)),
+        }
+    }
+
+    fn do_honestly(&mut self, what: Honest) {
+        self.world.note(format!("honest: {what:?}"));
+        match what {
+            Honest::Nothing(time) => self.pass(time, true),
+            Honest::NewTopic => self.share_new(),
+            Honest::Publish => {
+                for (owner, topic) in self.shares() {
+                    self.publish(owner, &topic);
+                }
+                self.pass(TICK, true);
+            }
+            Honest::Renew(node) => {
+                self.world.renew(node);
+                self.pass(Duration::from_secs(5), true);
+            }
+            Honest::RestartMember(node) | Honest::RestartRouter(node) => {
+                // What is under way to one that stops need not arrive.
+                self.pass(MESSAGE_MAX, true);
+                self.world.restart(node);
+                self.pass(GRACE, false);
+                self.check_granted("an honest node was restarted");
+            }
+            Honest::Revoke => {
+                if !std::mem::replace(&mut self.is_revoked, true) {
+                    let thief = self.world.member(self.thief).clone();
+                    let list = revocation_list("acme", &[thief], 7);
+                    self.world.hand_crl(self.members[0], &list);
+                    self.lists.push(list);
+                    self.pass(Duration::from_secs(5), true);
+                }
+            }
+            Honest::Rotate => {
+                for (owner, topic) in self.shares() {
+                    self.world.rotate(owner, &topic);
+                }
+                self.pass(Duration::from_secs(3), true);
+            }
+        }
+    }
+
+    fn shares(&self) -> BTreeSet<(NodeKey, String)> {
+        self.uses.iter().map(|(_, owner, topic)| (*owner, topic.clone())).collect()
+    }
+
+    /// A member shares a topic that nobody knows yet, and another one has it soon: the owner's allowance is whole.
+    fn share_new(&mut self) {
+        let (owner, user) = self.pair();
+        let topic = format!("/t{}", self.topics);
+        self.topics += 1;
+        self.world.share(owner, &topic, Sharing::to(&[user]));
+        self.world.use_topic(user, owner, &topic);
+        let begin = self.world.elapsed();
+        while self.world.status(user, owner, &topic) != Some(JoinStatus::Granted) {
+            let waited = self.world.elapsed() - begin;
+            assert!(waited < NEW_MAX, "{user:?} waits for {owner:?}:{topic} since {waited:?}");
+            self.pass(TICK, true);
+        }
+        // The data path follows the grant.
+        self.pass(ms(1000), true);
+        self.uses.insert((user, owner, topic));
+    }
+
+    fn publish(&mut self, owner: NodeKey, topic: &str) {
+        let id = self.world.publish(owner, topic);
+        let users = self.uses.iter().filter(|(_, o, t)| (*o, t.as_str()) == (owner, topic)).map(|u| u.0);
+        self.expected.insert(id, (users.collect(), self.world.elapsed() + MESSAGE_MAX));
+    }
+
+    // ---- The adversary.
+
+    fn draw_hostile(&mut self) -> Hostile {
+        let many = [1, 5, 40][self.dice.below(3)];
+        match self.dice.below(100) {
+            0..15 => Hostile::Replay(4 * many, self.dice.chance(50)),
+            15..25 => Hostile::Siege(self.members[self.dice.below(self.members.len())]),
+            25..32 => Hostile::ReplayPackets(many),
+            32..37 => Hostile::Spoil,
+            37..55 => Hostile::Pretend,
+            55..61 => Hostile::Withhold,
+            61..69 => Hostile::Release,
+            69..72 => Hostile::BeHonest,
+            72..79 => Hostile::Advertise(many),
+            79..83 => Hostile::ClaimAll,
+            83..88 => Hostile::Ask(many),
+            88..93 => Hostile::Join(many),
+            93..97 => Hostile::OldList,
+            _ => Hostile::Restart,
+        }
+    }
+
+    /// A link of the adversary that is up; one that is not is made again now and then.
+    fn line(&mut self) -> Option<(NodeKey, NodeKey)> {
+        let (rogue, honest) = self.dice.pick(&self.attached)?;
+        if self.world.is_linked(rogue, honest) {
+            return Some((rogue, honest));
+        }
+        if self.dice.chance(20) && self.world.is_running(rogue) && self.world.is_running(honest) {
+            self.world.rejoin(rogue, honest);
+        }
+        None
+    }
+
+    fn act(&mut self) {
+        let Some((rogue, honest)) = self.line() else { return };
+        let what = self.draw_hostile();
+        self.world.note(format!("hostile: {rogue:?} to {honest:?}: {what:?}"));
+        self.actions += 1;
+        let frames = match what {
+            Hostile::Replay(count, last) => (0..count).filter_map(|_| self.recorded(last)).collect(),
+            Hostile::Siege(victim) => {
+                self.siege = Some((rogue, honest, victim));
+                vec![]
+            }
+            Hostile::ReplayPackets(count) => {
+                self.replay_packets(rogue, honest, count);
+                vec![]
+            }
+            Hostile::Spoil => self.recorded(false).map(spoilt).into_iter().collect(),
+            Hostile::Pretend => (0..5).filter_map(|_| self.pretence()).collect(),
+            Hostile::Withhold => {
+                self.hold.borrow_mut().is_on = true;
+                vec![]
+            }
+            Hostile::Release => {
+                let held = std::mem::take(&mut self.hold.borrow_mut().frames);
+                for (index, frame) in held.into_iter().rev() {
+                    let (rogue, honest) = self.attached[index];
+                    if self.world.is_linked(rogue, honest) {
+                        self.world.inject(rogue, honest, &frame);
+                    }
+                }
+                vec![]
+            }
+            Hostile::BeHonest => {
+                self.siege = None;
+                *self.hold.borrow_mut() = Hold::default();
+                vec![]
+            }
+            Hostile::Advertise(count) => (0..count).map(|_| self.own_advert(rogue)).collect(),
+            Hostile::ClaimAll => vec![self.own_link_state(rogue)],
+            Hostile::Ask(count) => (0..count).map(|_| self.question()).collect(),
+            Hostile::Join(count) => (0..count).filter_map(|_| self.join(rogue)).collect(),
+            Hostile::OldList => vec![self.old_list()],
+            Hostile::Restart => {
+                self.world.restart(rogue);
+                vec![]
+            }
+        };
+        for frame in frames {
+            if self.world.is_linked(rogue, honest) {
+                self.world.inject(rogue, honest, &frame);
+            }
+        }
+    }
+
+    /// Goes on with a siege.
+    fn besiege(&mut self) {
+        for captured in &self.world.captured()[self.announced_to..] {
+            let is_announcement =
+                matches!(captured.frame, Control::Advert { .. } | Control::LinkState { .. });
+            if is_announcement && self.members.contains(&captured.from) {
+                self.announced.entry(captured.from).or_default().push(captured.frame.clone());
+            }
+        }
+        self.announced_to = self.world.captured().len();
+        let Some((rogue, honest, victim)) = self.siege else { return };
+        let announced = self.announced.get(&victim).map(Vec::as_slice).unwrap_or_default();
+        for _ in 0..SIEGE_FRAMES {
+            if let Some(frame) = announced.get(self.dice.below(announced.len().max(1)))
+                && self.world.is_linked(rogue, honest)
+            {
+                self.world.inject(rogue, honest, frame);
+            }
+        }
+    }
+
+    /// A signed frame that crossed any link, one of the last or any.
+    fn recorded(&mut self, last: bool) -> Option<Control> {
+        let all = self.world.captured();
+        let from = if last { all.len().saturating_sub(200) } else { 0 };
+        for _ in 0..20 {
+            let frame = &all.get(from + self.dice.below((all.len() - from).max(1)))?.frame;
+            let is_signed = matches!(
+                frame,
+                Control::Advert { .. }
+                    | Control::LinkState { .. }
+                    | Control::Join { .. }
+                    | Control::Answer { .. }
+                    | Control::Crl { .. }
+            );
+            if is_signed {
+                return Some(frame.clone());
+            }
+        }
+        None
+    }
+
+    fn replay_packets(&mut self, rogue: NodeKey, honest: NodeKey, count: usize) {
+        for _ in 0..count {
+            let all = self.world.captured_packets();
+            let Some(CapturedPacket { packet, .. }) = all.get(self.dice.below(all.len().max(1))) else {
+                return;
+            };
+            let mut packet = packet.clone();
+            packet.header.hops = 30;
+            if self.dice.chance(20) {
+                packet.header.seq += 1;
+            }
+            if self.world.is_linked(rogue, honest) {
+                self.world.inject_packet(rogue, honest, packet);
+            }
+        }
+    }
+
+    /// An unsigned frame about what is others'.
+    fn pretence(&mut self) -> Option<Control> {
+        let uses: Vec<_> = self.uses.iter().cloned().collect();
+        let (_, owner, topic) = uses.get(self.dice.below(uses.len().max(1)))?.clone();
+        let catalogue = self.dice.chance(30);
+        let name = if catalogue { self.world.catalogue_name(owner) } else { self.world.name(owner, &topic) };
+        let sinks: Vec<_> =
+            self.world.granted_sinks(owner, &topic).into_iter().map(|(sink, _)| sink).collect();
+        let sink = self.dice.pick(&sinks)?;
+        Some(match self.dice.below(10) {
+            0 => Control::Leave { name, sink },
+            1 => Control::Reject { name, sink, reason: RejectReason::Revoked },
+            2 => Control::Reject { name, sink, reason: RejectReason::RouteLost },
+            3 => Control::Reroute { name, sink },
+            4 => Control::Unreach { names: vec![name] },
+            5 => Control::Ack { name, sink, serial: u64::MAX },
+            6 => Control::Recover(Recover { name, sink, source: SourceId([1; 16]), from: 0, to: u64::MAX }),
+            7 => Control::Uninterest { names: vec![name] },
+            8 => Control::Interest { names: vec![name] },
+            _ => Control::Query { id: self.dice.number(), hops: 1, names: vec![name] },
+        })
+    }
+
+    fn number(&mut self) -> u64 {
+        self.seq += 1;
+        match self.dice.below(10) {
+            0 => u64::MAX,
+            1 => 0,
+            2 => self.world.now().unix.0 + 86_400_000,
+            _ => self.world.now().unix.0 + self.seq,
+        }
+    }
+
+    fn own_advert(&mut self, rogue: NodeKey) -> Control {
+        let seq = self.number();
+        let identity = identity(self.world.member(rogue));
+        let count = [1, 3, 256][self.dice.below(3)];
+        let blinds = (0..count).map(|n| {
+            let mut blind = [7; 32];
+            blind[..8].copy_from_slice(&(self.seq + n % 40).to_be_bytes());
+            Blind(blind)
+        });
+        let body = AdvertBody {
+            chain: identity.chain_bytes(),
+            seq,
+            issued_at: self.world.now().unix,
+            lease_ms: 300_000,
+            withdraw: self.dice.chance(30),
+            blinds: blinds.collect::<BTreeSet<_>>().into_iter().collect(),
+        };
+        Control::Advert { cost: 0, signed: identity.sign_advert(&body) }
+    }
+
+    fn own_link_state(&mut self, rogue: NodeKey) -> Control {
+        let seq = self.number();
+        let identity = identity(self.world.member(rogue));
+        let id = |node: &NodeKey| self.world.identity(*node).node_id();
+        let routers: BTreeSet<_> = self.routers.iter().map(id).collect();
+        let attached: BTreeSet<_> = self.members.iter().map(|node| id(node).tag()).collect();
+        let body = LinkStateBody {
+            chain: identity.chain_bytes(),
+            seq,
+            issued_at: self.world.now().unix,
+            lease_ms: 300_000,
+            floor: 0,
+            transit: true,
+            routers: routers.into_iter().map(|node| Adjacency { node, cost: 0 }).collect(),
+            attached: attached.into_iter().collect(),
+        };
+        Control::LinkState { signed: identity.sign_link_state(&body) }
+    }
+
+    fn question(&mut self) -> Control {
+        let names = (0..[1, 100][self.dice.below(2)])
+            .map(|_| {
+                let mut name = [0; 32];
+                name[..8].copy_from_slice(&self.dice.number().to_be_bytes());
+                Name(name)
+            })
+            .collect();
+        match self.dice.chance(50) {
+            true => Control::Query { id: self.dice.number(), hops: 0, names },
+            false => Control::Interest { names },
+        }
+    }
+
+    /// A request of its own for a topic that it may not have.
+    fn join(&mut self, rogue: NodeKey) -> Option<Control> {
+        let uses: Vec<_> = self.uses.iter().cloned().collect();
+        let (_, owner, topic) = uses.get(self.dice.below(uses.len().max(1)))?.clone();
+        let identity = identity(self.world.member(rogue));
+        let catalogue = self.dice.chance(50);
+        let mut sink = [0; 16];
+        sink[..8].copy_from_slice(&self.dice.number().to_be_bytes());
+        let body = JoinBody {
+            name: if catalogue { self.world.catalogue_name(owner) } else { self.world.name(owner, &topic) },
+            sink: SinkId(sink),
+            request: Request::Subscribe { describe: false },
+            issued_at: self.world.now().unix,
+            chain: identity.chain_bytes(),
+            reply_key: ReplyKey::generate(Kem::default()).public().clone(),
+        };
+        Some(Control::Join { signed: identity.sign_join(&body) })
+    }
+
+    fn old_list(&mut self) -> Control {
+        let members: Vec<_> = self.members.iter().map(|node| self.world.member(*node).clone()).collect();
+        let der = match self.dice.below(3) {
+            0 => serial_list("umbrella", &[Member { fleet: "umbrella".into(), ..Member::new("x") }], 9),
+            1 => {
+                // Its own CA revokes nodes of the same names.
+                let same: Vec<_> =
+                    members.into_iter().map(|m| Member { fleet: "umbrella".into(), ..m }).collect();
+                revocation_list("umbrella", &same, 9)
+            }
+            _ => self.lists[self.dice.below(self.lists.len())].clone(),
+        };
+        Control::Crl { der }
+    }
+
+    // ---- What must hold.
+
+    /// Lets time pass while the adversary acts; looks at what must hold, unless an honest node has just gone away.
+    fn pass(&mut self, time: Duration, strictly: bool) {
+        let end = self.world.elapsed() + time;
+        while self.world.elapsed() < end {
+            if self.dice.chance(60) {
+                self.act();
+            }
+            self.besiege();
+            self.world.run(TICK.min(end - self.world.elapsed()));
+            if strictly {
+                self.check_granted("nothing happened to an honest node");
+            }
+            self.check_log();
+            self.check_messages();
+        }
+    }
+
+    fn check_granted(&self, when: &str) {
+        for (user, owner, topic) in &self.uses {
+            let status = self.world.status(*user, *owner, topic);
+            assert!(
+                status == Some(JoinStatus::Granted) && self.world.granted(*owner, topic).contains(user),
+                "{when}, and {user:?} stands at {status:?} with {owner:?}:{topic}"
+            );
+        }
+        if self.is_revoked {
+            for node in self.members.iter().chain(&self.routers) {
+                assert!(!self.world.believes(*node, self.thief), "{node:?} believes the thief again");
+            }
+        }
+        for node in &self.members {
+            for other in self.members.iter().chain(&self.routers) {
+                assert!(self.world.believes(*node, *other), "{node:?} does not believe {other:?}");
+            }
+        }
+    }
+
+    /// No honest node is refused anything by another one for want of an allowance, or held for a liar.
+    fn check_log(&mut self) {
+        let honest: BTreeSet<_> = self
+            .members
+            .iter()
+            .chain(&self.routers)
+            .map(|node| self.world.identity(*node).node_id())
+            .collect();
+        let log = self.world.log();
+        for logged in &log[self.looked_at..] {
+            if self.rogues.contains(&logged.node) || logged.node == self.thief {
+                continue;
+            }
+            let What::RouterDrop(dropped) = &logged.what else { continue };
+            if !dropped.peer.is_some_and(|peer| honest.contains(&peer)) {
+                continue;
+            }
+            let fine = match &dropped.reason {
+                // What crossed the word of a revocation, or is of a fleet that this node does not know.
+                DropReason::NotVerified {
+                    why: SignedError::Cert(CertError::Revoked { .. } | CertError::UnknownIssuer),
+                    ..
+                } => true,
+                DropReason::Crl(why) => !why.is_forgery(),
+                reason => !reason.is_suspicious(),
+            };
+            assert!(fine, "{logged:?}");
+        }
+        self.looked_at = log.len();
+    }
+
+    /// Reliable messages arrive in time, each once.
+    fn check_messages(&mut self) {
+        let now = self.world.elapsed();
+        let due: Vec<_> =
+            self.expected.iter().filter(|(_, (_, until))| *until <= now).map(|(id, _)| *id).collect();
+        for id in due {
+            let Some((users, _)) = self.expected.remove(&id) else { continue };
+            let received: Vec<_> =
+                self.world.all_received().iter().filter(|r| r.id == id).map(|r| r.node).collect();
+            let once: BTreeSet<_> = received.iter().copied().collect();
+            let published = &self.world.all_published()[id.0 as usize];
+            assert!(
+                once == users && received.len() == users.len(),
+                "{published:?} reached {received:?}, not {users:?}"
+            );
+        }
+    }
+
+    fn all(&mut self) {
+        self.pass(Duration::from_secs(5), true);
+        for _ in 0..2 {
+            self.share_new();
+        }
+        for _ in 0..self.dice.within(10..=25) {
+            let honest = self.draw_honest();
+            self.do_honestly(honest);
+        }
+        self.pass(MESSAGE_MAX + ms(1000), true);
+        assert!(self.expected.is_empty());
+        assert!(self.actions > 0, "the adversary did nothing");
+    }
+}
+
+/// The same with a bit of body or signature changed.
+fn spoilt(frame: Control) -> Control {
+    let spoil = |signed: Signed| {
+        let mut body = signed.body.to_vec();
+        let at = body.len() / 2;
+        body[at] ^= 1;
+        Signed { body: body.into(), ..signed }
+    };
+    match frame {
+        Control::Advert { cost, signed } => Control::Advert { cost, signed: spoil(signed) },
+        Control::LinkState { signed } => Control::LinkState { signed: spoil(signed) },
+        Control::Join { signed } => Control::Join { signed: spoil(signed) },
+        Control::Answer { signed } => Control::Answer { signed: spoil(signed) },
+        frame => frame,
+    }
+}
+
+/// Runs one seed; on failure says why, with the way there.
+fn run(seed: u64) -> Result<usize, String> {
+    let mut run = Run::new(seed);
+    catch_unwind(AssertUnwindSafe(|| run.all())).map(|()| run.actions).map_err(|panic| {
+        let text = panic.downcast_ref::<String>().cloned();
+        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
+        format!("{}\nseed {seed}: {}", run.world.trace(), text.unwrap_or_default())
+    })
+}
+
+fn seeds() -> Vec<u64> {
+    let Ok(text) = std::env::var("SGC_SEEDS") else { return COMMITTED.to_vec() };
+    let range = text.split_once("..").and_then(|(a, b)| Some(a.parse().ok()?..b.parse().ok()?));
+    match (range, text.parse()) {
+        (Some(range), _) => range.collect(),
+        (None, Ok(one)) => vec![one],
+        (None, Err(_)) => panic!("SGC_SEEDS is {text:?}, not one seed or a range like 100..200"),
+    }
+}
+
+#[test]
+fn an_adversary_takes_nothing_from_honest_nodes_with_an_honest_way() {
+    // A failing seed is told once, with its trace; not a second time with a stack.
+    std::panic::set_hook(Box::new(|_| {}));
+    let mut failed = Vec::new();
+    let mut actions = 0;
+    for seed in seeds() {
+        match run(seed) {
+            Ok(done) => actions += done,
+            Err(why) => {
+                eprintln!("{why}\n");
+                failed.push(seed);
+            }
+        }
+    }
+    let _ = std::panic::take_hook();
+    assert!(failed.is_empty(), "{} seeds fail: {failed:?}", failed.len());
+    eprintln!("{actions} hostile actions");
+}
