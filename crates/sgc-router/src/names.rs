@@ -43,6 +43,8 @@ pub(crate) struct Record {
     digest: [u8; 32],
     /// When its lease is over; of a withdrawal, when nothing that it withdrew verifies any more.
     expires: Instant,
+    /// When half of its lease is over: owners renew after a third.
+    renewal_due: Instant,
     /// Names that no newer one speaks for.
     live: usize,
     /// The link that it came over first.
@@ -364,6 +366,7 @@ impl Router {
             signed: signed.clone(),
             digest,
             expires,
+            renewal_due: now.instant + expires.saturating_duration_since(now.instant) / 2,
             live: 0,
             from: link,
             // Owners tell of changes without being asked.
@@ -1018,6 +1021,8 @@ impl Router {
             let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
                 None => Known::No,
                 Some(record) => match record.asked {
+                    // Who answered first may keep back what came after it.
+                    Some(_) if record.renewal_due <= now.instant => Known::No,
                     Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
                     Some(_) => Known::No,
                     None => Known::Told,

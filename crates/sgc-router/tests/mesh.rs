@@ -438,6 +438,27 @@ fn who_waits_for_a_name_makes_the_router_ask_again_and_again() {
 }
 
 #[test]
+fn an_answer_that_is_not_renewed_in_time_is_asked_of_everyone() {
+    let mut bench = Bench::with(MappingKind::Query, Limits::default());
+    bench.with_proxies();
+    let names = vec![bench.name(&A)];
+    bench.frame(4, Control::Interest { names });
+    bench.with_owner_behind(5000, 9000);
+    assert!(bench.route(&A).is_some());
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(21));
+    assert_eq!(bench.told(), [(1, "query")], "who answered goes on telling");
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(20));
+    assert_eq!(bench.told(), [(1, "query"), (2, "query"), (3, "query")], "half of the lease is over");
+    bench.advert(2, 11, &[A]);
+    bench.sent.clear();
+    bench.pass(Duration::from_secs(20));
+    let asked: Vec<_> = bench.told().into_iter().filter(|(_, what)| *what == "query").collect();
+    assert_eq!(asked, [(2, "query")]);
+}
+
+#[test]
 fn questions_are_bounded() {
     let limits = Limits { queries_burst: 16, interests_per_link_max: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
