@@ -67,7 +67,7 @@ impl Machine {
         self.links += 1;
         let link = LinkId(self.links);
         self.router.handle_link_up(self.now, link, Neighbour::from(peer));
-        let hello = Hello { minor: 0, incarnation: 1, transit };
+        let hello = Hello { minor: 0, incarnation: 1, transit, yields: false, started: UnixMillis(1) };
         self.router.handle_frame(self.now, link, Control::Hello(hello));
         self.drain()?;
         Ok(link)

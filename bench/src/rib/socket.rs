@@ -12,7 +12,7 @@ use rand_core::SeedableRng as _;
 use serde::Serialize;
 use sgc_transport::{AnyLink, Dialer, Link, LinkOptions, LinkUrl};
 use sgc_trust::Identity;
-use sgc_wire::{AdvertBody, AnswerBody, Control, Decode, Encode, Hello, JoinBody, Name, SinkId};
+use sgc_wire::{AdvertBody, AnswerBody, Control, Decode, Encode, Hello, JoinBody, Name, SinkId, UnixMillis};
 use tokio::sync::mpsc;
 
 use super::frames::{BATCH, Member, NAMES_PER_OWNER};
@@ -60,7 +60,7 @@ impl End {
     ) -> Result<Self> {
         let dialer = Dialer::new(identity, LinkOptions::default(), Arc::default());
         let link = dialer.dial(url).await?;
-        let hello = Hello { minor: 0, incarnation: 1, transit: false };
+        let hello = Hello { minor: 0, incarnation: 1, transit: false, yields: false, started: UnixMillis(1) };
         link.send_control(Control::Hello(hello).to_bytes()).await?;
         let reader = link.clone();
         tokio::spawn(async move {
@@ -222,7 +222,7 @@ impl Neighbour {
                 }
             }
         });
-        let hello = Hello { minor: 0, incarnation: 1, transit: true };
+        let hello = Hello { minor: 0, incarnation: 1, transit: true, yields: false, started: UnixMillis(1) };
         runtime.block_on(link.send_control(Control::Hello(hello).to_bytes()))?;
         Ok(Self { told, _link: link, _dialer: dialer, runtime })
     }

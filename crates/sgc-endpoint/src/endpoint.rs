@@ -11,8 +11,8 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
 use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, next_seq, renewal_blind};
 use sgc_wire::{
-    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, Control, Credentials, DescribedType, Metadata, Name,
-    NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
+    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, ClockWatch, Control, Credentials, DescribedType,
+    Metadata, Name, NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
@@ -288,6 +288,7 @@ pub struct Endpoint {
     /// When to look for certificates that have ended.
     pub(crate) enforce_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
+    clock: ClockWatch,
     pub(crate) now: Now,
 }
 
@@ -326,6 +327,7 @@ impl Endpoint {
             renew_at: None,
             enforce_at: None,
             outputs: VecDeque::new(),
+            clock: ClockWatch::new(now),
             now,
         }
     }
@@ -385,6 +387,8 @@ impl Endpoint {
             Control::Query { .. } => self.unexpected("query"),
             Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
             Control::Pulse { .. } => self.unexpected("pulse"),
+            Control::Clock { .. } => self.unexpected("clock"),
+            Control::IdentityInUse { .. } => self.unexpected("identity"),
             Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
                 self.unexpected("lane");
             }
@@ -394,6 +398,11 @@ impl Endpoint {
     /// Time passed.
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
+        if self.clock.was_set(now) {
+            // What was signed by the old time may be refused, and so may what was asked for.
+            self.advertise_all();
+            self.joins.values_mut().for_each(|join| join.retry_refused_by_time(now.instant));
+        }
         if self.renew_at.is_some_and(|at| at <= now.instant) {
             self.advertise_all();
             self.renew_at = None;

@@ -31,6 +31,17 @@ pub enum RefusedBy {
     Router(RejectReason),
 }
 
+impl RefusedBy {
+    /// Returns `true` if a clock that is set right may make it another answer.
+    pub(crate) fn is_about_time(self) -> bool {
+        matches!(
+            self,
+            Self::Owner(RefuseReason::Clock | RefuseReason::Expired)
+                | Self::Router(RejectReason::Clock | RejectReason::Expired)
+        )
+    }
+}
+
 impl std::fmt::Display for RefusedBy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
@@ -231,6 +242,15 @@ impl Join {
         };
         let jitter = wait.mul_f64(f64::from(rng.next_u32() % 1000) / 2000.0);
         self.state = JoinState::ExpectRetry { at: now + wait / 2 + jitter, refused };
+    }
+
+    /// Asks again now if the clocks were the reason of the refusal.
+    pub(crate) fn retry_refused_by_time(&mut self, now: Instant) {
+        if let JoinState::ExpectRetry { at, refused: Some(by) } = &mut self.state
+            && by.is_about_time()
+        {
+            *at = now;
+        }
     }
 
     /// Starts patience afresh.

@@ -85,7 +85,13 @@ fn control() -> Vec<Vec<u8>> {
     let (name, sink, source) = (NAME, SINK, SourceId([3; 16]));
     let signed = Signed { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) };
     let frames = [
-        Control::Hello(Hello { minor: 0, incarnation: 5, transit: true }),
+        Control::Hello(Hello {
+            minor: 0,
+            incarnation: 5,
+            transit: true,
+            yields: false,
+            started: UnixMillis(1),
+        }),
         Control::Advert { cost: 1, signed: signed.clone() },
         Control::Unreach { names: vec![name; 3] },
         Control::Interest { names: vec![name; 2] },

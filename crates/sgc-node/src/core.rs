@@ -3,6 +3,7 @@
 //! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
 //! happens in tasks and threads of its own.
 
+mod alerts;
 mod graph;
 mod nodes;
 mod outputs;
@@ -13,7 +14,7 @@ mod services;
 mod trust;
 mod types;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -32,6 +33,7 @@ use sgc_wire::{Control, Name, NodeId, Now, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
 
+use crate::alerts::{Alerts, clock_alert};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::authority::{Authority, RenewalAnswer};
 use crate::calls::Calls;
@@ -58,8 +60,6 @@ use crate::tap::{Tap, TapError, TapQueue, TapWish};
 
 /// Events that may wait for the control task; who sends more waits.
 pub(crate) const INBOX_MAX: usize = 4096;
-/// Nodes remembered that connected from a new run.
-const SUPERSEDED_MAX: usize = 1024;
 /// Events handled before the timers are looked at again.
 const BATCH_MAX: usize = 256;
 /// How often sources are looked at that may have fallen silent.
@@ -92,6 +92,8 @@ pub(crate) enum CoreEvent {
     LinkDown {
         /// Which.
         id: LinkId,
+        /// The place of another process with this node's identity, if the peer closed the link for it.
+        in_use: Option<String>,
     },
     /// A control frame came.
     Frame {
@@ -267,7 +269,9 @@ pub(crate) struct Core<N: RosNetwork> {
     ros_failures: Arc<Drops>,
     events: mpsc::WeakSender<CoreEvent>,
     started: Instant,
-    superseded: BTreeSet<String>,
+    alerts: Alerts,
+    /// True until the clock has come to where this node's certificate begins.
+    awaits_clock: bool,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
@@ -336,6 +340,7 @@ impl<N: RosNetwork> Core<N> {
     pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
         let (requests, requested) = mpsc::channel(INBOX_MAX);
         let graph = LocalGraph::new(parts.identity.node_name().as_str());
+        let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
         let core = Self {
             identity: parts.identity,
             router: parts.router,
@@ -377,7 +382,8 @@ impl<N: RosNetwork> Core<N> {
             ros_failures: Arc::default(),
             events: parts.events,
             started: Instant::now(),
-            superseded: BTreeSet::new(),
+            alerts: Alerts::default(),
+            awaits_clock,
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
@@ -453,7 +459,7 @@ impl<N: RosNetwork> Core<N> {
                 self.router.handle_link_up(now(), id, neighbour);
                 self.begin_to_look(id);
             }
-            CoreEvent::LinkDown { id } => {
+            CoreEvent::LinkDown { id, in_use } => {
                 self.router.handle_link_down(now(), id);
                 self.control_drops.link_down(id);
                 self.data.drops().link_down(id);
@@ -467,10 +473,20 @@ impl<N: RosNetwork> Core<N> {
                     });
                     entry.flows.values().for_each(|f| f.close());
                 }
+                if let Some(place) = in_use {
+                    self.displaced(&place);
+                }
+            }
+            CoreEvent::Frame { link, frame: Control::IdentityInUse { place }, .. } => {
+                self.kept_out(link, place)
             }
             CoreEvent::Frame { link, frame, room } => {
+                let tells_time = matches!(frame, Control::Clock { .. });
                 self.router.handle_frame(now(), link, frame);
                 drop(room);
+                if tells_time {
+                    self.compare_clocks(link);
+                }
             }
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
@@ -552,6 +568,9 @@ impl<N: RosNetwork> Core<N> {
 
     fn handle_timeouts(&mut self) {
         let now = now();
+        if self.awaits_clock {
+            self.await_clock(now.unix);
+        }
         self.look_at_links(now.instant);
         self.router.handle_timeout(now);
         self.endpoint.handle_timeout(now);
@@ -728,6 +747,7 @@ impl<N: RosNetwork> Core<N> {
                     RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
                 })
                 .collect(),
+            alerts: self.alerts(),
             problems: self.problems(),
             names: names.collect(),
             drops,

@@ -7,6 +7,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 use sgc_wire::{Durability, History, Kind, Liveliness, Reliability, Representations};
 
+use crate::alerts::Alert;
+
 /// Local endpoints in one document.
 pub const GRAPH_ENDPOINTS_MAX: usize = 16_384;
 
@@ -40,6 +42,8 @@ pub struct Graph {
     pub drops: BTreeMap<String, u64>,
     /// What the user was told once.
     pub problems: Vec<String>,
+    /// What an operator has to see to.
+    pub alerts: Vec<Alert>,
 }
 
 /// What an interface is.

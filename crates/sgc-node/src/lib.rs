@@ -7,6 +7,7 @@
 
 mod access;
 pub mod admin;
+pub mod alerts;
 #[cfg(test)]
 mod allocations;
 pub mod audit;

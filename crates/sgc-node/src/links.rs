@@ -230,6 +230,14 @@ async fn passed(noted: Option<(Instant, u64)>) -> u64 {
     }
 }
 
+/// Returns the place of another process with this node's identity, if a peer closed a link for it.
+pub(crate) fn place_in_use(end: &LinkError) -> Option<&str> {
+    match end {
+        LinkError::Closed { by_peer: true, reason: CloseReason::InUse(place) } => Some(place),
+        _ => None,
+    }
+}
+
 /// Waits for a change; for ever if there can be none any more.
 async fn changed<T>(watched: &mut watch::Receiver<T>) {
     if watched.changed().await.is_err() {
@@ -343,7 +351,8 @@ impl Served {
         let end = self.link.closed().await;
         self.lanes.close();
         if let Some(id) = self.id {
-            let _ = core.send(CoreEvent::LinkDown { id }).await;
+            let in_use = place_in_use(&end).map(str::to_owned);
+            let _ = core.send(CoreEvent::LinkDown { id, in_use }).await;
         }
         end
     }
@@ -628,7 +637,7 @@ mod tests {
     use rand_core::OsRng;
     use sgc_transport::{CredentialStore, Dialer, LinkOptions, RefusalKind, TransportMetrics};
     use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
-    use sgc_wire::{Hello, Label};
+    use sgc_wire::{Hello, Label, UnixMillis};
 
     use super::*;
     use crate::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
@@ -667,14 +676,20 @@ mod tests {
                         let id = LinkId(links.len() as u32 + 1);
                         tell.send(Told::Up(id, link.peer().cert.clone())).await.unwrap();
                         if !mute.load(Relaxed) {
-                            let hello = Hello { minor: 0, incarnation: 1, transit: true };
+                            let hello = Hello {
+                                minor: 0,
+                                incarnation: 1,
+                                transit: true,
+                                yields: false,
+                                started: UnixMillis(1),
+                            };
                             assert!(control.send(Control::Hello(hello)));
                         }
                         links.push((link, control));
                         let place = LinkPlace { id, data: Arc::default(), inbox: Inbox::default().share() };
                         assert!(reply.send(Some(place)).is_ok());
                     }
-                    CoreEvent::LinkDown { id } => tell.send(Told::Down(id)).await.unwrap(),
+                    CoreEvent::LinkDown { id, .. } => tell.send(Told::Down(id)).await.unwrap(),
                     CoreEvent::Frame { link, frame: Control::Hello(_), .. }
                         if link.0 > 1 && closes.load(Relaxed) =>
                     {
@@ -826,7 +841,7 @@ mod tests {
         tokio::spawn(keep_accepting(listener, door, stopped));
         let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
-        let hello = Hello { minor: 0, incarnation: 9, transit: false };
+        let hello = Hello { minor: 0, incarnation: 9, transit: false, yields: false, started: UnixMillis(1) };
         link.send_control(Control::Hello(hello).to_bytes()).await.unwrap();
         let heard = async || Control::from_slice(&soon(link.recv_control()).await.unwrap()).unwrap();
         assert!(matches!(heard().await, Control::Hello(_)));

@@ -18,7 +18,7 @@ use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
 };
-use sgc_trust::{AnchorError, Identity, IdentityError};
+use sgc_trust::{AnchorError, CertError, Identity, IdentityError};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -26,6 +26,7 @@ use tracing::{info, warn};
 
 use crate::access::{AccessError, access_with, refused_tokens};
 use crate::admin::{self, Desk};
+use crate::alerts::clock_alert;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
@@ -197,7 +198,8 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
     Identity::parse(&text).map_err(|source| NodeError::Identity { path: path.to_owned(), source })
 }
 
-/// Checks what [`run`] would need of the identity and binds nothing.
+/// Checks what [`run`] would need of the identity and binds nothing. A certificate that has not begun by the clock here is
+/// let pass, see [`clock_alert`](crate::alerts::clock_alert).
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
     let certified = identity.node_name().as_str();
@@ -207,10 +209,11 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
             certified: certified.to_owned(),
         });
     }
-    identity
-        .anchors()
-        .verify(identity.chain(), now().unix)
-        .map_err(|source| NodeError::Certificate { path: config.identity.clone(), source })?;
+    match identity.anchors().verify(identity.chain(), now().unix) {
+        // The clock is behind: it may be set later, as by NTP after the start of a machine without a battery.
+        Ok(_) | Err(CertError::NotYetValid { .. }) => {}
+        Err(source) => return Err(NodeError::Certificate { path: config.identity.clone(), source }),
+    }
     let touches_topics = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
     if identity.fleet_secret().is_none() && touches_topics {
         return Err(NodeError::RouterIdentity);
@@ -253,6 +256,9 @@ pub async fn run(
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
     let identity = Arc::new(check_identity(&config)?);
+    if let Some(alert) = clock_alert(&identity, now().unix) {
+        warn!("{alert}; this node starts all the same and waits: {}", alert.fix());
+    }
     let left = Duration::from_millis(identity.not_after().0.saturating_sub(now().unix.0));
     if left < EXPIRY_WARNING {
         warn!(

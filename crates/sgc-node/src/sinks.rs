@@ -149,6 +149,15 @@ impl LocalSink {
         });
     }
 
+    /// Begins anew with the next grant, as a process that was just started does: what was published until then is not
+    /// asked for.
+    pub(crate) fn begin_anew(&self) {
+        let mut state = self.lock();
+        state.sink = None;
+        state.missed.clear();
+        self.writers.load().values().for_each(|writer| writer.begin_again());
+    }
+
     /// Has what comes from here on wait behind what is released; the turn for that, unless another has it.
     fn begin_release(&self, state: &mut State) -> Option<OwnedMutexGuard<()>> {
         state.releases += 1;

@@ -8,6 +8,7 @@ use sgc_gateway::GatewayStatus;
 use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
+use crate::alerts::Alert;
 use crate::finding::RouterStatus;
 use crate::stats::NameStats;
 
@@ -26,6 +27,8 @@ pub struct Status {
     pub routers: Vec<RouterStatus>,
     /// Shares and uses, and where each stands.
     pub routes: Vec<RouteLine>,
+    /// What an operator has to see to.
+    pub alerts: Vec<Alert>,
     /// What is wrong between local endpoints and the other side, with both values and the fix; gone when it is.
     pub problems: Vec<String>,
     /// Names that carry data through this node.

@@ -8,7 +8,7 @@ use sgc_transport::{
     CloseReason, DialError, Dialer, Link, LinkError, LinkOptions, LinkUrl, TransportMetrics,
 };
 use sgc_trust::Identity;
-use sgc_wire::{Control, Decode, Encode, Hello};
+use sgc_wire::{Control, Decode, Encode, Hello, UnixMillis};
 
 /// How long a router may take to greet and to say goodbye.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
@@ -60,7 +60,13 @@ async fn tell(link: &impl Link, list: Bytes) -> Result<Vec<Bytes>, LinkError> {
     let mut incarnation = [0; 8];
     // Another number than any run of a node has; nothing rests on it.
     incarnation.copy_from_slice(&link.peer().node_id.0[..8]);
-    let hello = Hello { minor: 0, incarnation: u64::from_be_bytes(incarnation), transit: false };
+    let hello = Hello {
+        minor: 0,
+        incarnation: u64::from_be_bytes(incarnation),
+        transit: false,
+        yields: true,
+        started: UnixMillis::default(),
+    };
     link.send_control(Control::Hello(hello).to_bytes()).await?;
     // Its greeting comes first: then it is a node that speaks this protocol.
     while !matches!(Control::from_slice(&link.recv_control().await?), Ok(Control::Hello(_))) {}

@@ -26,5 +26,7 @@ pub use fib::{FibEntry, Tree};
 pub use limits::Limits;
 pub use links::Neighbour;
 pub use mapping::MappingKind;
-pub use router::{DropReason, Dropped, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats};
+pub use router::{
+    DropReason, Dropped, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats, clocks_differ,
+};
 pub use topology::Ways;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
-use sgc_wire::{Hello, Name, NodeId, Now, SinkId, UnixMillis};
+use sgc_wire::{Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
 
 use crate::names::RecordId;
 use crate::tell::Telling;
@@ -54,7 +54,9 @@ pub(crate) struct LinkState {
     /// Its certificates; none for this node itself.
     pub(crate) certs: Arc<[CertId]>,
     may_route: bool,
-    /// When its certificate ends.
+    /// Last moment at which its certificate holds.
+    not_after: UnixMillis,
+    /// When that is by the monotonic clock; a certificate that outlasts the clock never ends.
     pub(crate) expires: Option<Instant>,
     /// Its greeting; nothing else is accepted before it.
     pub(crate) hello: Option<Hello>,
@@ -71,19 +73,29 @@ pub(crate) struct LinkState {
     pub(crate) names: usize,
     /// How far it has been told what was known when it greeted.
     pub(crate) telling: Option<Telling>,
+    /// Its wall clock, as it told it.
+    pub(crate) told_clock: Option<ToldClock>,
+    /// When it was told everything once more because a clock was set.
+    pub(crate) told_again: Option<Instant>,
 }
 
 impl LinkState {
     pub(crate) fn new(now: Now, neighbour: Neighbour) -> Self {
-        let left = Duration::from_millis(neighbour.not_after.0.saturating_sub(now.unix.0));
-        Self {
+        let mut state = Self {
             certs: neighbour.certs,
             may_route: neighbour.may_route,
-            // One that outlasts the clock never ends.
-            expires: now.instant.checked_add(left),
+            not_after: neighbour.not_after,
             cost: Cost::new(neighbour.cost),
             ..Self::local(neighbour.node)
-        }
+        };
+        state.set_expiry(now);
+        state
+    }
+
+    /// Reckons when the certificate ends, by the clocks as they are now.
+    pub(crate) fn set_expiry(&mut self, now: Now) {
+        let left = Duration::from_millis(self.not_after.0.saturating_sub(now.unix.0));
+        self.expires = now.instant.checked_add(left);
     }
 
     /// The link to this node's own endpoint.
@@ -92,6 +104,7 @@ impl LinkState {
             node,
             certs: Arc::new([]),
             may_route: false,
+            not_after: UnixMillis(u64::MAX),
             expires: None,
             hello: None,
             cost: Cost::new(Some(0)),
@@ -101,6 +114,8 @@ impl LinkState {
             follows: BTreeMap::new(),
             names: 0,
             telling: None,
+            told_clock: None,
+            told_again: None,
         }
     }
 

@@ -828,6 +828,14 @@ impl Router {
         }
     }
 
+    /// Tells a neighbour once more of the names that it asked for: it did not believe what it was told.
+    pub(crate) fn tell_interested_again(&mut self, link: LinkId) {
+        let Some(state) = self.links.get_mut(&link) else { return };
+        let names: Vec<_> = state.interests.keys().copied().collect();
+        state.interests.values_mut().for_each(|told| *told = None);
+        self.tell_interested(link, &names);
+    }
+
     /// Tells one who is interested what is news of these names: each advertisement once.
     fn tell_interested(&mut self, link: LinkId, names: &[Name]) {
         let mut adverts = BTreeMap::new();

@@ -8,8 +8,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{CrlError, Identity, SignedError, TrustAnchors};
-use sgc_wire::{Control, Hello, Name, NodeId, Now, SinkId, UnixMillis};
+use sgc_trust::{CLOCK_SKEW_MAX, CrlError, Identity, SignedError, TrustAnchors};
+use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::FibEntry;
@@ -40,6 +40,14 @@ const LINKS_MAX: usize = sgc_wire::ADJACENCIES_MAX + sgc_wire::ATTACHED_MAX;
 
 /// Allowances that are kept without looking whether they are of use.
 const ALLOWANCES_MIN: usize = 1024;
+
+/// Least time until a neighbour is told everything once more because a clock was set.
+const TELL_AGAIN_EVERY: Duration = Duration::from_secs(60);
+
+/// Returns `true` if bodies that one of two nodes signs are not believed by the other, for their clocks.
+pub fn clocks_differ(ahead_ms: i64) -> bool {
+    ahead_ms.unsigned_abs() > CLOCK_SKEW_MAX.as_millis() as u64
+}
 
 /// What a router is made of.
 #[derive(Clone, Debug)]
@@ -104,9 +112,15 @@ pub enum Output {
 /// Why a link is closed.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum LinkClose {
-    /// The node greeted on a newer link from another run of its process.
-    #[error("the node connected again from a new run; this link is of the old one")]
-    Superseded,
+    /// Another run of the node has the place of this one.
+    #[error("the node's identity is in use at another place")]
+    Superseded {
+        /// The link of the other run, if it is here; otherwise the other run is linked to another router.
+        by: Option<LinkId>,
+        /// True if the run that is closed is known to live: it came back after it was superseded once. The process of
+        /// a run that just greeted anew is mostly gone.
+        alive: bool,
+    },
     /// A frame came before the greeting, or a second greeting.
     #[error("the peer did not greet as the protocol says")]
     Greeting,
@@ -196,6 +210,18 @@ pub enum DropReason {
     /// A revocation list that is not believed.
     #[error("revocation list not believed: {0}")]
     Crl(CrlError),
+    /// A signed body from a clock that is not near the one here.
+    #[error(
+        "{what} signed at {signed}, which is not near {now}: one of the two clocks is wrong, or it is a replay"
+    )]
+    Clock {
+        /// Advertisement, join or link state.
+        what: &'static str,
+        /// The time in the body.
+        signed: UnixMillis,
+        /// The time here.
+        now: UnixMillis,
+    },
     /// A neighbour says that it is a router, and its certificate does not.
     #[error(
         "says that it carries others' names, but its certificate does not let it: enroll it with --router or --may-route"
@@ -213,6 +239,7 @@ impl DropReason {
             | Self::Limit { .. }
             | Self::StaleFlood
             | Self::Crl(_)
+            | Self::Clock { .. }
             | Self::NotRouter => true,
             Self::Stale { .. } | Self::Unknown { .. } | Self::WrongWay { .. } | Self::NoLink => false,
         }
@@ -231,6 +258,7 @@ impl DropReason {
             Self::WrongWay { .. } => "wrong_way",
             Self::NoLink => "no_link",
             Self::Crl(_) => "crl",
+            Self::Clock { .. } => "clock",
             Self::NotRouter => "not_router",
         }
     }
@@ -273,6 +301,9 @@ pub struct Router {
     /// When to pass on what was beyond the allowance of its signer.
     pub(crate) late_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
+    /// True once another run of this node took over from this one.
+    yields: bool,
+    clock: ClockWatch,
     /// As the driver said last.
     pub(crate) now: Now,
 }
@@ -281,7 +312,13 @@ impl Router {
     /// A router with nothing but its local link.
     pub fn new(config: RouterConfig, now: Now) -> Self {
         let mut local = LinkState::local(config.node);
-        local.hello = Some(Hello { minor: 0, incarnation: config.incarnation, transit: false });
+        local.hello = Some(Hello {
+            minor: 0,
+            incarnation: config.incarnation,
+            transit: false,
+            yields: false,
+            started: config.started,
+        });
         let mut topology = Topology::default();
         topology.begin(now.instant, config.transit);
         Self {
@@ -299,6 +336,8 @@ impl Router {
             early_at: None,
             late_at: None,
             outputs: VecDeque::new(),
+            yields: false,
+            clock: ClockWatch::new(now),
             now,
         }
     }
@@ -325,8 +364,15 @@ impl Router {
         of_node.push(link);
         of_node.sort_unstable();
         self.links.insert(link, LinkState::new(now, neighbour));
-        let hello = Hello { minor: 0, incarnation: self.config.incarnation, transit: self.config.transit };
+        let hello = Hello {
+            minor: 0,
+            incarnation: self.config.incarnation,
+            transit: self.config.transit,
+            yields: self.yields,
+            started: self.config.started,
+        };
         self.send(link, Control::Hello(hello));
+        self.send(link, Control::Clock { time: now.unix });
         // Before anything that they bear on.
         for der in self.config.anchors.crls().cloned().collect::<Vec<_>>() {
             self.send(link, Control::Crl { der });
@@ -382,6 +428,9 @@ impl Router {
                 self.drop_frame(link, DropReason::Unknown { what: "label" });
             }
             Control::Pulse { .. } => self.drop_frame(link, DropReason::Unknown { what: "pulse" }),
+            Control::Clock { time } => self.handle_clock(now, link, time),
+            // What it says is for the operator alone.
+            Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),
             Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "lane" });
             }
@@ -401,6 +450,9 @@ impl Router {
     /// Time passed.
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
+        if self.clock.was_set(now) {
+            self.clock_was_set(now);
+        }
         self.close_expired(now);
         self.retry_crls(now);
         self.expire_nodes(now);
@@ -438,6 +490,23 @@ impl Router {
         self.now = now;
         self.config.identity = identity;
         self.topology.touch_own(now.instant);
+    }
+
+    /// A peer closed a link because another run of this node has its place. From here on this run takes over from no
+    /// other: where two processes have one identity, the one that was started last keeps its links, and the other has
+    /// them when that one is gone.
+    pub fn handle_superseded(&mut self) {
+        self.yields = true;
+    }
+
+    /// Returns `true` once another run of this node has superseded this one.
+    pub fn yields(&self) -> bool {
+        self.yields
+    }
+
+    /// Returns by how many milliseconds the clock of a link's peer is ahead of the one here, as the peer told it.
+    pub fn clock_ahead_ms(&self, link: LinkId) -> Option<i64> {
+        Some(self.links.get(&link)?.told_clock?.ahead_ms(self.now))
     }
 
     /// How much is known.
@@ -479,34 +548,71 @@ impl Router {
         if hello.transit && !to_router {
             self.drop_frame(link, DropReason::NotRouter);
         }
-        // Greetings of two runs may cross; the newer link is that of the newer run.
-        let mut runs: Vec<_> = self
-            .links
-            .iter()
-            .filter(|(l, s)| {
-                **l == link
-                    || **l != LinkId::LOCAL
-                        && s.node == node
-                        && s.hello.is_some_and(|h| h.incarnation != hello.incarnation)
-            })
-            .map(|(l, _)| *l)
-            .collect();
-        let newest = runs.pop();
-        if newest != Some(link) {
-            runs = vec![link];
+        let is_other = |s: &LinkState| s.hello.is_some_and(|h| h.incarnation != hello.incarnation);
+        let of_node = self.links_of.get(&node).into_iter().flatten().copied();
+        let others: SmallVec<[LinkId; 2]> =
+            of_node.filter(|l| *l != link && self.links.get(l).is_some_and(is_other)).collect();
+        // Greetings of two runs may cross; the newer link is that of the newer run, unless that run knows of another.
+        let newest = others.iter().max().copied();
+        let elsewhere = hello.yields && self.topology.is_elsewhere(&self.config.node, &node, hello.started);
+        if elsewhere || newest.is_some_and(|newest| hello.yields || newest > link) {
+            return self.supersede(link, newest, hello.yields);
         }
-        for old in runs {
-            self.outputs.push_back(Output::Close { link: old, reason: LinkClose::Superseded });
-            self.forget_link(old);
+        for old in others {
+            let alive = self.links.get(&old).and_then(|s| s.hello).is_some_and(|h| h.yields);
+            self.supersede(old, Some(link), alive);
         }
-        if newest != Some(link) {
-            return;
-        }
-        if to_router {
+        self.tell_all(link);
+        self.links_changed(self.now.instant);
+    }
+
+    /// Tells a neighbour what it is to know of this node, and of the network if it is a router.
+    fn tell_all(&mut self, link: LinkId) {
+        if self.links.get(&link).is_some_and(LinkState::is_transit) {
             self.begin_telling(link);
         }
         self.send_interests(link);
-        self.links_changed(self.now.instant);
+    }
+
+    /// Closes the link of a run whose place another one has.
+    pub(crate) fn supersede(&mut self, link: LinkId, by: Option<LinkId>, alive: bool) {
+        self.outputs.push_back(Output::Close { link, reason: LinkClose::Superseded { by, alive } });
+        self.forget_link(link);
+    }
+
+    fn handle_clock(&mut self, now: Now, link: LinkId, time: UnixMillis) {
+        let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return };
+        let told = ToldClock::new(time, now);
+        let was_wrong = state.told_clock.replace(told).is_some_and(|old| clocks_differ(old.ahead_ms(now)));
+        // One of the two refused what the other signed until now, and would hear of it with the next lease only.
+        if was_wrong && !clocks_differ(told.ahead_ms(now)) {
+            self.tell_again(now, link);
+        }
+    }
+
+    /// The wall clock here was set: peers are told, and what was signed by the old time is signed anew.
+    fn clock_was_set(&mut self, now: Now) {
+        let links: Vec<_> = self.links.keys().filter(|l| **l != LinkId::LOCAL).copied().collect();
+        for link in links {
+            if let Some(state) = self.links.get_mut(&link) {
+                state.set_expiry(now);
+            }
+            self.send(link, Control::Clock { time: now.unix });
+            self.tell_again(now, link);
+        }
+        self.early_at = self.early_at.map(|_| now.instant);
+        self.links_changed(now.instant);
+    }
+
+    /// Tells a neighbour what it was told when it greeted, at most once in [`TELL_AGAIN_EVERY`].
+    fn tell_again(&mut self, now: Now, link: LinkId) {
+        let Some(state) = self.links.get_mut(&link).filter(|s| s.hello.is_some()) else { return };
+        if state.told_again.is_some_and(|at| now.instant.saturating_duration_since(at) < TELL_AGAIN_EVERY) {
+            return;
+        }
+        state.told_again = Some(now.instant);
+        self.tell_all(link);
+        self.tell_interested_again(link);
     }
 
     /// Takes back everything that came over or goes over `link`.

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, next_seq, signed_digest, verify_link_state};
-use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed};
+use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed, UnixMillis};
 
 use crate::links::LinkState;
 use crate::memory::Memory;
@@ -156,6 +156,14 @@ impl Topology {
         Ways { routers: self.paths.len(), searches: self.searches, changed: self.ways_changed }
     }
 
+    /// Returns `true` if a later run of a node than the one that `started` then is linked to another router than `own`,
+    /// and that router says so, too.
+    pub(crate) fn is_elsewhere(&self, own: &NodeId, node: &NodeId, started: UnixMillis) -> bool {
+        let Some(record) = self.nodes.get(node).filter(|r| r.floor > started.0) else { return false };
+        let says = |at: &Adjacency| self.nodes.get(&at.node).is_some_and(|r| r.says(node, record.transit));
+        record.routers.iter().any(|at| at.node != *own && self.paths.contains_key(&at.node) && says(at))
+    }
+
     fn search(&mut self, now: Instant, root: NodeId) {
         self.search_at = None;
         self.searched = Some(now);
@@ -277,6 +285,9 @@ impl Router {
         self.topology.insert(now.instant, node, record, nodes_max);
         self.topology.touch(now.instant);
         self.void_names(&node, floor);
+        if node != neighbour {
+            self.supersede_runs_before(&node, floor);
+        }
         self.pass_on_node_or_wait(link, &node);
     }
 
@@ -290,6 +301,20 @@ impl Router {
             self.send(link, Control::LinkState { signed });
         }
         self.drop_frame(link, DropReason::Stale { seq, known });
+    }
+
+    /// Closes the links of earlier runs of a node whose latest one describes itself at another router.
+    fn supersede_runs_before(&mut self, node: &NodeId, floor: u64) {
+        let of_node = self.links_of.get(node).into_iter().flatten().copied();
+        let earlier = |link: &LinkId| {
+            let hello = self.links.get(link).and_then(|s| s.hello);
+            hello.is_some_and(|h| h.started.0 < floor)
+        };
+        let earlier: Vec<_> = of_node.filter(earlier).collect();
+        for link in earlier {
+            let alive = self.links.get(&link).and_then(|s| s.hello).is_some_and(|h| h.yields);
+            self.supersede(link, None, alive);
+        }
     }
 
     /// Describes this node, if that is due: to all routers that it is linked to.

@@ -143,7 +143,13 @@ impl Router {
         };
         // Those two cost no verification, and a router may well bring many of them.
         let is_cheap = matches!(why, SignedError::Clock { .. } | SignedError::Cert(CertError::UnknownIssuer));
-        self.drop_frame(link, DropReason::NotVerified { what, why });
+        self.drop_frame(
+            link,
+            match why {
+                SignedError::Clock { signed, now } => DropReason::Clock { what, signed, now },
+                why => DropReason::NotVerified { what, why },
+            },
+        );
         if !honest {
             self.count_forgery(now, link);
         } else if !is_cheap {

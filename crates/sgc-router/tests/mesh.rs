@@ -9,12 +9,18 @@ use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Identity, name_of};
 use sgc_wire::{
     Adjacency, AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Hello, JoinBody, LinkStateBody, Name,
-    NodeId, RejectReason, Request, SinkId,
+    NodeId, RejectReason, Request, SinkId, UnixMillis,
 };
 
 const A: Blind = Blind([0xa; 32]);
 const B: Blind = Blind([0xb; 32]);
 const LEASE: Duration = Duration::from_secs(60);
+
+/// The greeting of a run with this number.
+fn hello(incarnation: u64, transit: bool) -> Control {
+    let started = UnixMillis(incarnation);
+    Control::Hello(Hello { minor: 0, incarnation, transit, yields: false, started })
+}
 
 fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
@@ -83,7 +89,7 @@ impl Bench {
     fn up(&mut self, link: u32, node: &Identity, transit: bool, cost: u32) {
         let neighbour = Neighbour { cost: Some(cost), ..Neighbour::from(node.as_peer()) };
         self.router.handle_link_up(self.clock.now(), LinkId(link), neighbour);
-        self.frame(link, Control::Hello(Hello { minor: 0, incarnation: link.into(), transit }));
+        self.frame(link, hello(link.into(), transit));
     }
 
     fn drain(&mut self) {
@@ -869,9 +875,8 @@ fn a_newer_run_supersedes_and_an_older_one_that_greets_late_does_not() {
     for link in [10, 11] {
         bench.router.handle_link_up(bench.clock.now(), LinkId(link), neighbour.clone());
     }
-    let hello = |incarnation| Control::Hello(Hello { minor: 0, incarnation, transit: false });
-    bench.frame(11, hello(2));
-    bench.frame(10, hello(1));
+    bench.frame(11, hello(2, false));
+    bench.frame(10, hello(1, false));
     let interest = Control::Interest { names: vec![bench.name(&A)] };
     bench.frame(10, interest.clone());
     assert_eq!(bench.dropped, ["no_link"]);

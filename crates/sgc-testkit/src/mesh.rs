@@ -685,7 +685,7 @@ fn weigh(frame: &Control) -> (&'static str, usize) {
         Control::Advert { signed: s, .. } => ("advert", 4 + signed(s)),
         Control::Join { signed: s } => ("join", signed(s)),
         Control::Answer { signed: s } => ("answer", signed(s)),
-        Control::Hello(Hello { .. }) => ("hello", 12),
+        Control::Hello(Hello { .. }) => ("hello", 21),
         Control::Query { names, .. } => ("query", 14 + 32 * names.len()),
         Control::Interest { names } => ("interest", 5 + 32 * names.len()),
         other => ("other", other.to_bytes().len()),
@@ -705,7 +705,13 @@ mod tests {
             Control::Advert { cost: 3, signed: signed.clone() },
             Control::Join { signed: signed.clone() },
             Control::Answer { signed },
-            Control::Hello(Hello { minor: 0, incarnation: 7, transit: true }),
+            Control::Hello(Hello {
+                minor: 0,
+                incarnation: 7,
+                transit: true,
+                yields: false,
+                started: UnixMillis(8),
+            }),
             Control::Query { id: 1, hops: 2, names: names.clone() },
             Control::Interest { names },
         ] {

@@ -136,7 +136,8 @@ pub(crate) struct Node {
 pub(crate) enum Arrival {
     Frame(LinkId, Control),
     Packet(LinkId, Packet),
-    LinkDown(LinkId),
+    /// True if the peer says that another run of this node has its place.
+    LinkDown(LinkId, bool),
     /// What its driver measures.
     Quality(LinkId, Duration, bool),
 }
@@ -295,7 +296,14 @@ impl Running {
         match arrival {
             Arrival::Frame(link, frame) => self.router.handle_frame(now, link, frame),
             Arrival::Packet(link, packet) => self.forward(now, link, packet),
-            Arrival::LinkDown(link) => self.link_down(now, link),
+            Arrival::LinkDown(link, superseded) => {
+                if superseded {
+                    self.router.handle_superseded();
+                    // What the other run gave to local programs is not to be asked for.
+                    self.sinks.values_mut().for_each(|local| local.sink = None);
+                }
+                self.link_down(now, link);
+            }
             Arrival::Quality(link, round_trip, suspect) => {
                 self.router.handle_link_quality(now, link, round_trip, suspect);
             }

@@ -107,12 +107,23 @@ impl World {
 
     /// Sets a node's wall clock ahead of the true time.
     pub fn set_ahead(&mut self, node: NodeKey, by: Duration) {
-        self.nodes[node.0].skew_ms = by.as_millis() as i64;
+        self.set_clock(node, by.as_millis() as i64);
     }
 
     /// Sets a node's wall clock behind the true time.
     pub fn set_behind(&mut self, node: NodeKey, by: Duration) {
-        self.nodes[node.0].skew_ms = -(by.as_millis() as i64);
+        self.set_clock(node, -(by.as_millis() as i64));
+    }
+
+    /// Sets a node's wall clock, which its driver looks at all the time.
+    fn set_clock(&mut self, node: NodeKey, skew_ms: i64) {
+        self.nodes[node.0].skew_ms = skew_ms;
+        let now = self.now_at(node);
+        let Node { running, frozen: None, .. } = &mut self.nodes[node.0] else { return };
+        if let Some(running) = running {
+            running.handle_timeout(now);
+            self.settle(node);
+        }
     }
 
     /// The present, as a node's clocks show it.

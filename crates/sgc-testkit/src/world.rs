@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, PackedType, Wish};
-use sgc_router::{LinkId, MappingKind, Neighbour, RouterStats};
+use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, LinkStateBody, Metadata,
@@ -71,10 +71,27 @@ impl WorldConfig {
 }
 
 enum Pending {
-    Frame { wire: usize, to: usize, bytes: Vec<u8> },
-    Packet { wire: usize, to: usize, packet: Packet },
-    LinkDown { wire: usize, to: usize },
-    Quality { wire: usize, to: usize, suspect: bool },
+    Frame {
+        wire: usize,
+        to: usize,
+        bytes: Vec<u8>,
+    },
+    Packet {
+        wire: usize,
+        to: usize,
+        packet: Packet,
+    },
+    /// The far end is gone; `superseded` if it closed because another run of the node has its place.
+    LinkDown {
+        wire: usize,
+        to: usize,
+        superseded: bool,
+    },
+    Quality {
+        wire: usize,
+        to: usize,
+        suspect: bool,
+    },
 }
 
 /// How much a trace holds; the environment variable `SGC_TRACE` may ask for more.
@@ -334,7 +351,7 @@ impl World {
         for to in 0..2 {
             let idle = if self.wires[wire].ends[to].node == a { a_idle } else { b_idle };
             self.queue(self.clock.instant() + SUSPECT_AFTER, Pending::Quality { wire, to, suspect: true });
-            self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to });
+            self.queue(self.clock.instant() + idle, Pending::LinkDown { wire, to, superseded: false });
         }
     }
 
@@ -668,6 +685,20 @@ impl World {
         self.nodes[node.0].running.as_ref().map(|r| r.router.stats()).unwrap_or_default()
     }
 
+    /// By how many milliseconds the clock of a neighbour is ahead of a node's, as the node was told.
+    pub fn clock_ahead_ms(&self, node: NodeKey, neighbour: NodeKey) -> Option<i64> {
+        let running = self.nodes[node.0].running.as_ref()?;
+        let is_there = |(wire, side): &(usize, usize)| self.wires[*wire].ends[1 - side].node == neighbour;
+        let link = running.links.iter().find(|(_, end)| is_there(end)).map(|(link, _)| *link)?;
+        running.router.clock_ahead_ms(link)
+    }
+
+    /// True if a node is linked to a neighbour.
+    pub fn is_linked(&self, node: NodeKey, neighbour: NodeKey) -> bool {
+        let links = self.nodes[node.0].running.iter().flat_map(|r| r.links.values());
+        links.into_iter().any(|(wire, side)| self.wires[*wire].ends[1 - side].node == neighbour)
+    }
+
     /// Names with a forwarding entry at a node.
     pub fn forwarding(&self, node: NodeKey) -> Vec<Name> {
         self.nodes[node.0].running.iter().flat_map(|r| r.fib.keys().copied()).collect()
@@ -878,23 +909,23 @@ impl World {
         for (wire, side) in running.links.into_values() {
             self.wires[wire].ends[side].up = false;
             if in_order {
-                self.hang_up(wire, side);
+                self.hang_up(wire, side, false);
             } else if self.wires[wire].carries {
                 self.wires[wire].carries = false;
                 let (at, to) = (self.clock.instant(), 1 - side);
                 self.queue(at + SUSPECT_AFTER, Pending::Quality { wire, to, suspect: true });
-                self.queue(at + idle, Pending::LinkDown { wire, to });
+                self.queue(at + idle, Pending::LinkDown { wire, to, superseded: false });
                 self.unplug(wire);
             }
         }
     }
 
     /// Tells the far end, behind all that was sent before, that this end closed.
-    fn hang_up(&mut self, wire: usize, side: usize) {
+    fn hang_up(&mut self, wire: usize, side: usize, superseded: bool) {
         self.wires[wire].ends[side].up = false;
         if self.wires[wire].carries {
             let at = self.arrival(wire, side);
-            self.queue(at, Pending::LinkDown { wire, to: 1 - side });
+            self.queue(at, Pending::LinkDown { wire, to: 1 - side, superseded });
         }
         self.unplug(wire);
     }
@@ -1014,7 +1045,7 @@ impl World {
             Pending::Frame { wire, to, .. }
             | Pending::Packet { wire, to, .. }
             | Pending::Quality { wire, to, .. }
-            | Pending::LinkDown { wire, to } => (*wire, *to),
+            | Pending::LinkDown { wire, to, .. } => (*wire, *to),
         };
         let Wire { carries, ends, .. } = &mut self.wires[wire];
         let end = &mut ends[to];
@@ -1044,9 +1075,9 @@ impl World {
                 let cable = self.wires[wire].cable;
                 Arrival::Quality(link, 2 * self.cables[cable].latency, suspect)
             }
-            Pending::LinkDown { .. } => {
+            Pending::LinkDown { superseded, .. } => {
                 self.unplug(wire);
-                Arrival::LinkDown(link)
+                Arrival::LinkDown(link, superseded)
             }
         };
         self.arrive(node, arrival);
@@ -1093,12 +1124,13 @@ impl World {
                 }
             }
             Effect::Close(link, reason) => {
+                let superseded = matches!(reason, LinkClose::Superseded { .. });
                 self.write_log(node, What::Closed { reason });
                 let now = self.now_at(node);
                 let Some(running) = &mut self.nodes[node.0].running else { return };
                 if let Some((wire, side)) = running.links.get(&link).copied() {
                     running.link_down(now, link);
-                    self.hang_up(wire, side);
+                    self.hang_up(wire, side, superseded);
                 }
             }
             Effect::Delivered { owner, topic, id, use_number } => {

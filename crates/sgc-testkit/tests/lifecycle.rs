@@ -152,7 +152,8 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
     world.start(arm);
     world.run(ms(500));
     let closed = |l: &&sgc_testkit::Logged| {
-        l.node == cloud && matches!(l.what, What::Closed { reason: LinkClose::Superseded })
+        l.node == cloud
+            && matches!(l.what, What::Closed { reason: LinkClose::Superseded { alive: false, .. } })
     };
     assert_eq!(world.log().iter().filter(closed).count(), 1);
 }

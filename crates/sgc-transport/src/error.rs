@@ -47,6 +47,9 @@ pub enum CloseReason {
     /// The node that is told so did not answer.
     #[error("no answer came")]
     Silent,
+    /// Another process uses the identity of the node that is told so, at this place, and has its links.
+    #[error("the identity is in use at another place: {0}")]
+    InUse(String),
     /// A reason that this version does not know.
     #[error("reason {code}: {text}")]
     Other {
@@ -73,6 +76,7 @@ impl CloseReason {
             Self::Revoked => (5, ""),
             Self::Expired => (6, ""),
             Self::Silent => (7, ""),
+            Self::InUse(place) => (8, place.as_str()),
             Self::Other { code, text } => (u32::try_from(*code).unwrap_or(u32::MAX), text.as_str()),
         };
         (code, printable(text.as_bytes()))
@@ -88,6 +92,7 @@ impl CloseReason {
             5 => Self::Revoked,
             6 => Self::Expired,
             7 => Self::Silent,
+            8 => Self::InUse(printable(text)),
             code => Self::Other { code, text: printable(text) },
         }
     }
@@ -544,6 +549,13 @@ impl fmt::Display for Closing<'_> {
         let what = match reason {
             CloseReason::Revoked => "certificate was revoked",
             CloseReason::Expired => "certificate expired",
+            CloseReason::InUse(place) if *by_peer => {
+                return write!(
+                    f,
+                    "closed by the peer: this node's identity is in use at another place: {place}; stop one of the two, or \
+                     enroll its machine under a name of its own"
+                );
+            }
             reason if *by_peer => return write!(f, "closed by the peer: {reason}"),
             reason => return write!(f, "closed by this node: {reason}"),
         };
@@ -575,6 +587,8 @@ mod tests {
             CloseReason::Overloaded,
             CloseReason::Revoked,
             CloseReason::Expired,
+            CloseReason::Silent,
+            CloseReason::InUse("203.0.113.5:7447".into()),
             CloseReason::Other { code: 77, text: "z".into() },
         ] {
             let (code, text) = reason.to_wire();

@@ -4,6 +4,8 @@
 //! ([`Signed`]), so that no re-encoding can change what a signature covers. Checking signatures is
 //! `sgc-trust`'s, acting on frames `sgc-router`'s and `sgc-endpoint`'s.
 
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
@@ -171,6 +173,43 @@ pub enum Control {
         /// Name.
         name: Name,
     },
+    /// The sender's wall clock. Between the two nodes of a link alone: first behind the greeting, and again after the
+    /// clock was set. A hint that is shown to operators; nothing is set or believed by it.
+    Clock {
+        /// The time when the frame was made.
+        time: UnixMillis,
+    },
+    /// Another process uses the identity of the node that is told so, and was refused. Between the two nodes of a link
+    /// alone. A hint that is shown to operators.
+    IdentityInUse {
+        /// The place of the other process, as the sender sees it.
+        place: Place,
+    },
+}
+
+/// An address and a port of a node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Place {
+    /// The address; IPv4 addresses are mapped into IPv6 (RFC 4291, 2.5.5.2).
+    pub ip: [u8; 16],
+    /// The port.
+    pub port: u16,
+}
+
+impl From<SocketAddr> for Place {
+    fn from(address: SocketAddr) -> Self {
+        let ip = match address.ip() {
+            IpAddr::V4(v4) => v4.to_ipv6_mapped(),
+            IpAddr::V6(v6) => v6,
+        };
+        Self { ip: ip.octets(), port: address.port() }
+    }
+}
+
+impl From<Place> for SocketAddr {
+    fn from(place: Place) -> Self {
+        Self::new(Ipv6Addr::from(place.ip).to_canonical(), place.port)
+    }
 }
 
 /// The first frame of a link.
@@ -182,6 +221,10 @@ pub struct Hello {
     pub incarnation: u64,
     /// True for a router, which carries others' names; false for a node that only serves itself.
     pub transit: bool,
+    /// True if another run of this node has taken a link of this one over: this run takes over from nobody.
+    pub yields: bool,
+    /// When this run began, by its own clock: the floor in its link states.
+    pub started: UnixMillis,
 }
 
 /// What a sink asks to be sent again. What a source no longer has, it does not send.
@@ -673,6 +716,8 @@ impl Encode for Control {
                 w.u16(hello.minor);
                 w.u64(hello.incarnation);
                 w.bool(hello.transit);
+                w.bool(hello.yields);
+                hello.started.encode(w);
             }
             Self::Advert { cost, signed } => {
                 w.u8(2);
@@ -771,6 +816,15 @@ impl Encode for Control {
                 w.u8(25);
                 name.encode(w);
             }
+            Self::Clock { time } => {
+                w.u8(26);
+                time.encode(w);
+            }
+            Self::IdentityInUse { place } => {
+                w.u8(27);
+                w.raw(&place.ip);
+                w.u16(place.port);
+            }
         }
     }
 }
@@ -778,7 +832,13 @@ impl Encode for Control {
 impl Decode for Control {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Ok(match r.u8()? {
-            1 => Self::Hello(Hello { minor: r.u16()?, incarnation: r.u64()?, transit: r.bool("transit")? }),
+            1 => Self::Hello(Hello {
+                minor: r.u16()?,
+                incarnation: r.u64()?,
+                transit: r.bool("transit")?,
+                yields: r.bool("yields")?,
+                started: UnixMillis::decode(r)?,
+            }),
             2 => Self::Advert { cost: r.u32()?, signed: Signed::decode(r)? },
             3 => Self::Unreach { names: decode_names(r)? },
             4 => Self::Interest { names: decode_names(r)? },
@@ -810,6 +870,8 @@ impl Decode for Control {
             23 => Self::LaneOffer { token: LaneToken::decode(r)?, name: Name::decode(r)? },
             24 => Self::LaneAnswer { token: LaneToken::decode(r)?, accepted: r.bool("accepted")? },
             25 => Self::LaneWanted { name: Name::decode(r)? },
+            26 => Self::Clock { time: UnixMillis::decode(r)? },
+            27 => Self::IdentityInUse { place: Place { ip: r.array("address")?, port: r.u16()? } },
             v => return Err(DecodeError::value("control frame", v.into())),
         })
     }
@@ -825,7 +887,13 @@ mod tests {
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
         let label = Label::new(LABELS_MAX - 1).unwrap();
         vec![
-            Control::Hello(Hello { minor: 3, incarnation: 9, transit: true }),
+            Control::Hello(Hello {
+                minor: 3,
+                incarnation: 9,
+                transit: true,
+                yields: false,
+                started: UnixMillis(78),
+            }),
             Control::Advert { cost: 2, signed: signed.clone() },
             Control::Unreach { names: vec![name; 3] },
             Control::Interest { names: vec![name] },
@@ -847,6 +915,8 @@ mod tests {
             Control::LaneOffer { token: LaneToken([4; 16]), name },
             Control::LaneAnswer { token: LaneToken([4; 16]), accepted: true },
             Control::LaneWanted { name },
+            Control::Clock { time: UnixMillis(79) },
+            Control::IdentityInUse { place: Place { ip: [5; 16], port: 7447 } },
         ]
     }
 

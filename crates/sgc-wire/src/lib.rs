@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod catalogue;
+mod clock;
 mod codec;
 mod control;
 mod ids;
@@ -21,13 +22,14 @@ pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
     GRANT_SOURCES_MAX, GrantContent, SECRET_GENERATIONS_MAX, SecretGeneration, SourceAnnounce, TopicGrant,
 };
+pub use clock::{ClockWatch, ToldClock};
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use control::{
     ADJACENCIES_MAX, ADVERT_NAMES_MAX, ASK_BYTES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer,
     AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX,
-    Control, Hello, JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, REPLY_KEY_BYTES_MAX, Recover, RefuseReason,
-    RejectReason, Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX, Signed,
-    SourceOffer,
+    Control, Hello, JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, Place, REPLY_KEY_BYTES_MAX, Recover,
+    RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX,
+    Signed, SourceOffer,
 };
 pub use ids::{
     Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,

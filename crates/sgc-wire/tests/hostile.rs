@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
-    Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Qos, Recover,
+    Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Place, Qos, Recover,
     RefuseReason, RejectReason, Request, RosNode, SecretBytes, Signed, SinkId, SourceAnnounce, SourceId,
     TopicGrant, UnixMillis,
 };
@@ -50,7 +50,15 @@ fn signed() -> Signed {
 fn control_frames_survive_mutation() {
     let (name, sink, source) = (Name([1; 32]), SinkId([2; 16]), SourceId([3; 16]));
     let frames = [
-        Control::Hello(Hello { minor: 0, incarnation: 5, transit: true }),
+        Control::Hello(Hello {
+            minor: 0,
+            incarnation: 5,
+            transit: true,
+            yields: false,
+            started: UnixMillis(6),
+        }),
+        Control::Clock { time: UnixMillis(7) },
+        Control::IdentityInUse { place: Place { ip: [8; 16], port: 9 } },
         Control::Advert { cost: 1, signed: signed() },
         Control::Unreach { names: vec![name; 3] },
         Control::Interest { names: vec![name; 2] },

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use sgc_gateway::Anonymous;
+use sgc_node::alerts::clock_alert;
 use sgc_node::config::{
     self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
     TokenSource,
@@ -16,6 +17,7 @@ use sgc_types::Definitions;
 use sgc_wire::PayloadForm;
 
 use crate::error::CliError;
+use crate::fleet::unix_now;
 use crate::{name, output, run};
 
 /// Say everything that is wrong with a configuration, or what a node with it would do. Binds nothing.
@@ -139,6 +141,9 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     }
     if let Some(gateway) = &config.gateway {
         rows.extend(gateway_rows(gateway));
+    }
+    if let Some(alert) = clock_alert(identity, unix_now()) {
+        rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
     }
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
     if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {

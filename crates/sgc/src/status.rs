@@ -15,6 +15,7 @@ use clap::Args;
 use serde::Deserialize;
 use sgc_node::SocketError;
 use sgc_node::admin::AdminRequest;
+use sgc_node::alerts::Alert;
 use sgc_node::config::{self, Config};
 
 use crate::error::CliError;
@@ -47,6 +48,7 @@ pub(crate) struct Status {
     pub(crate) links: Vec<Link>,
     pub(crate) routers: Vec<Router>,
     pub(crate) routes: Vec<Route>,
+    pub(crate) alerts: Vec<Alert>,
     problems: Vec<String>,
     names: Vec<NameTraffic>,
     pub(crate) drops: BTreeMap<String, u64>,
@@ -278,6 +280,10 @@ impl Status {
             let table: Vec<_> = std::iter::once(head).chain(rows).collect();
             lines.extend(output::columns(&table).into_iter().map(|line| format!("  {line}")));
         };
+        if !self.alerts.is_empty() {
+            let rows = self.alerts.iter().map(|alert| vec![alert.to_string(), alert.fix().to_owned()]);
+            section("Needs attention", &["what", "do"], rows.collect());
+        }
         section(
             "Links",
             &["peer", "remote", "round trip", "cost", "sent", "received", "dialled"],

@@ -55,6 +55,7 @@ impl<N: RosNetwork> Core<N> {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             has_ros: self.network.is_some(),
             drops: self.data.drops().snapshot(),
+            alerts: self.alerts(),
             ..Graph::default()
         };
         graph.drops.extend(self.control_drops.snapshot());
@@ -248,7 +249,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// A peer's name, or the beginning of its id.
-    fn called(&self, peer: &NodeId) -> String {
+    pub(super) fn called(&self, peer: &NodeId) -> String {
         self.audit.name_of(peer).unwrap_or_else(|| peer.short())
     }
 

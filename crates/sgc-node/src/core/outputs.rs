@@ -7,7 +7,7 @@ use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
-use super::{Core, EPOCH_GRACE, SUPERSEDED_MAX, graph, now};
+use super::{Core, EPOCH_GRACE, graph, now};
 use crate::audit::{AuditEvent, AuditRecord};
 
 impl<N: RosNetwork> Core<N> {
@@ -35,16 +35,7 @@ impl<N: RosNetwork> Core<N> {
                     self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
                 }
                 match &reason {
-                    LinkClose::Superseded => {
-                        let peer = entry.link.peer().node_id.to_string();
-                        if self.superseded.len() >= SUPERSEDED_MAX {
-                            self.superseded.clear();
-                        }
-                        if !self.superseded.insert(peer.clone()) {
-                            warn!(%peer, "connects again and again from new runs: do two processes use one identity?");
-                        }
-                        entry.link.close(CloseReason::Replaced);
-                    }
+                    LinkClose::Superseded { by, alive } => self.close_superseded(link, *by, *alive),
                     LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
                     LinkClose::Revoked => {
                         let peer = entry.link.peer();

@@ -11,6 +11,10 @@ use tokio::time::Instant;
 pub(super) const BACKOFF_MIN: Duration = Duration::from_millis(250);
 /// The longest wait for a router that the user, or his DNS, named.
 pub(crate) const BACKOFF_MAX: Duration = Duration::from_secs(10);
+/// The first wait, before jitter, after another process with this node's identity took its links. It is doubled each time.
+const DISPLACED_MIN: Duration = Duration::from_secs(1);
+/// The longest such wait, before jitter.
+pub(crate) const DISPLACED_MAX: Duration = Duration::from_secs(300);
 /// How long nothing is tried where trying again soon is of no use.
 pub(crate) const STAND_BACK: Duration = Duration::from_secs(300);
 
@@ -19,19 +23,27 @@ pub(crate) const STAND_BACK: Duration = Duration::from_secs(300);
 pub(crate) struct Backoff {
     max: Duration,
     failures: u32,
+    /// How often in a row the links were taken by another process with this node's identity.
+    displaced: u32,
     due: Option<Instant>,
 }
 
 impl Backoff {
     /// Nothing was tried yet, so now is the time. No wait is longer than `max`, standing back excepted.
     pub(crate) fn new(max: Duration) -> Self {
-        Self { max, failures: 0, due: None }
+        Self { max, failures: 0, displaced: 0, due: None }
     }
 
     /// It worked, and is over.
     pub(crate) fn ended(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
-        self.failures = 0;
+        (self.failures, self.displaced) = (0, 0);
         self.due = Some(now + wait(1, self.max, rng));
+    }
+
+    /// It worked, and was ended for another process with this node's identity.
+    pub(crate) fn displaced(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
+        self.displaced = self.displaced.saturating_add(1);
+        self.due = Some(now + doubled(DISPLACED_MIN, self.displaced, DISPLACED_MAX, rng));
     }
 
     /// It did not work.
@@ -64,7 +76,12 @@ impl Backoff {
 /// How long to wait after so many failures in a row: `BACKOFF_MIN` doubled for each after the first, at most `max`, times
 /// a random factor in [0.5, 1).
 pub(crate) fn wait(failures: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
-    let doubled = BACKOFF_MIN.saturating_mul(2u32.saturating_pow(failures.saturating_sub(1).min(16)));
+    doubled(BACKOFF_MIN, failures, max, rng)
+}
+
+/// `least` doubled for each time after the first, at most `max`, with jitter.
+fn doubled(least: Duration, times: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
+    let doubled = least.saturating_mul(2u32.saturating_pow(times.saturating_sub(1).min(16)));
     jittered(doubled.min(max), rng)
 }
 
@@ -89,6 +106,21 @@ mod tests {
             assert!(waits.iter().all(|w| (most / 2..=most).contains(w)), "{failures}: {waits:?}");
             assert!(waits.iter().max() > waits.iter().min());
         }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_displaced_process_waits_twice_as_long_each_time_until_a_link_ends_otherwise() {
+        let (mut rng, mut backoff) = (ChaCha20Rng::seed_from_u64(3), Backoff::new(BACKOFF_MAX));
+        let now = Instant::now();
+        for most_s in [1, 2, 4, 8, 16, 32, 64, 128, 256, 300, 300] {
+            backoff.displaced(now, &mut rng);
+            let wait = backoff.due().unwrap() - now;
+            let most = Duration::from_secs(most_s);
+            assert!(wait >= most / 2 && wait <= most, "{wait:?} of {most:?}");
+        }
+        backoff.ended(now, &mut rng);
+        backoff.displaced(now, &mut rng);
+        assert!(backoff.due().unwrap() - now <= DISPLACED_MIN);
     }
 
     #[tokio::test(start_paused = true)]

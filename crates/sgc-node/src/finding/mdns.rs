@@ -15,6 +15,8 @@ use tracing::{debug, info, warn};
 
 use super::candidates::{CANDIDATES_MAX, Candidates, Verdict};
 use super::local::Heard;
+use crate::links::place_in_use;
+
 use super::{Aim, BACKOFF_MAX, Board, Failure, Hold, Line, LocalNetwork, Outcome, Wish, wait};
 
 /// Most links to routers that were found so.
@@ -201,6 +203,7 @@ async fn attempt<H: Hold>(addresses: Vec<SocketAddr>, wish: Wish, holder: H, boa
 
 fn judge(outcome: &Outcome) -> Verdict {
     match outcome {
+        Outcome::Ended { end, .. } if place_in_use(end).is_some() => Verdict::StandBack,
         Outcome::Ended { .. } => Verdict::Ended,
         // One of another fleet stays one.
         Outcome::Failed(Failure::Dial(why)) if why.is_refusal() => Verdict::StandBack,

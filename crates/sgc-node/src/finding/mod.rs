@@ -38,6 +38,7 @@ pub(crate) use mdns::Wanted;
 pub(crate) use ways::{Climb, Passed, WayBook, is_over_udp};
 
 use crate::config::RouterUrl;
+use crate::links::place_in_use;
 use crate::roaming::Network;
 
 /// Somewhere to dial.
@@ -130,6 +131,12 @@ pub(crate) async fn keep_at<H: Hold>(aim: impl Into<Aim>, holder: H, line: Line,
 fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &Line, rng: &mut ChaCha20Rng) {
     let now = Instant::now();
     match outcome {
+        Outcome::Ended { remote, end } if place_in_use(end).is_some() => {
+            // The control task says so once, in words for the operator.
+            info!(%remote, "link ended: {end}");
+            line.ended(&end.to_string());
+            backoff.displaced(now, rng);
+        }
         Outcome::Ended { remote, end } => {
             info!(%remote, "link ended: {end}");
             line.ended(&end.to_string());
@@ -152,7 +159,10 @@ fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &Line, rng: &mut Ch
             backoff.failed(now, rng);
         }
     }
-    let stands_back = matches!(outcome, Outcome::Failed(why) if why.stands_back());
+    let stands_back = match outcome {
+        Outcome::Failed(why) => why.stands_back(),
+        Outcome::Ended { end, .. } => place_in_use(end).is_some(),
+    };
     line.waits(backoff.due(), stands_back);
 }
 

@@ -214,3 +214,38 @@ fn a_clock_that_is_wrong_by_days_is_refused_with_a_reason_that_says_so() {
         world.until_granted(*tab, *arm, "/chatter");
     }
 }
+
+#[test]
+fn a_clock_two_hours_off_is_known_on_both_sides_and_works_soon_after_it_is_set() {
+    const TWO_HOURS: Duration = Duration::from_secs(7200);
+    let ms_of = |time: Duration| i64::try_from(time.as_millis()).expect("two hours");
+    for ahead in [true, false] {
+        let skew = if ahead { World::set_ahead } else { World::set_behind };
+        let sign = if ahead { 1 } else { -1 };
+        // The owner, then a user: neither is believed, and neither believes.
+        for who in 0..2 {
+            let mut scene = scene_with(WorldConfig::new(98));
+            let Scene { world, arm, east, west, tab, .. } = &mut scene;
+            let (node, router) = [(*arm, *east), (*tab, *west)][who];
+            skew(world, node, TWO_HOURS);
+            world.restart(node);
+            world.share(*arm, "/chatter", Sharing::to(&[*tab]));
+            world.use_topic(*tab, *arm, "/chatter");
+            world.run(MINUTE);
+            assert_ne!(world.status(*tab, *arm, "/chatter"), Some(JoinStatus::Granted));
+            assert!(drops(world, router, "clock") > 0, "the router counts it");
+            assert!(closed(world, router).is_empty(), "a wrong clock is no forgery");
+            let (there, here) = (world.clock_ahead_ms(router, node), world.clock_ahead_ms(node, router));
+            let off = there.expect("the router was told");
+            assert!((off - sign * ms_of(TWO_HOURS)).abs() < 1000, "{off}");
+            assert!((here.expect("the node was told") + off).abs() < 1000, "{here:?}");
+
+            // NTP sets it.
+            skew(world, node, Duration::ZERO);
+            let granted = |world: &World| world.status(*tab, *arm, "/chatter") == Some(JoinStatus::Granted);
+            assert!(world.run_until(ms(5000), granted), "{}", world.trace());
+            assert!(world.clock_ahead_ms(router, node).expect("told anew").abs() < 1000);
+            assert!(world.clock_ahead_ms(node, router).expect("told").abs() < 1000);
+        }
+    }
+}

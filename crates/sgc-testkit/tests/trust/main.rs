@@ -6,6 +6,7 @@
 
 mod certificates;
 mod floods;
+mod identity_in_use;
 mod members;
 mod nonces;
 mod partners;

@@ -4,6 +4,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use sgc_node::alerts::Alert;
 use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Share, ShareRoute, Use, UseRoute};
 use sgc_ros::{is_pattern, matches};
 
@@ -13,9 +14,25 @@ use super::{Step, Verdict};
 /// Steps, of which one that is wrong is the last.
 type Walk = Vec<Step>;
 
+/// The beginning of each walk: whether the node runs, and what an operator has to see to. `true` if that is why nothing
+/// flows.
+fn begin(graph: &Graph) -> (Walk, bool) {
+    let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
+    let is_clock = |alert: &&Alert| matches!(alert, Alert::ClocksDiffer { .. });
+    let believed = graph.links.len().saturating_sub(graph.alerts.iter().filter(is_clock).count());
+    let stops = |alert: &Alert| (alert.stops_all() || is_clock(&alert)) && believed == 0;
+    let (stopping, others): (Vec<_>, Vec<_>) = graph.alerts.iter().partition(|alert| stops(alert));
+    steps.extend(others.into_iter().map(|alert| Step::unknown(alert.to_string()).with_fix(alert.fix())));
+    steps.extend(stopping.first().map(|alert| Step::wrong(alert.to_string(), alert.fix())));
+    (steps, !stopping.is_empty())
+}
+
 /// Why an interface of the local network does not flow.
 pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
-    let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
+    let (mut steps, is_over) = begin(graph);
+    if is_over {
+        return steps;
+    }
     if !topic.starts_with('/') {
         let fix = format!("ask for /{topic}");
         steps.push(Step::wrong(format!("{topic} is not a full ROS 2 name: it begins with no /"), fix));
@@ -71,7 +88,10 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
 
 /// Why a name does not flow, at a router.
 pub(super) fn name(graph: &Graph, name: &str) -> Walk {
-    let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
+    let (mut steps, is_over) = begin(graph);
+    if is_over {
+        return steps;
+    }
     let line = graph.names.get(name).cloned().unwrap_or_default();
     match line.way {
         Some((0, _)) => steps.push(Step::fine("its owner is this node")),

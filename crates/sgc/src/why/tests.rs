@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use sgc_node::alerts::Alert;
 use sgc_node::graph::{
     Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use, UseRoute,
 };
@@ -422,4 +423,46 @@ fn routers_know_names() {
     let mut graph = sound();
     graph.links[0].silent = true;
     assert!(last(&graph).1.contains("is silent"));
+}
+
+/// What a walk found first that is wrong, or cannot be known.
+fn found(graph: &Graph, verdict: Verdict) -> Option<String> {
+    let steps = diagnose::interface(graph, "/a");
+    steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found)
+}
+
+#[test]
+fn mistakes_of_operators_come_first() {
+    let place = || "203.0.113.5:7447".to_owned();
+    let displaced = Alert::Displaced { node: "here".into(), place: place(), ago_s: 3 };
+    let kept_out = Alert::IdentityInUse { node: "here".into(), place: place(), ago_s: 3 };
+    let early = Alert::ClockBeforeCertificate { not_before: "2026".into(), now: "1970".into() };
+    let clock = Alert::ClocksDiffer { peer: "cloud".into(), remote: place(), ahead_ms: 7_200_000 };
+    for alert in [displaced, early] {
+        let unlinked = Graph { alerts: vec![alert.clone()], links: vec![], ..owner() };
+        assert_eq!(found(&unlinked, Verdict::Wrong), Some(alert.to_string()));
+        // With links all the same it is over, or about to be.
+        let linked = Graph { alerts: vec![alert.clone()], ..owner() };
+        assert_eq!(found(&linked, Verdict::Unknown), Some(alert.to_string()));
+        assert_eq!(found(&linked, Verdict::Wrong), None);
+    }
+    let graph = Graph { alerts: vec![kept_out.clone()], ..owner() };
+    assert_eq!(
+        (found(&graph, Verdict::Unknown), found(&graph, Verdict::Wrong)),
+        (Some(kept_out.to_string()), None)
+    );
+    // The only peer, or one of two.
+    let graph = Graph { alerts: vec![clock.clone()], ..user() };
+    assert_eq!(found(&graph, Verdict::Wrong), Some(clock.to_string()));
+    let mut graph = Graph { alerts: vec![clock.clone()], ..user() };
+    graph.links.push(Link { id: 2, ..Link::default() });
+    assert_eq!(
+        (found(&graph, Verdict::Unknown), found(&graph, Verdict::Wrong)),
+        (Some(clock.to_string()), None)
+    );
+    let at_router = diagnose::name(&Graph { alerts: vec![clock.clone()], ..sound() }, NAME);
+    assert_eq!(
+        at_router.last().map(|step| (step.verdict, step.found.clone())),
+        Some((Verdict::Wrong, clock.to_string()))
+    );
 }

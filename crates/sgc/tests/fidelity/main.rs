@@ -5,6 +5,7 @@
 
 mod busy;
 mod churn;
+mod identity;
 mod isolation;
 #[path = "../support/lab.rs"]
 mod lab;

@@ -1,0 +1,289 @@
+//! What an operator has to see to: mistakes outside of this program that look like its faults, or like attacks.
+//!
+//! Each is known on every node that it concerns, and [`Alerts`] remembers those that no state of a machine shows. They
+//! are shown by `sgc status` and `sgc why`; nothing is decided by them.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+use sgc_trust::Identity;
+use sgc_wire::{NodeId, UnixMillis};
+
+/// Peers that are remembered because two processes use their identity; of more the one seen longest ago goes.
+const PEERS_MAX: usize = 1024;
+/// How long it is shown that an identity was in use at another place. A process that waits tries again sooner than that.
+const SHOWN_FOR: Duration = Duration::from_secs(660);
+
+/// A mistake of an operator.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Alert {
+    /// Another process uses this node's identity, and has its links.
+    Displaced {
+        /// This node's name.
+        node: String,
+        /// The place of the other process, as far as it is known.
+        place: String,
+        /// Seconds since it was seen.
+        ago_s: u64,
+    },
+    /// Another process uses this node's identity, and is kept out.
+    IdentityInUse {
+        /// This node's name.
+        node: String,
+        /// The place of the other process.
+        place: String,
+        /// Seconds since it was seen.
+        ago_s: u64,
+    },
+    /// Two processes use the identity of a peer.
+    PeerIdentityInUse {
+        /// The peer.
+        peer: String,
+        /// The place of the process that has the links.
+        place: String,
+        /// The place of the process that is kept out.
+        other: String,
+        /// Seconds since it was seen.
+        ago_s: u64,
+    },
+    /// This node and a peer do not believe each other, for their clocks.
+    ClocksDiffer {
+        /// The peer.
+        peer: String,
+        /// Its address.
+        remote: String,
+        /// By how many milliseconds its clock is ahead of the one here.
+        ahead_ms: i64,
+    },
+    /// By the clock here this node's certificate has not begun.
+    ClockBeforeCertificate {
+        /// Beginning of the certificate, RFC 3339.
+        not_before: String,
+        /// The time here, RFC 3339.
+        now: String,
+    },
+    /// An alert that this version does not know.
+    #[serde(other)]
+    Other,
+}
+
+impl Alert {
+    /// Returns `true` if nothing flows over this node while it stands.
+    pub fn stops_all(&self) -> bool {
+        matches!(self, Self::Displaced { .. } | Self::ClockBeforeCertificate { .. })
+    }
+
+    /// Returns what to do about it.
+    pub fn fix(&self) -> &'static str {
+        match self {
+            Self::Displaced { .. } | Self::IdentityInUse { .. } | Self::PeerIdentityInUse { .. } => {
+                "stop one of the two, or enroll its machine under a name of its own; if nobody knows the other place, the \
+                 identity was stolen: `sgc fleet revoke` it and enroll the node again"
+            }
+            Self::ClocksDiffer { .. } => {
+                "compare `date -u` on both machines and set the clock that is wrong, for instance by NTP (`timedatectl`)"
+            }
+            Self::ClockBeforeCertificate { .. } => {
+                "set the clock, for instance by NTP (`timedatectl`); the node goes on by itself as soon as it is right"
+            }
+            Self::Other => "use an `sgc` of the node's version",
+        }
+    }
+}
+
+impl fmt::Display for Alert {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Displaced { node, place, ago_s } => write!(
+                f,
+                "the identity {node} is in use at another place: {place}, which has the links of this node ({ago_s} s ago)"
+            ),
+            Self::IdentityInUse { node, place, ago_s } => write!(
+                f,
+                "the identity {node} is in use at another place: {place}, which is kept out while this node has its links \
+                 ({ago_s} s ago)"
+            ),
+            Self::PeerIdentityInUse { peer, place, other, ago_s } => write!(
+                f,
+                "the identity {peer} is in use at two places: {place} has its links, {other} is kept out ({ago_s} s ago)"
+            ),
+            Self::ClocksDiffer { peer, remote, ahead_ms } => {
+                let (by, way) = (duration(*ahead_ms), if *ahead_ms > 0 { "ahead of" } else { "behind" });
+                write!(
+                    f,
+                    "the clock of {peer} at {remote} is {by} {way} the one here: neither believes what the other signs"
+                )
+            }
+            Self::ClockBeforeCertificate { not_before, now } => write!(
+                f,
+                "the clock here says {now}, and this node's certificate begins at {not_before}: the clock is wrong"
+            ),
+            Self::Other => f.write_str("the node says something that this version of sgc does not know"),
+        }
+    }
+}
+
+/// Returns what is wrong with the clock, if it says that this identity's certificate has not begun.
+pub fn clock_alert(identity: &Identity, now: UnixMillis) -> Option<Alert> {
+    let not_before = identity.as_peer().not_before;
+    let is_early = now < not_before;
+    is_early
+        .then(|| Alert::ClockBeforeCertificate { not_before: not_before.to_string(), now: now.to_string() })
+}
+
+/// A time as a person says it: the two largest units.
+fn duration(ms: i64) -> String {
+    let s = ms.unsigned_abs() / 1000;
+    match (s / 86_400, s / 3600 % 24, s / 60 % 60) {
+        (0, 0, minutes) => format!("{minutes} min"),
+        (0, hours, minutes) => format!("{hours} h {minutes} min"),
+        (days, hours, _) => format!("{days} d {hours} h"),
+    }
+}
+
+/// Where another process was seen that uses an identity.
+#[derive(Clone, Debug)]
+struct Sighting {
+    place: String,
+    other: String,
+    at: Instant,
+}
+
+impl Sighting {
+    fn is_shown(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.at) < SHOWN_FOR
+    }
+
+    fn ago_s(&self, now: Instant) -> u64 {
+        now.saturating_duration_since(self.at).as_secs()
+    }
+}
+
+/// Identities that were seen at two places lately.
+#[derive(Debug, Default)]
+pub(crate) struct Alerts {
+    /// Who has the links of this node.
+    displaced: Option<Sighting>,
+    /// Who is kept out for this node.
+    kept_out: Option<Sighting>,
+    peers: BTreeMap<NodeId, Sighting>,
+}
+
+impl Alerts {
+    /// Notes that another process has the links of this node; `true` if that is news.
+    pub(crate) fn displaced(&mut self, place: &str, now: Instant) -> bool {
+        self.kept_out = None;
+        note(&mut self.displaced, place, "", now)
+    }
+
+    /// Notes that another process is kept out for this node; `true` if that is news.
+    pub(crate) fn kept_out(&mut self, place: SocketAddr, now: Instant) -> bool {
+        self.displaced = None;
+        note(&mut self.kept_out, &place.to_string(), "", now)
+    }
+
+    /// Notes that `other` is kept out for `place`, and both use the identity of a peer; `true` if that is news.
+    pub(crate) fn peer_in_use(&mut self, peer: NodeId, place: &str, other: SocketAddr, now: Instant) -> bool {
+        if self.peers.len() >= PEERS_MAX
+            && !self.peers.contains_key(&peer)
+            && let Some(oldest) = self.peers.iter().min_by_key(|(_, seen)| seen.at).map(|(peer, _)| *peer)
+        {
+            self.peers.remove(&oldest);
+        }
+        let mut seen = self.peers.remove(&peer);
+        let is_news = note(&mut seen, place, &other.to_string(), now);
+        self.peers.extend(seen.map(|seen| (peer, seen)));
+        is_news
+    }
+
+    /// Returns what is to be shown now.
+    pub(crate) fn shown(&self, node: &str, called: impl Fn(&NodeId) -> String, now: Instant) -> Vec<Alert> {
+        let own = |seen: &Option<Sighting>| seen.clone().filter(|seen| seen.is_shown(now));
+        let mut alerts = Vec::new();
+        let node = node.to_owned();
+        if let Some(seen) = own(&self.displaced) {
+            let ago_s = seen.ago_s(now);
+            alerts.push(Alert::Displaced { node, place: seen.place, ago_s });
+        } else if let Some(seen) = own(&self.kept_out) {
+            let ago_s = seen.ago_s(now);
+            alerts.push(Alert::IdentityInUse { node, place: seen.place, ago_s });
+        }
+        let peers = self.peers.iter().filter(|(_, seen)| seen.is_shown(now));
+        alerts.extend(peers.map(|(peer, seen)| Alert::PeerIdentityInUse {
+            peer: called(peer),
+            place: seen.place.clone(),
+            other: seen.other.clone(),
+            ago_s: seen.ago_s(now),
+        }));
+        alerts
+    }
+}
+
+/// Notes a sighting; `true` if there was none that is shown.
+fn note(noted: &mut Option<Sighting>, place: &str, other: &str, now: Instant) -> bool {
+    let seen = Sighting { place: place.to_owned(), other: other.to_owned(), at: now };
+    !noted.replace(seen).is_some_and(|old| old.is_shown(now))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    fn at(n: u16) -> SocketAddr {
+        SocketAddr::from(([203, 0, 113, 5], n))
+    }
+
+    #[test]
+    fn a_sighting_is_news_once_and_is_shown_for_a_while() {
+        let (mut alerts, now) = (Alerts::default(), Instant::now());
+        assert!(alerts.displaced("203.0.113.5:1", now));
+        assert!(!alerts.displaced("203.0.113.5:2", now + SHOWN_FOR / 2));
+        let shown = |alerts: &Alerts, at| alerts.shown("robot", NodeId::short, at);
+        let text = shown(&alerts, now + SHOWN_FOR)[0].to_string();
+        assert!(text.starts_with("the identity robot is in use at another place: 203.0.113.5:2"), "{text}");
+        assert_eq!(shown(&alerts, now + 2 * SHOWN_FOR), []);
+        assert!(alerts.displaced("203.0.113.5:1", now + 2 * SHOWN_FOR));
+        // Who has its links again says so in the place of the other.
+        assert!(alerts.kept_out(at(3), now + 2 * SHOWN_FOR));
+        assert!(matches!(shown(&alerts, now + 2 * SHOWN_FOR)[..], [Alert::IdentityInUse { .. }]));
+    }
+
+    #[test]
+    fn peers_are_bounded() {
+        let (mut alerts, now) = (Alerts::default(), Instant::now());
+        for n in 0..2 * PEERS_MAX {
+            let mut id = [0; 32];
+            id[..8].copy_from_slice(&n.to_be_bytes());
+            let later = now + Duration::from_millis(n as u64);
+            assert!(alerts.peer_in_use(NodeId(id), "203.0.113.5:1", at(2), later));
+        }
+        assert_eq!(alerts.peers.len(), PEERS_MAX);
+        let mut oldest = [0; 32];
+        oldest[..8].copy_from_slice(&PEERS_MAX.to_be_bytes());
+        assert_eq!(alerts.peers.keys().next(), Some(&NodeId(oldest)), "those seen last stay");
+    }
+
+    #[test]
+    fn clocks_are_said_as_people_say_them() {
+        let said = |ahead_ms| {
+            Alert::ClocksDiffer { peer: "robot".into(), remote: at(1).to_string(), ahead_ms }.to_string()
+        };
+        assert!(said(7_260_000).contains("is 2 h 1 min ahead of the one here"));
+        assert!(said(-90_000_000).contains("is 1 d 1 h behind the one here"));
+        assert!(said(i64::MIN).contains("behind"));
+    }
+
+    #[test]
+    fn alerts_survive_json() {
+        let alert = Alert::Displaced { node: "robot".into(), place: at(1).to_string(), ago_s: 3 };
+        let json = serde_json::to_string(&alert).unwrap();
+        assert_eq!(json, r#"{"kind":"displaced","node":"robot","place":"203.0.113.5:1","ago_s":3}"#);
+        assert_eq!(serde_json::from_str::<Alert>(&json).unwrap(), alert);
+    }
+}
