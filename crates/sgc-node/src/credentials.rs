@@ -11,6 +11,7 @@ use sgc_wire::{CRL_BYTES_MAX, Credentials, Now};
 use tokio::sync::{mpsc, watch};
 use tracing::{debug, warn};
 
+use crate::run_lock::RunLock;
 use crate::state;
 
 /// Where revocation lists are kept, below the state directory.
@@ -58,13 +59,21 @@ pub(crate) struct Keeper {
 
 impl Keeper {
     /// Tasks that write into the state directory and over the identity file; they end with this handle.
-    pub(crate) fn spawn(dir: Option<PathBuf>, identity_file: PathBuf, alive: mpsc::Sender<()>) -> Self {
+    pub(crate) fn spawn(
+        dir: Option<PathBuf>,
+        identity_file: PathBuf,
+        run_lock: RunLock,
+        alive: mpsc::Sender<()>,
+    ) -> Self {
         let anchors = keep_newest(alive.clone(), move |anchors: &TrustAnchors| {
             if let Some(dir) = &dir {
                 keep_crls(dir, anchors);
             }
         });
-        let identity = keep_newest(alive, move |identity: &Identity| keep_identity(&identity_file, identity));
+        let identity = keep_newest(alive, move |identity: &Identity| {
+            keep_identity(&identity_file, identity);
+            run_lock.follow();
+        });
         Self { anchors, identity }
     }
 

@@ -44,6 +44,7 @@ use crate::peer_rate::PeerRates;
 use crate::reload::{ConfigSource, Reloader, Running};
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
+use crate::run_lock::{IdentityInUse, RunLock};
 use crate::state::{self, StateError};
 
 /// How much later than a pulse the transport keeps a link alive by itself.
@@ -93,6 +94,17 @@ pub enum NodeError {
         configured: String,
         /// Name in the identity.
         certified: String,
+    },
+    /// Another process of this machine runs with the identity.
+    #[error(
+        "identity {}: {source}. One identity is for one process: stop that one, or enroll this node under a name of its own",
+        path.display()
+    )]
+    IdentityInUse {
+        /// The identity file.
+        path: PathBuf,
+        /// Which process, and by which lock it is known.
+        source: IdentityInUse,
     },
     /// The identity's certificate does not hold.
     #[error("identity {}: {source}", path.display())]
@@ -289,6 +301,13 @@ pub async fn run_on<N: RosNetwork>(
 ) -> Result<(), NodeError> {
     let file_watch = options.file.filter(|_| config.watch).map(|file| FileWatch::begin(file, &config));
     let state = state_dir(&config, identity.node_name().as_str())?;
+    let mut shutdown = std::pin::pin!(shutdown);
+    let run_lock = tokio::select! {
+        taken = RunLock::take(&config.identity, state.as_deref(), identity.node_id()) => {
+            taken.map_err(|source| NodeError::IdentityInUse { path: config.identity.clone(), source })?
+        }
+        () = &mut shutdown => return Ok(()),
+    };
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
     config.warnings().iter().chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
@@ -404,7 +423,7 @@ pub async fn run_on<N: RosNetwork>(
         authority: config.authority.clone(),
         epoch_messages_max: config.rotation.messages,
         rates: PeerRates::new(config.peer_rate),
-        keeper: Keeper::spawn(state.clone(), config.identity.clone(), alive.clone()),
+        keeper: Keeper::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
         redial,
         alive,
         identity: identity.clone(),
@@ -554,6 +573,7 @@ pub async fn run_on<N: RosNetwork>(
     if let Some(network) = network {
         let _ = tokio::task::spawn_blocking(move || drop(network)).await;
     }
+    drop(run_lock);
     Ok(())
 }
 

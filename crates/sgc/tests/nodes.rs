@@ -121,7 +121,9 @@ fn a_child_does_not_outlive_its_standard_input() {
 #[test]
 fn an_address_in_use_is_a_failure_and_named() {
     let router = Router::start();
-    let args = ["router", "--identity", "cloud.identity", "--listen", &router.address];
+    let enrolled = sgc(router.place.path(), &["fleet", "enroll", "other", "--router"]).output().unwrap();
+    assert!(enrolled.status.success());
+    let args = ["router", "--identity", "other.identity", "--listen", &router.address];
     let output = sgc(router.place.path(), &args).stderr(Stdio::piped()).output().unwrap();
     let stderr = String::from_utf8(output.stderr).unwrap();
     let last = stderr.lines().last().unwrap();
@@ -152,4 +154,49 @@ fn sharing_with_everyone_by_saying_nothing_is_said() {
     }
     router.signal(Signal::TERM);
     assert!(router.end().0.success());
+}
+
+#[test]
+fn a_second_process_with_one_identity_does_not_start_and_names_the_first() {
+    let router = Router::start();
+    let dir = router.place.path();
+    let second = |home: Option<&Path>, identity: &str| {
+        let mut command =
+            sgc(dir, &["router", "--identity", identity, "--listen", "quic://127.0.0.1:0", "--print-ready"]);
+        command.envs(home.map(|home| ("HOME", home))).stderr(Stdio::piped());
+        command
+    };
+    let output = second(None, "cloud.identity").output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    let pid = router.child.id();
+    let last = stderr.lines().last().unwrap();
+    assert!(last.contains(&format!("process {pid}, see `ps -fp {pid}`")), "{stderr}");
+    assert!(last.contains("cloud.identity") && last.contains("One identity is for one process"), "{stderr}");
+
+    // One that is killed leaves nothing behind, and the next starts although it came before that end.
+    let mut next = second(None, "cloud.identity").spawn().unwrap();
+    let mut log = BufReader::new(next.stderr.take().unwrap());
+    let mut line = String::new();
+    while !line.contains("waiting") {
+        line.clear();
+        assert!(log.read_line(&mut line).unwrap() > 0, "it ended");
+    }
+    router.signal(Signal::KILL);
+    let mut ready = String::new();
+    BufReader::new(next.stdout.take().unwrap()).read_line(&mut ready).unwrap();
+    assert!(ready.contains("quic://127.0.0.1:"), "{ready}");
+    kill_process(Pid::from_child(&next), Signal::KILL).unwrap();
+    wait(&mut next);
+
+    // A copy of the identity has another lock, and its state in the same place.
+    std::fs::copy(dir.join("cloud.identity"), dir.join("copy.identity")).unwrap();
+    let mut first = second(Some(dir), "cloud.identity").spawn().unwrap();
+    BufReader::new(first.stdout.take().unwrap()).read_line(&mut ready).unwrap();
+    let output = second(Some(dir), "copy.identity").output().unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    assert!(stderr.lines().last().unwrap().contains(&format!("process {}", first.id())), "{stderr}");
+    kill_process(Pid::from_child(&first), Signal::KILL).unwrap();
+    wait(&mut first);
 }

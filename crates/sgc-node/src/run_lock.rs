@@ -1,0 +1,195 @@
+//! One process for each identity on a machine.
+//!
+//! A process holds two advisory locks: on the identity file, which every user and container that may read the file sees,
+//! and on a file in the state directory, which copies of the identity have in common. The kernel releases both when the
+//! process ends, whatever ends it. Two processes that see neither file of each other are told apart by the routers.
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use rustix::fs::{FlockOperation, OFlags, flock, major, minor};
+use rustix::io::Errno;
+use sgc_wire::NodeId;
+use tokio::time::{Instant, sleep};
+use tracing::{info, warn};
+
+/// How long the process before may take to end.
+const WAIT_MAX: Duration = Duration::from_secs(6);
+/// How often it is looked whether it has.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// The identity of this process is in use by another one of this machine.
+#[derive(Debug, thiserror::Error)]
+#[error("{} is locked by {}", path.display(), Holder(*pid, path))]
+pub struct IdentityInUse {
+    /// The file that is locked.
+    pub path: PathBuf,
+    /// The process, where it can be seen.
+    pub pid: Option<u32>,
+}
+
+struct Holder<'a>(Option<u32>, &'a Path);
+
+impl std::fmt::Display for Holder<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.0 {
+            Some(pid) => write!(f, "process {pid}, see `ps -fp {pid}`"),
+            None => write!(f, "another process, see `fuser -v {}`", self.1.display()),
+        }
+    }
+}
+
+/// Held for as long as a process uses an identity. Clones share it.
+#[derive(Clone, Debug)]
+pub(crate) struct RunLock {
+    identity: PathBuf,
+    held: Arc<Mutex<Held>>,
+}
+
+#[derive(Debug)]
+struct Held {
+    identity: Option<fs::File>,
+    _state: Option<fs::File>,
+}
+
+impl RunLock {
+    /// Takes the locks of an identity and of its state directory, or waits a while for the process that has them to end.
+    pub(crate) async fn take(
+        identity: &Path,
+        state: Option<&Path>,
+        node: NodeId,
+    ) -> Result<Self, IdentityInUse> {
+        let state = state.map(|dir| dir.join(format!("run-{}.lock", node.short())));
+        let deadline = Instant::now() + WAIT_MAX;
+        let mut is_told = false;
+        loop {
+            let taken = lock(identity, false).and_then(|identity| {
+                let state = state.as_deref().map_or(Ok(None), |state| lock(state, true))?;
+                Ok(Held { identity, _state: state })
+            });
+            match taken {
+                Ok(held) => {
+                    return Ok(Self { identity: identity.to_owned(), held: Arc::new(Mutex::new(held)) });
+                }
+                Err(in_use) if Instant::now() >= deadline => return Err(in_use),
+                Err(in_use) if !is_told => {
+                    is_told = true;
+                    info!("the identity is in use: {in_use}; waiting {} s for its end", WAIT_MAX.as_secs());
+                }
+                Err(_) => {}
+            }
+            sleep(LOOK_EVERY).await;
+        }
+    }
+
+    /// Locks the identity file that was put in the place of the one before.
+    pub(crate) fn follow(&self) {
+        match lock(&self.identity, false) {
+            Ok(file) => self.held.lock().unwrap_or_else(PoisonError::into_inner).identity = file,
+            Err(in_use) => warn!("the renewed identity is in use: {in_use}"),
+        }
+    }
+}
+
+/// Locks a file, made if `makes`. Nothing where the file or the file system does not allow it: then the other lock has to
+/// do, or the routers.
+fn lock(path: &Path, makes: bool) -> Result<Option<fs::File>, IdentityInUse> {
+    let mut options = fs::OpenOptions::new();
+    options.read(true);
+    if makes {
+        let flags = OFlags::NOFOLLOW.bits() as i32;
+        options.write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
+    }
+    let not_locked = |error: io::Error| {
+        warn!(path = %path.display(), %error, "cannot be locked; a second process with this identity would not be noticed by it");
+        Ok(None)
+    };
+    let file = match options.open(path) {
+        Ok(file) => file,
+        Err(error) => return not_locked(error),
+    };
+    match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Ok(Some(file)),
+        Err(Errno::WOULDBLOCK) => Err(IdentityInUse { path: path.to_owned(), pid: holder(&file) }),
+        Err(error) => not_locked(error.into()),
+    }
+}
+
+/// The process that holds a lock on a file, as far as the kernel tells it to this one.
+fn holder(file: &fs::File) -> Option<u32> {
+    let metadata = file.metadata().ok()?;
+    let device = metadata.dev();
+    holder_in(&fs::read_to_string("/proc/locks").ok()?, (major(device), minor(device)), metadata.ino())
+}
+
+/// The same from the text of `/proc/locks` (proc_locks(5)): `1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE 0 EOF`, the
+/// device in hexadecimal. A process of another PID namespace has the number 0.
+fn holder_in(locks: &str, (major, minor): (u32, u32), inode: u64) -> Option<u32> {
+    let place = format!("{major:02x}:{minor:02x}:{inode}");
+    let of = |line: &str| match line.split_whitespace().collect::<Vec<_>>()[..] {
+        [_, "FLOCK", _, _, pid, at, ..] if at == place => pid.parse().ok().filter(|pid| *pid > 0),
+        _ => None,
+    };
+    locks.lines().find_map(of)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    fn node() -> NodeId {
+        NodeId([7; 32])
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_second_process_waits_and_is_refused_with_the_number_of_the_first() {
+        let dir = tempfile::tempdir().unwrap();
+        let (identity, copy) = (dir.path().join("robot.identity"), dir.path().join("copy.identity"));
+        fs::write(&identity, "").unwrap();
+        fs::write(&copy, "").unwrap();
+        let first = RunLock::take(&identity, Some(dir.path()), node()).await.unwrap();
+        let own = Some(std::process::id());
+        let refused = RunLock::take(&identity, None, node()).await.unwrap_err();
+        assert_eq!((&refused.path, refused.pid), (&identity, own));
+        // A copy of the identity keeps its state in the same place.
+        let refused = RunLock::take(&copy, Some(dir.path()), node()).await.unwrap_err();
+        assert_eq!(
+            (refused.path.file_name().unwrap().to_str().unwrap(), refused.pid),
+            ("run-07070707.lock", own)
+        );
+        // Another identity is another matter.
+        RunLock::take(&copy, Some(dir.path()), NodeId([8; 32])).await.unwrap();
+        // A renewed identity is another file.
+        fs::write(dir.path().join("new"), "").unwrap();
+        fs::rename(dir.path().join("new"), &identity).unwrap();
+        first.follow();
+        assert!(RunLock::take(&identity, None, node()).await.is_err());
+        // It waits for one that is about to end.
+        let (waits, ends) = (RunLock::take(&identity, Some(dir.path()), node()), async {
+            sleep(2 * LOOK_EVERY).await;
+            drop(first);
+        });
+        assert!(tokio::join!(waits, ends).0.is_ok());
+    }
+
+    #[tokio::test]
+    async fn what_cannot_be_locked_keeps_nobody_from_starting() {
+        let dir = tempfile::tempdir().unwrap();
+        let (identity, state) = (dir.path().join("gone"), dir.path().join("gone too"));
+        RunLock::take(&identity, Some(&state), node()).await.unwrap();
+    }
+
+    #[test]
+    fn the_holder_is_who_has_the_lock() {
+        let locks = "1: POSIX  ADVISORY  WRITE 11 fd:01:77 0 EOF\n2: FLOCK  ADVISORY  WRITE 12 fd:01:77 0 EOF\n\
+                     2: -> FLOCK  ADVISORY  WRITE 13 fd:01:77 0 EOF\n3: FLOCK  ADVISORY  WRITE 0 fd:01:78 0 EOF\n";
+        assert_eq!(holder_in(locks, (0xfd, 1), 77), Some(12));
+        assert_eq!((holder_in(locks, (0xfd, 1), 78), holder_in(locks, (0xfd, 2), 77)), (None, None));
+    }
+}
