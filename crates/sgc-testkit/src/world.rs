@@ -693,12 +693,6 @@ impl World {
         running.router.clock_ahead_ms(link)
     }
 
-    /// True if a node is linked to a neighbour.
-    pub fn is_linked(&self, node: NodeKey, neighbour: NodeKey) -> bool {
-        let links = self.nodes[node.0].running.iter().flat_map(|r| r.links.values());
-        links.into_iter().any(|(wire, side)| self.wires[*wire].ends[1 - side].node == neighbour)
-    }
-
     /// Names with a forwarding entry at a node.
     pub fn forwarding(&self, node: NodeKey) -> Vec<Name> {
         self.nodes[node.0].running.iter().flat_map(|r| r.fib.keys().copied()).collect()
