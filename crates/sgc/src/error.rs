@@ -365,9 +365,12 @@ impl CliError {
             | Self::Token(_)
             | Self::TokenShown
             | Self::Cannot { .. } => EXIT_USAGE,
-            Self::Node(NodeError::Listen { .. } | NodeError::Ros(_) | NodeError::Randomness(_)) => {
-                EXIT_FAILURE
-            }
+            Self::Node(
+                NodeError::Listen { .. }
+                | NodeError::IdentityInUse { .. }
+                | NodeError::Ros(_)
+                | NodeError::Randomness(_),
+            ) => EXIT_FAILURE,
             Self::Node(_) => EXIT_USAGE,
             Self::Read { .. }
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
