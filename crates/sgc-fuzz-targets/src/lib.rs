@@ -14,6 +14,7 @@ pub mod certs;
 pub mod control;
 pub mod dtls;
 pub mod dtls_handshake;
+pub mod front_door;
 pub mod gateway;
 pub mod grants;
 pub mod mux;
@@ -33,6 +34,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("control", control::run),
     ("dtls", dtls::run),
     ("dtls_handshake", dtls_handshake::run),
+    ("front_door", front_door::run),
     ("gateway", gateway::run),
     ("grants", grants::run),
     ("mux", mux::run),

@@ -61,5 +61,8 @@ pub use link::{AnyLink, KeyExchange, Link, LinkStats};
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub use stream::DoorExercise;
 pub use stream::{StreamLink, StreamViolation};
 pub use url::{COST_MS_MAX, DEFAULT_PATH, DEFAULT_PORT, LinkUrl, ListenAddr, Scheme, UrlError};

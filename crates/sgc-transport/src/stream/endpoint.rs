@@ -236,6 +236,21 @@ impl StreamDialer {
     }
 }
 
+/// Makes a link of a stream, and starts its task.
+pub(super) fn start(
+    made: Made,
+    remote: SocketAddr,
+    is_dialer: bool,
+    options: &LinkOptions,
+) -> (StreamLink, Arc<Shared>) {
+    let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
+    let shared = Shared::new(options, counters);
+    shared.lock().mux.note_handshake(rtt);
+    prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
+    let about = About { remote, is_dialer, lane, key_exchange, mtu_bytes };
+    (StreamLink::new(Arc::clone(&shared), peer, about), shared)
+}
+
 /// The links of one endpoint, to be closed with it.
 #[derive(Default)]
 struct Links {
@@ -244,17 +259,13 @@ struct Links {
 
 impl Links {
     fn start(&self, made: Made, remote: SocketAddr, is_dialer: bool, options: &LinkOptions) -> StreamLink {
-        let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
-        let shared = Shared::new(options, counters);
-        shared.lock().mux.note_handshake(rtt);
-        prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
+        let (link, shared) = start(made, remote, is_dialer, options);
         let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
         if all.len() == all.capacity() {
             all.retain(|link| link.strong_count() > 0);
         }
         all.push(Arc::downgrade(&shared));
-        drop(all);
-        StreamLink::new(shared, peer, About { remote, is_dialer, lane, key_exchange, mtu_bytes })
+        link
     }
 
     /// Closes all, and gives their peers a while to hear of it.

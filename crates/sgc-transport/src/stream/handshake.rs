@@ -99,7 +99,7 @@ impl From<io::Error> for Failure {
 }
 
 /// Sets a fresh connection up: nothing waits for company, and little waits unsent.
-fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<(Wire, Arc<Counters>, u16)> {
+fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<Prepared> {
     tcp.set_nodelay(true)?;
     let socket = SockRef::from(&tcp);
     if let Some(dscp) = options.dscp {
@@ -124,9 +124,23 @@ pub(super) async fn accept(
     credentials: &CredentialStore,
     options: &LinkOptions,
 ) -> Result<Made, Refusal> {
+    let prepared = prepare(tcp, options).map_err(|e| refusal(&Findings::default(), e.into()))?;
+    accept_on(prepared, scheme, path, credentials, options).await
+}
+
+/// A fresh connection: itself, its counters and its longest packet.
+pub(super) type Prepared = (Wire, Arc<Counters>, u16);
+
+/// The same on any stream of bytes.
+pub(super) async fn accept_on(
+    (mut wire, counters, mtu_bytes): Prepared,
+    scheme: Scheme,
+    path: &str,
+    credentials: &CredentialStore,
+    options: &LinkOptions,
+) -> Result<Made, Refusal> {
     let nothing = Findings::default();
     let refused = |failure| refusal(&nothing, failure);
-    let (mut wire, counters, mtu_bytes) = prepare(tcp, options).map_err(|e| refused(e.into()))?;
     if scheme == Scheme::Wss {
         let acceptor = TlsAcceptor::from(Arc::new(tls::outer_server(credentials)));
         match acceptor.accept(wire).into_fallible().await {
@@ -175,9 +189,18 @@ pub(super) async fn dial(
     credentials: &CredentialStore,
     options: &LinkOptions,
 ) -> Result<Secured, LinkError> {
+    dial_on(prepare(tcp, options)?, url, credentials, options).await
+}
+
+/// The same on any stream of bytes.
+pub(super) async fn dial_on(
+    (mut wire, counters, mtu_bytes): Prepared,
+    url: &LinkUrl,
+    credentials: &CredentialStore,
+    options: &LinkOptions,
+) -> Result<Secured, LinkError> {
     let nothing = Findings::default();
     let failed = |failure| link_error(&nothing, failure);
-    let (mut wire, counters, mtu_bytes) = prepare(tcp, options)?;
     if url.scheme == Scheme::Wss {
         let connector = TlsConnector::from(Arc::new(tls::outer_client()));
         // Web proxies choose by it.
@@ -206,6 +229,12 @@ pub(super) async fn dial(
 }
 
 impl Secured {
+    /// The innermost TLS, for who says something of his own in it.
+    #[cfg(feature = "fuzzing")]
+    pub(super) fn into_stream(self) -> TlsStream<Below> {
+        self.tls
+    }
+
     /// The dialer's greeting; the listener's answer says that it accepts us.
     pub(super) async fn greet(mut self, greeting: Greeting) -> Result<Made, LinkError> {
         match self.exchange(&greeting).await {

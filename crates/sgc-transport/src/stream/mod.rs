@@ -8,6 +8,8 @@
 mod conversation;
 mod driver;
 mod endpoint;
+#[cfg(feature = "fuzzing")]
+mod exercise;
 mod frame;
 mod handshake;
 mod mux;
@@ -19,6 +21,8 @@ mod ws;
 #[cfg(feature = "benchmarks")]
 pub use conversation::Conversation;
 pub(crate) use endpoint::{StreamDialer, StreamListener};
+#[cfg(feature = "fuzzing")]
+pub use exercise::DoorExercise;
 pub use frame::StreamViolation;
 
 /// Two machines, and whatever their users do.
