@@ -9,10 +9,12 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
-use sgc_trust::{GrantError, Identity, SignedError, TrustAnchors, name_of, next_seq, renewal_blind};
+use sgc_trust::{
+    GrantError, Identity, SignedError, TrustAnchors, name_of, next_seq, operations_blind, renewal_blind,
+};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, ClockWatch, Control, Credentials, DescribedType,
-    Metadata, Name, NodeId, Now, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
+    Metadata, Name, NodeId, Now, OperationAnswer, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
@@ -64,6 +66,8 @@ pub struct EndpointConfig {
     pub identity: Arc<Identity>,
     /// True if this node gives members their certificates.
     pub authority: bool,
+    /// True if this authority carries operations out for operators.
+    pub operations: bool,
     /// Bounds and timers.
     pub limits: Limits,
 }
@@ -145,6 +149,29 @@ pub enum Event {
     },
     /// The authority does not give this node credentials.
     RenewRefused {
+        /// By whom and why.
+        by: RefusedBy,
+    },
+    /// A node of this fleet asks this authority for an operation; to be answered with [`Endpoint::answer_operation`].
+    OperationAsked {
+        /// The sink to answer.
+        sink: SinkId,
+        /// The node.
+        peer: sgc_trust::VerifiedPeer,
+        /// An encoded [`sgc_wire::OperationRequest`], not verified.
+        request: bytes::Bytes,
+    },
+    /// An authority answered an operation.
+    OperationAnswered {
+        /// The name that it was asked at.
+        name: Name,
+        /// The answer.
+        answer: OperationAnswer,
+    },
+    /// An authority, or a router before it, refuses to be asked for operations.
+    OperationDenied {
+        /// The name that it was asked at.
+        name: Name,
         /// By whom and why.
         by: RefusedBy,
     },
@@ -263,6 +290,9 @@ pub struct Endpoint {
     /// Where members ask this authority.
     pub(crate) renewal_name: Option<(Name, Blind)>,
     pub(crate) renewals: BTreeMap<SinkId, GrantedSink>,
+    /// Where operators ask this authority.
+    pub(crate) operations_name: Option<(Name, Blind)>,
+    pub(crate) operations: BTreeMap<SinkId, GrantedSink>,
     /// Where this owner is asked what its types look like.
     pub(crate) types_name: (Name, Blind),
     /// True once it describes any.
@@ -297,19 +327,25 @@ impl Endpoint {
     pub fn new(config: EndpointConfig, rng: ChaCha20Rng, now: Now) -> Self {
         let identity = &config.identity;
         let own = identity.node_id();
-        let renewal_name = config.authority.then(|| {
-            let blind = renewal_blind(&identity.as_peer().ca);
-            (name_of(&own, &blind), blind)
-        });
+        let at = |blind| (name_of(&own, &blind), blind);
+        let renewal_name = config.authority.then(|| at(renewal_blind(&identity.as_peer().ca)));
+        let operations_name = config.operations.then(|| at(operations_blind(&identity.as_peer().ca)));
         let catalogue_names = catalogue_names(identity);
         Self {
-            unadvertised: catalogue_names.iter().chain(&renewal_name).map(|(_, b)| *b).collect(),
+            unadvertised: catalogue_names
+                .iter()
+                .chain(&renewal_name)
+                .chain(&operations_name)
+                .map(|(_, b)| *b)
+                .collect(),
             anchors: Arc::new(identity.anchors().clone()),
             config,
             rng,
             catalogue_names,
             renewal_name,
             renewals: BTreeMap::new(),
+            operations_name,
+            operations: BTreeMap::new(),
             types_name: types_name(&own),
             describes: false,
             questions: BTreeMap::new(),
@@ -459,7 +495,8 @@ impl Endpoint {
     pub(crate) fn advertise_all(&mut self) {
         self.adverts_apart = 0;
         let types = self.describes.then_some(&self.types_name);
-        let fixed = self.catalogue_names.iter().chain(&self.renewal_name).chain(types).map(|(_, b)| *b);
+        let of_authority = self.renewal_name.iter().chain(&self.operations_name);
+        let fixed = self.catalogue_names.iter().chain(of_authority).chain(types).map(|(_, b)| *b);
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
     }
 

@@ -5,11 +5,12 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use sgc_trust::{
-    Identity, Kem, ReplyKey, TopicSecret, VerifiedPeer, name_of, renewal_blind, verify_advert, verify_answer,
+    Identity, Kem, ReplyKey, TopicSecret, VerifiedPeer, name_of, operations_blind, renewal_blind,
+    verify_advert, verify_answer,
 };
 use sgc_wire::{
-    Answer, AnswerBody, Control, Decode, DescribedType, GrantContent, JoinBody, Metadata, Name, NodeId, Now,
-    Recover, RefuseReason, RejectReason, Signed, SinkId, SourceId,
+    Answer, AnswerBody, Control, Decode, DescribedType, Encode as _, GrantContent, JoinBody, Metadata, Name,
+    NodeId, Now, OperationRequest, Recover, RefuseReason, RejectReason, Signed, SinkId, SourceId,
 };
 
 use crate::endpoint::{Dropped, Endpoint, Event, Output};
@@ -62,6 +63,15 @@ impl Endpoint {
         self.leave(now, &name);
         self.join(now, name, authority, Wish::Renew(csr));
         true
+    }
+
+    /// Asks `authority` for an operation on this fleet, in place of what it was asked before; returns the name that it is
+    /// asked at, which is to be left once [`Event::OperationAnswered`] or [`Event::OperationDenied`] came.
+    pub fn operate(&mut self, now: Now, authority: NodeId, request: &OperationRequest) -> Name {
+        let name = name_of(&authority, &operations_blind(&self.config.identity.as_peer().ca));
+        self.leave(now, &name);
+        self.join(now, name, authority, Wish::Operate(request.to_bytes()));
+        name
     }
 
     /// Joins a name of `owner`; waits for it if need be, and joins again whenever it must.
@@ -245,7 +255,7 @@ impl Endpoint {
     fn lost(&mut self, name: Name, reason: LostReason) {
         match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
             (Some(owner), _) => self.owner_lost(*owner, reason),
-            (None, Some(Wish::Renew(_) | Wish::Types(_))) => {}
+            (None, Some(Wish::Renew(_) | Wish::Operate(_) | Wish::Types(_))) => {}
             (None, _) => self.event(Event::Lost { name, reason }),
         }
     }
@@ -266,6 +276,7 @@ impl Endpoint {
             (Some(owner), _) if self.hears(&owner) => {}
             (Some(owner), _) => self.event(Event::OwnerRefused { owner, by }),
             (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
+            (None, Some(Wish::Operate(_))) => self.event(Event::OperationDenied { name, by }),
             // What is not described is not known; that is seen where it is needed.
             (None, Some(Wish::Types(_))) => {}
             (None, _) => self.event(Event::Refused { name, by }),
@@ -281,8 +292,8 @@ impl Endpoint {
             return;
         }
         // An authority may require post-quantum keys before this node's identity says so.
-        let renews = matches!(join.wish, Wish::Renew(_));
-        let reply_key = ReplyKey::generate(Kem::for_fleet(renews || identity.post_quantum()));
+        let of_authority = matches!(join.wish, Wish::Renew(_) | Wish::Operate(_));
+        let reply_key = ReplyKey::generate(Kem::for_fleet(of_authority || identity.post_quantum()));
         let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
         let wish = join.wish.clone();
         let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
@@ -407,6 +418,9 @@ impl Endpoint {
             }
             (GrantContent::Credentials(credentials), Some(Wish::Renew(_))) => {
                 self.event(Event::Renewed { credentials });
+            }
+            (GrantContent::Operation(answer), Some(Wish::Operate(_))) => {
+                self.event(Event::OperationAnswered { name, answer });
             }
             (GrantContent::Types(types), Some(Wish::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);

@@ -78,6 +78,8 @@ pub enum Wish {
     Follow,
     /// A fresh certificate for this signing request (PKCS #10, DER).
     Renew(Bytes),
+    /// An operation on the fleet that the owner is the authority of: an encoded [`sgc_wire::OperationRequest`].
+    Operate(Bytes),
     /// What the types of these interfaces of an owner look like.
     Types(Vec<Name>),
 }
@@ -88,7 +90,7 @@ impl Wish {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
             Self::Follow => Request::Subscribe { describe: false },
             Self::Publish(offer) => Request::Publish { offer: offer.clone() },
-            Self::Renew(csr) => Request::Ask { what: csr.clone() },
+            Self::Renew(what) | Self::Operate(what) => Request::Ask { what: what.clone() },
             Self::Types(names) => {
                 let question = TypeQuestion { names: names.clone() };
                 Request::Ask { what: question.to_vec().into() }
@@ -98,7 +100,7 @@ impl Wish {
 
     /// Whether an answer is for good: there is nothing that flows, and no better way to be looked for.
     pub(crate) fn is_question(&self) -> bool {
-        matches!(self, Self::Renew(_) | Self::Types(_))
+        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_))
     }
 }
 

@@ -9,8 +9,8 @@ use bytes::Bytes;
 use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Control,
-    Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, Now, Qos, Recover, RefuseReason,
-    Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
+    Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, OperationAnswer, Qos,
+    Recover, RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
@@ -24,6 +24,9 @@ const EPOCHS_AHEAD_MAX: u32 = 3;
 
 /// A request that is older than the one known of its sink or node.
 pub(crate) const OLDER_REQUEST: &str = "older request";
+
+/// Nodes that have a place at the operations name of an authority: operators are few.
+const OPERATIONS_ASKED_MAX: usize = 64;
 
 /// How long changes of the catalogue are gathered after it was sent.
 const CATALOGUE_REST: Duration = Duration::from_millis(100);
@@ -169,8 +172,8 @@ impl Endpoint {
         for (name, blind) in std::mem::take(&mut self.catalogue_names) {
             self.end_catalogue(name, blind);
         }
-        if let Some((_, blind)) = self.renewal_name.take() {
-            self.withdrawn.insert(blind);
+        for name in [&mut self.renewal_name, &mut self.operations_name] {
+            self.withdrawn.extend(name.take().map(|(_, blind)| blind));
         }
         self.withdraw_types();
         self.renew_at = None;
@@ -196,6 +199,28 @@ impl Endpoint {
         };
         if !granted {
             self.renewals.remove(&sink);
+        }
+    }
+
+    /// Answers [`Event::OperationAsked`].
+    pub fn answer_operation(
+        &mut self,
+        now: Now,
+        sink: SinkId,
+        answer: Result<OperationAnswer, RefuseReason>,
+    ) {
+        self.now = now;
+        let Some((name, _)) = self.operations_name else { return };
+        let Some(mut asked) = self.operations.remove(&sink) else { return };
+        asked.serial += 1;
+        match answer {
+            Ok(answer) => {
+                let (content, serial) = (GrantContent::Operation(answer), asked.serial);
+                if self.grant(name, sink, serial, &asked.reply_key, &content) {
+                    self.operations.insert(sink, asked);
+                }
+            }
+            Err(reason) => self.refuse(name, sink, asked.serial, reason),
         }
     }
 
@@ -262,6 +287,14 @@ impl Endpoint {
             if let Some(reason) = reason {
                 self.answer_renewal(self.now, sink, Err(reason));
             }
+        }
+        let lost: Vec<_> = self
+            .operations
+            .iter()
+            .filter_map(|(sink, asked)| Some((*sink, self.standing(&asked.peer)?)))
+            .collect();
+        for (sink, reason) in lost {
+            self.answer_operation(self.now, sink, Err(reason));
         }
         self.enforce_types();
     }
@@ -479,6 +512,10 @@ impl Endpoint {
         self.renewal_name.is_some_and(|(n, _)| n == *name)
     }
 
+    fn is_operations(&self, name: &Name) -> bool {
+        self.operations_name.is_some_and(|(n, _)| n == *name)
+    }
+
     pub(crate) fn handle_join(&mut self, signed: &Signed) {
         let join = match verify_join(&self.anchors, signed, self.now.unix) {
             Ok(join) => join,
@@ -489,6 +526,7 @@ impl Endpoint {
                     && (self.shares.shares.contains_key(&name)
                         || self.is_catalogue(&name)
                         || self.is_renewal(&name)
+                        || self.is_operations(&name)
                         || self.is_types(&name))
                 {
                     self.refuse(name, sink, 1, why.refuse_reason());
@@ -509,6 +547,8 @@ impl Endpoint {
             self.handle_follow(name, sink, asked);
         } else if self.is_renewal(&name) {
             self.handle_renew(name, sink, asked);
+        } else if self.is_operations(&name) {
+            self.handle_operation(name, sink, asked);
         } else if self.is_types(&name) {
             self.handle_type_question(name, sink, asked);
         } else {
@@ -646,14 +686,13 @@ impl Endpoint {
             return self.refuse(name, sink, 1, RefuseReason::NotPermitted);
         }
         let peer = asked.peer.clone();
-        // One place for a node: the newer request is of the newer run, or of a newer certificate.
-        let other = self.renewals.iter().find(|(id, s)| **id != sink && s.peer.node_id == peer.node_id);
-        let known = other.map(|(_, other)| other).or_else(|| self.renewals.get(&sink));
-        if known.is_some_and(|known| is_older(&asked, known)) {
-            return self.unexpected(OLDER_REQUEST);
+        if is_of_another(&self.renewals, &sink, &peer.node_id) {
+            return self.refuse(name, sink, 1, RefuseReason::NotPermitted);
         }
-        if let Some((older, serial)) = other.map(|(id, s)| (*id, s.serial + 1)) {
-            self.renewals.remove(&older);
+        let Ok(older) = take_older(&mut self.renewals, &sink, &asked) else {
+            return self.unexpected(OLDER_REQUEST);
+        };
+        if let Some((older, serial)) = older {
             self.refuse(name, older, serial, RefuseReason::Limit);
         }
         if self.renewals.len() >= self.config.limits.sinks_per_name_max {
@@ -664,11 +703,39 @@ impl Endpoint {
         self.event(Event::RenewAsked { sink, peer, csr });
     }
 
+    fn handle_operation(&mut self, name: Name, sink: SinkId, asked: GrantedSink) {
+        let own_fleet = asked.peer.ca == self.config.identity.as_peer().ca;
+        let Request::Ask { what: request } = asked.request.clone() else {
+            return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+        };
+        if !own_fleet {
+            return self.refuse(name, sink, 1, RefuseReason::NotPermitted);
+        }
+        let peer = asked.peer.clone();
+        if is_of_another(&self.operations, &sink, &peer.node_id) {
+            return self.refuse(name, sink, 1, RefuseReason::NotPermitted);
+        }
+        let Ok(older) = take_older(&mut self.operations, &sink, &asked) else {
+            return self.unexpected(OLDER_REQUEST);
+        };
+        if let Some((older, serial)) = older {
+            self.refuse(name, older, serial, RefuseReason::Limit);
+        }
+        if self.operations.len() >= OPERATIONS_ASKED_MAX {
+            return self.refuse(name, sink, 1, RefuseReason::Limit);
+        }
+        let serial = self.operations.get(&sink).map_or(0, |s| s.serial);
+        self.operations.insert(sink, GrantedSink { serial, ..asked });
+        self.event(Event::OperationAsked { sink, peer, request });
+    }
+
     pub(crate) fn handle_leave(&mut self, name: Name, sink: SinkId) {
         if self.is_catalogue(&name) {
             self.shares.followers.remove(&(name, sink));
         } else if self.is_renewal(&name) {
             self.renewals.remove(&sink);
+        } else if self.is_operations(&name) {
+            self.operations.remove(&sink);
         } else if self.is_types(&name) {
             self.questions.remove(&sink);
         } else if let Some(share) = self.shares.shares.get_mut(&name)
@@ -730,6 +797,33 @@ pub(crate) fn place<'a, K: Copy + 'a>(
         return oldest.map(|(_, key)| Some(*key)).ok_or(RefuseReason::Limit);
     }
     if all >= limits.sinks_per_name_max { Err(RefuseReason::Limit) } else { Ok(None) }
+}
+
+/// True if another node has the place of this sink.
+fn is_of_another(granted: &BTreeMap<SinkId, GrantedSink>, sink: &SinkId, peer: &NodeId) -> bool {
+    granted.get(sink).is_some_and(|known| known.peer.node_id != *peer)
+}
+
+/// A request that was signed before the one that is known of its node.
+struct OlderRequest;
+
+/// Gives the one place of a node to a request: the newer one is of the newer run, or of a newer certificate. Returns the sink
+/// that had it, and the serial of its refusal; an error if that one was signed later, so that this one is played again.
+fn take_older(
+    granted: &mut BTreeMap<SinkId, GrantedSink>,
+    sink: &SinkId,
+    asked: &GrantedSink,
+) -> Result<Option<(SinkId, u64)>, OlderRequest> {
+    let other = granted.iter().find(|(id, s)| *id != sink && s.peer.node_id == asked.peer.node_id);
+    let known = other.map(|(_, other)| other).or_else(|| granted.get(sink));
+    if known.is_some_and(|known| is_older(asked, known)) {
+        return Err(OlderRequest);
+    }
+    let other = other.map(|(id, s)| (*id, s.serial + 1));
+    if let Some((older, _)) = &other {
+        granted.remove(older);
+    }
+    Ok(other)
 }
 
 fn refusal(denied: Denied) -> RefuseReason {

@@ -29,7 +29,8 @@ struct Bench {
 impl Bench {
     fn new(name: &str, limits: Limits) -> Self {
         let (clock, identity) = (Clock::default(), identity(&Member::new(name)));
-        let config = EndpointConfig { identity: identity.clone(), authority: false, limits };
+        let config =
+            EndpointConfig { identity: identity.clone(), authority: false, operations: false, limits };
         let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(1), clock.now());
         let (sent, events, dropped) = (Vec::new(), Vec::new(), Vec::new());
         let mut bench = Self { endpoint, clock, identity, sent, events, dropped, timeout: None };

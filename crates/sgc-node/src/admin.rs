@@ -16,12 +16,14 @@ use std::time::{Duration, Instant};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
-use sgc_wire::{CRL_BYTES_MAX, Name};
+use sgc_trust::NodeName;
+use sgc_wire::{CRL_BYTES_MAX, Decode as _, Encode as _, Name, Operation};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tracing::{debug, info, warn};
+use zeroize::Zeroizing;
 
 pub use self::socket::{SocketError, connect, default_socket_path};
 use self::socket::{StatusSocket, may_ask};
@@ -80,6 +82,13 @@ pub enum AdminRequest {
     Publish(PublishWish),
     /// Call a service.
     Call(CallWish),
+    /// Have an authority carry an operation on the fleet out; answered with an [`OperationAnswer`], encoded.
+    Operate {
+        /// The authority's node name.
+        at: NodeName,
+        /// The operation.
+        operation: Operation,
+    },
 }
 
 /// What precedes each message of a tap: [`TapHead::BYTES`] bytes, numbers big endian in this order. So many bytes
@@ -187,9 +196,16 @@ impl AdminRequest {
                 Ok(wish) => Ok(Self::Call(wish)),
                 Err(_) => Err(AdminError::Argument { word: "call" }),
             },
+            ("operate", rest) => Self::parse_operate(rest).ok_or(AdminError::Argument { word: "operate" }),
             ("tap", rest) => Self::parse_tap(rest).ok_or(AdminError::Argument { word: "tap" }),
             (word, _) => Err(AdminError::Unknown { word: word.chars().take(32).collect() }),
         }
+    }
+
+    fn parse_operate(rest: &str) -> Option<Self> {
+        let (at, operation) = rest.split_once(' ')?;
+        let operation = Operation::from_slice(&STANDARD.decode(operation).ok()?).ok()?;
+        Some(Self::Operate { at: at.parse().ok()?, operation })
     }
 
     fn parse_tap(rest: &str) -> Option<Self> {
@@ -217,6 +233,9 @@ impl AdminRequest {
             }
             Self::Publish(wish) => format!("{ADMIN_PREFIX}publish {}\n", json(wish)),
             Self::Call(wish) => format!("{ADMIN_PREFIX}call {}\n", json(wish)),
+            Self::Operate { at, operation } => {
+                format!("{ADMIN_PREFIX}operate {at} {}\n", STANDARD.encode(operation.to_vec()))
+            }
         }
     }
 }
@@ -249,7 +268,7 @@ pub enum AdminError {
     },
     /// A word that is not known.
     #[error(
-        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, tap, publish and call are"
+        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, tap, publish, call and operate are"
     )]
     Unknown {
         /// The word.
@@ -505,6 +524,14 @@ async fn carry_out(
         AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
         AdminRequest::Publish(_) => Err(AdminError::Argument { word: "publish" }.to_string()),
         AdminRequest::Call(wish) => shell::call(gateway, &wish).await,
+        AdminRequest::Operate { at, operation } => {
+            let (reply, done) = oneshot::channel();
+            let asked = CoreEvent::Operate { at, operation, reply };
+            events.send(asked).await.map_err(|_| stopping())?;
+            let answer = done.await.map_err(|_| stopping())?.map_err(|error| error.to_string())?;
+            let answer = Zeroizing::new(STANDARD.encode(Zeroizing::new(answer.to_vec())));
+            Ok(serde_json::json!({ "answer": *answer }).to_string())
+        }
         AdminRequest::Reload => {
             let report = reloader.reload("sgc reload").await?;
             serde_json::to_string(&report).map_err(|error| error.to_string())
@@ -559,6 +586,10 @@ mod tests {
                 ..Default::default()
             }),
             AdminRequest::Call(CallWish { request: "{\"a\":\n1}".into(), ..Default::default() }),
+            AdminRequest::Operate {
+                at: "keeper".parse().unwrap(),
+                operation: Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] },
+            },
         ] {
             let line = request.to_line();
             assert!(line.ends_with('\n') && line.len() <= ADMIN_LINE_BYTES_MAX);
@@ -598,6 +629,8 @@ mod tests {
             (b"sgc/1 tap any -1 /a", AdminError::Argument { word: "tap" }),
             (b"sgc/1 tap both 1 /a", AdminError::Argument { word: "tap" }),
             (b"sgc/1 tap any 1 /a b", AdminError::Argument { word: "tap" }),
+            (b"sgc/1 operate keeper", AdminError::Argument { word: "operate" }),
+            (b"sgc/1 operate keeper AA", AdminError::Argument { word: "operate" }),
             (b"sgc/1 publish /a", AdminError::Argument { word: "publish" }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {

@@ -70,6 +70,8 @@ pub enum AuditEvent {
     Crl,
     /// This node's certificate was renewed, or it renewed another's.
     Renewed,
+    /// An operator had this authority carry an operation out, or was refused.
+    Operation,
     /// The configuration was read again.
     Reload,
     /// An access token was made for the gateway.
@@ -86,7 +88,7 @@ pub enum AuditEvent {
 
 impl AuditEvent {
     /// All of them.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 20] = [
         Self::Started,
         Self::Stopped,
         Self::Granted,
@@ -100,6 +102,7 @@ impl AuditEvent {
         Self::LinkClosed,
         Self::Crl,
         Self::Renewed,
+        Self::Operation,
         Self::Reload,
         Self::TokenMade,
         Self::TokenRevoked,
@@ -124,6 +127,7 @@ impl AuditEvent {
             Self::LinkClosed => "link_closed",
             Self::Crl => "crl",
             Self::Renewed => "renewed",
+            Self::Operation => "operation",
             Self::Reload => "reload",
             Self::TokenMade => "token_made",
             Self::TokenRevoked => "token_revoked",

@@ -1,7 +1,7 @@
 //! The fleet's authority: looks members up in the fleet's file, and gives them certificates and the secrets in use.
 //!
 //! Members ask whenever they like, and the file is slow: it is locked, read, signed and replaced as a whole. So the
-//! control task queues requests ([`RenewalQueue`], pure) and hands them in batches to one blocking job at a time
+//! control task queues requests ([`DeskQueue`], pure) and hands them in batches to one blocking job at a time
 //! ([`FleetDesk`]), which reads the file once a batch and only for requests that it has not answered before.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -14,13 +14,15 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore};
 use sgc_trust::{
-    Absorbed, CertId, Fleet, FleetError, TrustAnchors, VerifiedPeer, requested_key_hash, serial_of,
+    Absorbed, CertId, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
+    requested_key_hash, serial_of,
 };
-use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId};
+use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId, UnixMillis};
 use tracing::{error, info, warn};
 
 use crate::credentials::{is_due, lasts, renewal_interval};
 use crate::fleet_file::{FleetFileError, LockedFleet};
+use crate::operators::{OPERATIONS_WAITING_MAX, OperationDone, OperationJob, Operators};
 
 /// Shortest time for which a new certificate holds.
 const VALID_MIN: Duration = Duration::from_secs(60);
@@ -110,15 +112,17 @@ impl RenewalRefusal {
     }
 }
 
-/// Requests that wait for the fleet's file: one for each node, first come, first served, one batch at a time.
+/// Requests that wait for the fleet's file: one for each node, first come, first served, one batch at a time; and
+/// operations, each by itself.
 #[derive(Debug, Default)]
-pub(crate) struct RenewalQueue {
+pub(crate) struct DeskQueue {
     waiting: BTreeMap<NodeId, RenewalRequest>,
     order: VecDeque<NodeId>,
+    operations: VecDeque<OperationJob>,
     is_busy: bool,
 }
 
-impl RenewalQueue {
+impl DeskQueue {
     /// Queues a request. A newer request of a node takes the place of its older one.
     pub(crate) fn push(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
         let node = request.peer.node_id;
@@ -134,14 +138,24 @@ impl RenewalQueue {
         Ok(())
     }
 
-    /// Returns the next requests to answer, unless a batch is under way.
-    pub(crate) fn next_batch(&mut self) -> Option<Vec<RenewalRequest>> {
-        if self.is_busy || self.order.is_empty() {
+    /// Queues an operation, or gives it back if too many wait.
+    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), OperationJob> {
+        if self.operations.len() >= OPERATIONS_WAITING_MAX {
+            return Err(job);
+        }
+        self.operations.push_back(job);
+        Ok(())
+    }
+
+    /// Returns what is to be done next, unless a batch is under way.
+    fn next_batch(&mut self) -> Option<DeskBatch> {
+        if self.is_busy || (self.order.is_empty() && self.operations.is_empty()) {
             return None;
         }
         self.is_busy = true;
         let nodes: Vec<_> = self.order.drain(..self.order.len().min(RENEWAL_BATCH_MAX)).collect();
-        Some(nodes.into_iter().filter_map(|node| self.waiting.remove(&node)).collect())
+        let renewals = nodes.into_iter().filter_map(|node| self.waiting.remove(&node)).collect();
+        Some(DeskBatch { renewals, operations: self.operations.drain(..).collect() })
     }
 
     /// Ends the batch that is under way.
@@ -150,23 +164,57 @@ impl RenewalQueue {
     }
 }
 
+/// What one job does.
+#[derive(Debug)]
+struct DeskBatch {
+    renewals: Vec<RenewalRequest>,
+    operations: Vec<OperationJob>,
+}
+
+/// What came of a job.
+pub(crate) struct DeskAnswers {
+    pub(crate) renewals: Vec<RenewalAnswer>,
+    pub(crate) operations: Vec<OperationDone>,
+}
+
 /// This node's work as its fleet's authority.
 pub(crate) struct Authority {
-    pub(crate) queue: RenewalQueue,
+    pub(crate) queue: DeskQueue,
+    pub(crate) operators: Operators,
+    /// When members were last given something, in this run; at most as many as a roster has.
+    seen: BTreeMap<NodeId, UnixMillis>,
+    own: NodeId,
     desk: Arc<Mutex<FleetDesk>>,
 }
 
 impl Authority {
-    /// The authority that keeps this fleet file.
-    pub(crate) fn new(file: PathBuf) -> Self {
-        Self { queue: RenewalQueue::default(), desk: Arc::new(Mutex::new(FleetDesk::new(file))) }
+    /// The authority `own`, which keeps this fleet file and does what these nodes say.
+    pub(crate) fn new(file: PathBuf, operators: Grantees, own: NodeId) -> Self {
+        let (queue, operators) = (DeskQueue::default(), Operators::new(operators));
+        let desk = Arc::new(Mutex::new(FleetDesk::new(file)));
+        Self { queue, operators, seen: BTreeMap::new(), own, desk }
     }
 
-    /// Returns a blocking job that answers the next batch, unless one is under way or nobody waits.
-    pub(crate) fn next_job(&mut self) -> Option<impl FnOnce(Now) -> Vec<RenewalAnswer> + Send + use<>> {
+    /// Remembers that members were here.
+    pub(crate) fn note_seen(&mut self, nodes: impl IntoIterator<Item = NodeId>, now: UnixMillis) {
+        for node in nodes {
+            if self.seen.len() < ROSTER_NODES_MAX || self.seen.contains_key(&node) {
+                self.seen.insert(node, now);
+            }
+        }
+    }
+
+    /// Returns a blocking job that does what is next, unless one is under way or nobody waits.
+    pub(crate) fn next_job(&mut self) -> Option<impl FnOnce(Now) -> DeskAnswers + Send + use<>> {
         let batch = self.queue.next_batch()?;
-        let desk = self.desk.clone();
-        Some(move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).answer(batch, now))
+        let (desk, own) = (self.desk.clone(), self.own);
+        let seen = if batch.operations.is_empty() { BTreeMap::new() } else { self.seen.clone() };
+        Some(move |now: Now| {
+            let mut desk = desk.lock().unwrap_or_else(PoisonError::into_inner);
+            let done = |job: OperationJob| job.carry_out(&desk.file, &own, &seen, now.unix);
+            let operations = batch.operations.into_iter().map(done).collect();
+            DeskAnswers { operations, renewals: desk.answer(batch.renewals, now) }
+        })
     }
 
     /// Returns a blocking job that lets the file learn what these lists revoke.
@@ -279,13 +327,13 @@ impl FleetDesk {
                 self.stamp = FileStamp::of(&self.file);
                 let fleet = &mut locked.fleet;
                 let has_learnt = batch.iter().fold(false, |any, (r, _)| recognize(fleet, r, now) || any);
-                let found: Vec<_> = batch.iter().map(|(r, _)| renew(fleet, r, now)).collect();
+                let found = batch.iter().map(|(r, _)| renew(fleet, r, now)).collect();
                 self.save(&locked, has_learnt, found)
             }
             Err(why) => refuse_all(&why, batch.len()),
         };
         let mut answers = Vec::with_capacity(batch.len());
-        for ((request, key), (answer, made)) in batch.into_iter().zip(found.drain(..)) {
+        for ((request, key), Found { answer, made, .. }) in batch.into_iter().zip(found.drain(..)) {
             let RenewalRequest { asker, peer, .. } = request;
             let interval = renewal_interval(&peer);
             let remembered =
@@ -296,9 +344,9 @@ impl FleetDesk {
         answers
     }
 
-    /// Writes the file if certificates were made, which the roster has before an answer leaves, or others are new to it.
+    /// Writes the file if the roster says something else: it has certificates before an answer leaves.
     fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<Found>) -> Vec<Found> {
-        if !has_learnt && found.iter().all(|(_, made)| made.is_none()) {
+        if !has_learnt && found.iter().all(|found| !found.is_news) {
             return found;
         }
         let saved = locked.save();
@@ -351,40 +399,51 @@ fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
     }
 }
 
-/// An answer, and the serial number of the certificate that was made for it.
-type Found = (Result<Credentials, RenewalRefusal>, Option<Arc<[u8]>>);
+/// An answer from the file.
+struct Found {
+    answer: Result<Credentials, RenewalRefusal>,
+    /// The serial number of the certificate that was made for it.
+    made: Option<Arc<[u8]>>,
+    /// True if the roster says something else since.
+    is_news: bool,
+}
 
-/// Credentials, and the serial number of the certificate that was made for them.
-type Renewed = (Credentials, Option<Arc<[u8]>>);
+impl Found {
+    fn refused(why: RenewalRefusal) -> Self {
+        Self { answer: Err(why), made: None, is_news: false }
+    }
+}
 
 fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<Found> {
     error!(requests, "cannot give credentials: {why}");
-    vec![(Err(RenewalRefusal::File), None); requests]
+    std::iter::repeat_with(|| Found::refused(RenewalRefusal::File)).take(requests).collect()
 }
 
 fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Found {
     match try_renew(fleet, request, now) {
-        Ok((credentials, made)) => (Ok(credentials), made),
+        Ok(found) => found,
         Err(why) => {
             warn!(peer = %request.peer.node_id.short(), %why, "gives no credentials");
-            (Err(RenewalRefusal::from_fleet(&why)), None)
+            Found::refused(RenewalRefusal::from_fleet(&why))
         }
     }
 }
 
-fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Renewed, FleetError> {
+fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Found, FleetError> {
     let RenewalRequest { peer, csr, .. } = request;
     let unknown = || FleetError::UnknownNode { node: peer.pseudonym.short() };
     let node = fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
     if !is_due(peer, now) {
-        return Ok((fleet.credentials_for(&node, Vec::new())?, None));
+        let credentials = fleet.credentials_for(&node, Vec::new())?;
+        let is_news = fleet.note_handed(&node, now.unix)?;
+        return Ok(Found { answer: Ok(credentials), made: None, is_news });
     }
     let valid = Duration::from_millis(lasts(peer)).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
     let credentials = fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     let made = credentials.chain.first().and_then(|leaf| serial_of(leaf)).map(Arc::from);
     info!(%node, "renewed its certificate");
-    Ok((credentials, made))
+    Ok(Found { answer: Ok(credentials), made, is_news: true })
 }
 
 #[cfg(test)]
@@ -540,18 +599,18 @@ mod tests {
     fn requests_of_a_node_take_one_place_and_one_batch_is_under_way() {
         let bench = Bench::new();
         let (arm, desk) = (bench.enroll("arm"), bench.enroll("desk"));
-        let mut queue = RenewalQueue::default();
+        let mut queue = DeskQueue::default();
         for _ in 0..1000 {
             queue.push(request(&arm, &other_key()[..10])).unwrap();
         }
         queue.push(request(&arm, b"last")).unwrap();
         queue.push(request(&desk, b"desk")).unwrap();
-        let batch = queue.next_batch().unwrap();
+        let batch = queue.next_batch().unwrap().renewals;
         assert_eq!(batch.iter().map(|r| &r.csr[..]).collect::<Vec<_>>(), [b"last", b"desk"]);
         queue.push(request(&arm, b"next")).unwrap();
         assert!(queue.next_batch().is_none(), "a second job would wait for the file's lock");
         queue.end_batch();
-        assert_eq!(queue.next_batch().unwrap().len(), 1);
+        assert_eq!(queue.next_batch().unwrap().renewals.len(), 1);
         queue.end_batch();
         assert!(queue.next_batch().is_none());
     }
@@ -559,7 +618,7 @@ mod tests {
     #[test]
     fn the_queue_is_bounded_and_goes_in_batches() {
         let arm = Bench::new().enroll("arm");
-        let mut queue = RenewalQueue::default();
+        let mut queue = DeskQueue::default();
         let numbered = |n: usize| {
             let mut request = request(&arm, b"csr");
             request.peer.node_id.0[..8].copy_from_slice(&n.to_be_bytes());
@@ -570,6 +629,6 @@ mod tests {
         }
         assert_eq!(queue.push(numbered(RENEWALS_WAITING_MAX)), Err(RenewalRefusal::QueueFull));
         assert_eq!(queue.push(numbered(0)), Ok(()), "who has a place keeps it");
-        assert_eq!(queue.next_batch().unwrap().len(), RENEWAL_BATCH_MAX);
+        assert_eq!(queue.next_batch().unwrap().renewals.len(), RENEWAL_BATCH_MAX);
     }
 }

@@ -6,6 +6,7 @@
 mod alerts;
 mod graph;
 mod nodes;
+mod operations;
 mod outputs;
 mod publish;
 mod quality;
@@ -15,7 +16,6 @@ mod trust;
 mod types;
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -27,15 +27,15 @@ use sgc_ros::{
 };
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
-use sgc_trust::{CrlError, Identity, TrustAnchors};
+use sgc_trust::{CrlError, Identity, NodeName, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Name, NodeId, Now, SourceId, UnixMillis};
+use sgc_wire::{Control, Name, NodeId, Now, Operation, OperationAnswer, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tracing::debug;
 
 use crate::alerts::{Alerts, clock_alert};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
-use crate::authority::{Authority, RenewalAnswer};
+use crate::authority::{Authority, DeskAnswers};
 use crate::calls::Calls;
 use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::nodes::LocalGraph;
@@ -49,6 +49,7 @@ use crate::graph::Graph;
 use crate::heart::{Heart, Patience};
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
+use crate::operations::{OperationError, Operations};
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
 use crate::replays::Replays;
@@ -160,8 +161,17 @@ pub(crate) enum CoreEvent {
         /// Told when it is done.
         reply: oneshot::Sender<()>,
     },
-    /// What the fleet's file holds for those who asked this authority.
-    RenewalsReady(Vec<RenewalAnswer>),
+    /// What the fleet's file holds for those who asked this authority, and what came of operations.
+    DeskAnswered(DeskAnswers),
+    /// A user wants an operation on the fleet to be carried out at its authority.
+    Operate {
+        /// The authority's name.
+        at: NodeName,
+        /// The operation.
+        operation: Operation,
+        /// Where to answer.
+        reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
+    },
     /// The user brings a revocation list; answered with whether it is news, and with the lists that were in force before.
     Crl {
         /// The list, DER.
@@ -257,6 +267,8 @@ pub(crate) struct Core<N: RosNetwork> {
     gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
+    /// What users of this node ask an authority for.
+    operations: Operations,
     keeper: Keeper,
     /// When to ask for another certificate.
     renew_due: Option<Instant>,
@@ -293,8 +305,8 @@ pub(crate) struct CoreParts<N> {
     pub gateway: Arc<Gateway>,
     /// What peers may send into this node.
     pub(crate) rates: PeerRates,
-    /// The fleet's file, if this node is the authority of its fleet.
-    pub authority: Option<PathBuf>,
+    /// Set if this node is the authority of its fleet.
+    pub authority: Option<Authority>,
     /// Messages of one source under one key.
     pub epoch_messages_max: u64,
     /// For the suites of its shares.
@@ -371,7 +383,8 @@ impl<N: RosNetwork> Core<N> {
             epoch_over: Arc::default(),
             credentials: parts.credentials,
             gateway: parts.gateway,
-            authority: parts.authority.map(Authority::new),
+            authority: parts.authority,
+            operations: Operations::default(),
             keeper: parts.keeper,
             renew_due: None,
             redial: parts.redial,
@@ -518,7 +531,8 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
-            CoreEvent::RenewalsReady(answers) => self.renewals_ready(answers),
+            CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
+            CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
             CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
                 self.add_message_keys(message_keys);
                 self.reconfigure(shares, uses, anchors);
@@ -596,6 +610,7 @@ impl<N: RosNetwork> Core<N> {
         for name in long {
             self.endpoint.rotate(now, &name);
         }
+        self.operations_due(now.instant);
         self.calls_due(now.instant);
         self.types_due(now.instant);
         self.rekey_due(now);
@@ -637,7 +652,7 @@ impl<N: RosNetwork> Core<N> {
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
-                let own = [self.renew_due, self.silence_due, self.look_due];
+                let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
                 let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
                 let all = all.into_iter().chain(own).chain([self.types.deadline()]);
                 return all.flatten().min();
@@ -680,6 +695,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Takes back what was shared, and says goodbye.
     fn stop(&mut self) -> Vec<AnyLink> {
+        self.operations.stop();
         self.endpoint.withdraw_all(now());
         self.drain();
         for entry in self.links.values() {

@@ -28,6 +28,7 @@ use crate::access::{AccessError, access_with, refused_tokens};
 use crate::admin::{self, Desk};
 use crate::alerts::clock_alert;
 use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
+use crate::authority::Authority;
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
@@ -41,6 +42,7 @@ use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
 use crate::message_keys;
 use crate::peer_rate::PeerRates;
+use crate::policy::grantees;
 use crate::reload::{ConfigSource, Reloader, Running};
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
@@ -364,6 +366,7 @@ pub async fn run_on<N: RosNetwork>(
     let endpoint_config = EndpointConfig {
         identity: identity.clone(),
         authority: config.authority.is_some(),
+        operations: config.authority.as_ref().is_some_and(|a| !a.operators.is_empty()),
         limits: sgc_endpoint::Limits {
             rotate_every: config.rotation.every,
             ..sgc_endpoint::Limits::default()
@@ -420,7 +423,10 @@ pub async fn run_on<N: RosNetwork>(
         board: board.clone(),
         patience,
         message_keys,
-        authority: config.authority.clone(),
+        authority: config.authority.as_ref().map(|wanted| {
+            let operators = grantees(&wanted.operators, &identity, &rules.partners);
+            Authority::new(wanted.fleet.clone(), operators, identity.node_id())
+        }),
         epoch_messages_max: config.rotation.messages,
         rates: PeerRates::new(config.peer_rate),
         keeper: Keeper::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),

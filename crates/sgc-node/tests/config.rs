@@ -986,6 +986,7 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
         trust = ["old-ca.pem", "/ca/other.pem"]
         [authority]
         fleet = "lab.fleet"
+        operators = ["group:operators", "desk"]
         [rotation]
         every = "15min"
         messages = 4096
@@ -997,7 +998,10 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
     );
     assert_eq!(config.state.as_deref(), Some(Path::new("/etc/sgc/state")));
     assert_eq!(config.trust, [Path::new("/etc/sgc/old-ca.pem"), Path::new("/ca/other.pem")]);
-    assert_eq!(config.authority.as_deref(), Some(Path::new("/etc/sgc/lab.fleet")));
+    let authority = config.authority.unwrap();
+    assert_eq!(authority.fleet, Path::new("/etc/sgc/lab.fleet"));
+    let operators: Vec<_> = authority.operators.iter().map(ToString::to_string).collect();
+    assert_eq!(operators, ["group:operators", "desk"]);
     let every = std::time::Duration::from_secs(900);
     assert_eq!(config.rotation, RotationConfig { every, messages: 4096 });
     let file = Some(PathBuf::from("/var/log/sgc.jsonl"));
@@ -1036,6 +1040,15 @@ fn trust_authority_rotation_and_audit_are_taken_over() {
         (
             "[audit]\noff = true\nfile = 'x'",
             &["node.toml:5: `off` is true, but `file` is given: take one of them out"],
+        ),
+        (
+            "[authority]\nfleet = 'a.fleet'\noperators = ['group:ops', '*', 'partner:acme']",
+            &[
+                "node.toml:5: `operators` names \"*\": operators change the fleet itself, so each is a node (\"desk\") or a \
+                 group (\"group:operators\") of it",
+                "node.toml:5: `operators` names \"partner:acme\": operators change the fleet itself, so each is a node \
+                 (\"desk\") or a group (\"group:operators\") of it",
+            ],
         ),
         ("[authority]", &["node.toml:3: [authority] has no `fleet`; add one, such as fleet = \"lab.fleet\""]),
         ("node.trust = ['a', 'a']", &["node.toml:3: `trust` names \"a\" twice; once is enough"]),

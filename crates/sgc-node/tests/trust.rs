@@ -12,14 +12,22 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use lab::*;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
 use sgc_node::audit::AuditRecord;
-use sgc_node::config::{Config, TokenConfig, TokenSource, UseConfig};
+use sgc_node::config::{AuthorityConfig, Config, Recipient, TokenConfig, TokenSource, UseConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords};
-use sgc_trust::{EnrollRequest, Identity, ShareToken, Suite, TopicSecret, derive_name};
-use sgc_wire::{Metadata, UnixMillis};
+use sgc_transport::{AnyLink, CloseReason, Dialer, Link as _, LinkOptions};
+use sgc_trust::{
+    EnrollRequest, Identity, Kem, KeyRequest, Membership, ReplyKey, ShareToken, Suite, TopicSecret,
+    derive_name, name_of, operations_blind,
+};
+use sgc_wire::{
+    Answer, AnswerBody, Control, Decode as _, Encode as _, GrantContent, Hello, JoinBody, Metadata, Name,
+    Operation, OperationAnswer, OperationRefusal, OperationRequest, Request, Signed, SinkId, UnixMillis,
+};
 use support::*;
 
 #[test]
@@ -213,7 +221,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     stream.more(100);
     assert_eq!((until("desk"), lab.identity("desk").chain()), (old.not_after(), old.chain()));
 
-    let keeper = lab.start("keeper", |c| c.authority = Some(lab.fleet_file()));
+    let keeper = lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())));
     wait("both have new certificates", || {
         lab.identity("desk").chain() != old.chain() && lab.identity("robot").chain() != old_robot.chain()
     });
@@ -292,7 +300,8 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
         request.valid = Duration::from_secs(3600);
         request.now.0 -= 2_500_000;
     });
-    let (_cloud, keeper) = (lab.cloud(), lab.start("keeper", |c| c.authority = Some(lab.fleet_file())));
+    let (_cloud, keeper) =
+        (lab.cloud(), lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file()))));
     let old = lab.identity("desk");
     let desk = lab.start("desk", |_| {});
     wait("it is renewed", || lab.identity("desk").chain() != old.chain());
@@ -327,6 +336,252 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
     assert_eq!(certificates(), 2);
 }
 
+impl Lab {
+    /// A fleet with an authority, `keeper`, and an operator, `desk`.
+    fn with_operator(nodes: &[&str]) -> Self {
+        let lab = Self::new(&[]);
+        lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
+        lab.enroll("keeper", |_| {});
+        lab.enroll("desk", |request| request.groups.push("operators".parse().unwrap()));
+        nodes.iter().for_each(|node| lab.enroll(node, |_| {}));
+        lab
+    }
+
+    fn keeper(&self) -> Node {
+        self.start("keeper", |c| {
+            let operators = vec![Recipient::Group("operators".parse().unwrap())];
+            c.authority = Some(AuthorityConfig { fleet: self.fleet_file(), operators });
+        })
+    }
+
+    fn certificates(&self, node: &str) -> usize {
+        let read = sgc_node::read_fleet(&self.fleet_file()).unwrap();
+        read.node(&node.parse().unwrap()).map_or(0, |n| n.certificates.len())
+    }
+}
+
+/// Has an authority carry something out; the answer, or what the user is told.
+fn operate(node: &Node, at: &str, operation: Operation) -> Result<OperationAnswer, String> {
+    use base64::Engine as _;
+    let answer = node.ask(&AdminRequest::Operate { at: at.parse().unwrap(), operation });
+    match answer["error"].as_str() {
+        Some(error) => Err(error.to_owned()),
+        None => {
+            let encoded = answer["ok"]["answer"].as_str().unwrap();
+            let bytes = base64::engine::general_purpose::STANDARD.decode(encoded).unwrap();
+            Ok(OperationAnswer::from_slice(&bytes).unwrap())
+        }
+    }
+}
+
+fn revoke(node: &str) -> Operation {
+    Operation::Revoke { nodes: vec![node.to_owned()] }
+}
+
+/// A request of a node for a certificate, whose key nobody needs.
+fn enroll(node: &str) -> Operation {
+    let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
+    Operation::Enroll {
+        node: node.to_owned(),
+        groups: vec!["arms".into()],
+        router: false,
+        may_route: false,
+        again: false,
+        valid_ms: 3_600_000,
+        csr: Bytes::copy_from_slice(made.csr()),
+    }
+}
+
+#[test]
+fn an_operator_has_operations_carried_out_at_the_authority() {
+    let lab = Lab::with_operator(&["thief", "guest"]);
+    let (cloud, keeper) = (lab.cloud(), lab.keeper());
+    let (desk, thief) = (lab.start("desk", |_| {}), lab.start("thief", |_| {}));
+    wait("all are linked", || cloud.peers().len() == 3);
+
+    let done = operate(&desk, "keeper", enroll("arm"));
+    let Ok(OperationAnswer::Membership(text)) = done else { panic!("{done:?}") };
+    let member = Membership::parse(text.expose()).unwrap();
+    assert_eq!((member.node_name().as_str(), lab.certificates("arm")), ("arm", 1));
+    let listed = operate(&desk, "keeper", Operation::List { after: None });
+    let Ok(OperationAnswer::Roster(roster)) = listed else { panic!("{listed:?}") };
+    let names: Vec<_> = roster.nodes.iter().map(|node| node.name.as_str()).collect();
+    assert_eq!(names, ["arm", "cloud", "desk", "guest", "keeper", "thief"]);
+    let of = |name: &str| roster.nodes.iter().find(|node| node.name == name).unwrap();
+    assert_eq!((&of("arm").groups[..], roster.more), (&["arms".to_owned()][..], false));
+    let rest = operate(&desk, "keeper", Operation::List { after: Some("guest".into()) });
+    let Ok(OperationAnswer::Roster(rest)) = rest else { panic!("{rest:?}") };
+    assert_eq!(rest.nodes.len(), 2);
+
+    // Whoever is revoked is out everywhere, at once.
+    let id = lab.id("thief").to_string();
+    let done = operate(&desk, "keeper", revoke("thief"));
+    assert!(matches!(done, Ok(OperationAnswer::Revoked { list: 1.. })), "{done:?}");
+    wait("the thief is cut off", || !cloud.peers().contains(&id));
+    let said: Vec<_> = lab.audit("keeper").into_iter().filter(|r| r.event == "operation").collect();
+    assert!(said.iter().all(|r| r.peer == Some(lab.id("desk").to_string())), "{said:?}");
+    let said: Vec<_> = said.iter().map(|r| r.reason.as_deref().unwrap()).collect();
+    assert_eq!(said, ["enroll arm: done", "list: done", "list: done", "revoke thief: done"]);
+
+    // What is not possible is said.
+    let refused = |done: Result<OperationAnswer, String>| match done {
+        Ok(OperationAnswer::Refused { detail, .. }) => detail,
+        other => panic!("{other:?}"),
+    };
+    assert!(refused(operate(&desk, "keeper", revoke("nobody"))).contains("has no node nobody"));
+    assert!(refused(operate(&desk, "keeper", revoke("keeper"))).contains("does not revoke itself"));
+    assert!(refused(operate(&desk, "keeper", enroll("thief"))).contains("was revoked at"));
+    assert_eq!(keeper.drops("operation_refused"), 3);
+    let own = operate(&keeper, "keeper", revoke("guest")).unwrap_err();
+    assert!(own.contains("keeper is this node"), "{own}");
+    let routers = operate(&cloud, "keeper", revoke("guest")).unwrap_err();
+    assert!(routers.contains("this node is a router"), "{routers}");
+    let wrong = operate(&desk, "keepr", revoke("guest")).unwrap_err();
+    assert!(wrong.starts_with("no authority keepr is in reach of this node"), "{wrong}");
+    assert!(wrong.contains("whose identity names another authority"), "{wrong}");
+    drop((desk, thief));
+}
+
+#[test]
+fn who_is_no_operator_changes_nothing() {
+    let lab = Lab::with_operator(&["guest", "thief"]);
+    let (_cloud, keeper) = (lab.cloud(), lab.keeper());
+    let guest = lab.start("guest", |_| {});
+    for operation in [revoke("desk"), enroll("mine"), Operation::List { after: None }] {
+        let said = operate(&guest, "keeper", operation).unwrap_err();
+        assert!(said.starts_with("keeper does not take this node for an operator"), "{said}");
+    }
+    assert!(keeper.drops("operation_not_permitted") >= 3);
+    let refused = |r: &AuditRecord| {
+        r.event == "refused" && r.reason.as_deref() == Some("an operation: it is no operator")
+    };
+    assert!(lab.audit("keeper").iter().any(refused));
+    assert_eq!(lab.certificates("mine"), 0);
+    drop(keeper);
+
+    // Without operators an authority does not even offer it.
+    let _keeper = lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())));
+    let desk = lab.start("desk", |_| {});
+    let said = operate(&desk, "keeper", revoke("guest")).unwrap_err();
+    assert!(said.starts_with("no authority keeper is in reach"), "{said}");
+}
+
+/// A member that speaks the protocol by hand.
+struct ByHand {
+    runtime: tokio::runtime::Runtime,
+    dialer: Dialer,
+    link: AnyLink,
+    identity: Arc<Identity>,
+}
+
+impl ByHand {
+    /// Links to the router, and has learned of `name`.
+    fn start(lab: &Lab, node: &str, name: Name) -> Self {
+        let identity = lab.identity(node);
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _enter = runtime.enter();
+        let dialer = Dialer::new(identity.clone(), LinkOptions::default(), Arc::default());
+        let link = runtime.block_on(dialer.dial(&lab.url().parse().unwrap())).unwrap();
+        drop(_enter);
+        let member = Self { runtime, dialer, link, identity };
+        let (started, yields) = (unix_now(), false);
+        let hello = Hello { minor: 0, incarnation: 7, transit: false, started, yields };
+        member.send(&Control::Hello(hello));
+        member.send(&Control::Interest { names: vec![name] });
+        member.hear(|frame| matches!(frame, Control::Advert { .. }).then_some(()));
+        member
+    }
+
+    fn send(&self, frame: &Control) {
+        self.runtime.block_on(self.link.send_control(frame.to_bytes())).unwrap();
+    }
+
+    fn hear<T>(&self, wanted: impl Fn(Control) -> Option<T>) -> T {
+        self.runtime.block_on(async {
+            loop {
+                let frame = tokio::time::timeout(PATIENCE, self.link.recv_control()).await;
+                let frame = Control::from_slice(&frame.expect("a frame comes").unwrap()).unwrap();
+                if let Some(found) = wanted(frame) {
+                    return found;
+                }
+            }
+        })
+    }
+
+    /// A request to `name`, as it is signed, and what opens its answer.
+    fn request(&self, name: Name, sink: u8, request: &OperationRequest) -> (Signed, ReplyKey) {
+        let reply_key = ReplyKey::generate(Kem::X25519);
+        let body = JoinBody {
+            name,
+            sink: SinkId([sink; 16]),
+            request: Request::Ask { what: request.to_bytes() },
+            issued_at: unix_now(),
+            chain: self.identity.chain_bytes(),
+            reply_key: reply_key.public().clone(),
+        };
+        (self.identity.sign_join(&body), reply_key)
+    }
+
+    /// Sends it and opens the answer.
+    fn ask(&self, name: Name, sink: u8, signed: &Signed, reply_key: &ReplyKey) -> OperationAnswer {
+        let id = SinkId([sink; 16]);
+        let body = loop {
+            self.send(&Control::Join { signed: signed.clone() });
+            let body = self.hear(|frame| match frame {
+                Control::Answer { signed } => {
+                    Some(Some(AnswerBody::from_slice(&signed.body).unwrap()).filter(|body| body.sink == id))
+                }
+                // There is no way to the authority for a while after its start.
+                Control::Reject { sink, .. } if sink == id => Some(None),
+                _ => None,
+            });
+            match body {
+                Some(body) => break body,
+                None => std::thread::sleep(Duration::from_millis(50)),
+            }
+        };
+        self.send(&Control::Leave { name, sink: id });
+        let Answer::Grant { enc, sealed } = body.answer else { panic!("{:?}", body.answer) };
+        match reply_key.open(&name, &id, body.serial, &enc, &sealed).unwrap() {
+            GrantContent::Operation(answer) => answer,
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_request_that_was_recorded_and_comes_again_is_not_carried_out_again() {
+    let lab = Lab::with_operator(&[]);
+    let (_cloud, keeper) = (lab.cloud(), lab.keeper());
+    let ca = lab.identity("keeper").as_peer().ca;
+    let name = name_of(&lab.id("keeper"), &operations_blind(&ca));
+    let desk = ByHand::start(&lab, "desk", name);
+    let (asks, key) = desk.request(name, 1, &OperationRequest::Challenge);
+    let OperationAnswer::Challenge(challenge) = desk.ask(name, 1, &asks, &key) else {
+        panic!("no challenge")
+    };
+    let execute = OperationRequest::Execute { challenge, operation: enroll("arm") };
+    let (recorded, key) = desk.request(name, 2, &execute);
+    let first = desk.ask(name, 2, &recorded, &key);
+    assert!(matches!(first, OperationAnswer::Membership(_)), "{first:?}");
+    assert_eq!(lab.certificates("arm"), 1);
+
+    // The frame, bit for bit, as a router on the way could play it; and its content in another request of the node.
+    assert_eq!(desk.ask(name, 2, &recorded, &key), first);
+    let (again, other_key) = desk.request(name, 3, &execute);
+    assert_eq!(desk.ask(name, 3, &again, &other_key), first);
+    assert_eq!((lab.certificates("arm"), keeper.drops("operation_repeated")), (1, 2));
+
+    // Another run knows nothing of it, and refuses.
+    keeper.kill();
+    let keeper = lab.keeper();
+    desk.hear(|frame| matches!(frame, Control::Advert { .. }).then_some(()));
+    let stale = desk.ask(name, 2, &recorded, &key);
+    assert!(matches!(stale, OperationAnswer::Refused { why: OperationRefusal::Stale, .. }), "{stale:?}");
+    assert_eq!((lab.certificates("arm"), keeper.drops("operation_stale")), (1, 1));
+    desk.runtime.block_on(desk.dialer.close(CloseReason::Goodbye));
+}
+
 #[test]
 fn telling_a_router_a_list_returns_those_that_it_has() {
     let lab = Lab::new(&["desk", "tab"]);
@@ -358,7 +613,7 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
     lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
     ["keeper", "robot", "desk", "late"].iter().for_each(|node| lab.enroll(node, |_| {}));
     let cloud = lab.cloud();
-    let keeper = lab.start("keeper", |c| c.authority = Some(lab.fleet_file()));
+    let keeper = lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())));
     let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["*"])]);
     let both = |c: &mut Config| c.uses = vec![uses("/chatter"), uses("/later")];
     let desk = lab.start("desk", both);

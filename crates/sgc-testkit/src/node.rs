@@ -232,6 +232,7 @@ impl Node {
         let config = EndpointConfig {
             identity: self.identity.clone(),
             authority: false,
+            operations: false,
             limits: self.endpoint_limits.clone(),
         };
         let mut endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(seed), now);

@@ -139,6 +139,8 @@ impl Fleet {
             groups: Vec::new(),
             router: false,
             may_route: peer.may_route,
+            generation: 0,
+            seen: None,
             certificates: Vec::new(),
         });
         // The CA made the certificate, so the incarnation was given out, if only by another copy of the file.
@@ -184,6 +186,8 @@ impl Fleet {
             groups: request.groups.iter().cloned().collect::<BTreeSet<_>>().into_iter().collect(),
             router: request.router,
             may_route: request.router || request.may_route,
+            generation: if request.router { 0 } else { self.newest_generation() },
+            seen: Some(request.now),
             certificates: Vec::new(),
         };
         if let Some(known) = self.roster.nodes.get(&request.node) {

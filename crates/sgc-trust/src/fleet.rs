@@ -38,6 +38,10 @@ pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
 pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
 /// How long before its making a certificate begins to hold: clocks of machines differ by minutes.
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
+/// How much later a node is seen again before a roster takes note of it: it is written as a whole.
+pub const SEEN_STEP: Duration = Duration::from_secs(86_400);
+/// A node that was seen within this time counts as one that may come back.
+pub const SEEN_RECENTLY: Duration = Duration::from_secs(30 * 86_400);
 /// Longest roster that is kept, bytes.
 pub const ROSTER_BYTES_MAX: usize = 8 * 1024 * 1024;
 
@@ -463,7 +467,36 @@ impl Fleet {
         if now.secs() > not_after.secs() { Err(FleetError::CaExpired { not_after, now }) } else { Ok(()) }
     }
 
-    fn newest_generation(&self) -> u32 {
+    /// Notes that a node of the roster is handed the secrets in use. True if that is to be kept: they are news to it, or
+    /// it has not been seen for [`SEEN_STEP`].
+    pub fn note_handed(&mut self, node: &NodeName, now: UnixMillis) -> Result<bool, FleetError> {
+        let newest = self.newest_generation();
+        let Some(node) = self.roster.nodes.get_mut(node) else { return Ok(false) };
+        let generation = if node.router { 0 } else { newest };
+        let step = SEEN_STEP.as_millis() as u64;
+        let is_old = node.seen.is_none_or(|seen| seen.0.saturating_add(step) <= now.0);
+        if generation == node.generation && !is_old {
+            return Ok(false);
+        }
+        node.generation = generation;
+        node.seen = node.seen.max(Some(now));
+        self.sign_roster()?;
+        Ok(true)
+    }
+
+    /// Members that would be lost if the generations before this one were retired: they have a certificate that holds,
+    /// were seen recently ([`SEEN_RECENTLY`]) or have an unknown time of it, and were handed no newer generation.
+    pub fn lacking(&self, before: u32, now: UnixMillis) -> impl Iterator<Item = &RosterNode> {
+        let recently = UnixMillis(now.0.saturating_sub(SEEN_RECENTLY.as_millis() as u64));
+        self.nodes().filter(move |node| {
+            let holds = node.expires(self.revocation_of(&node.name)).is_some_and(|until| until >= now);
+            let is_member = !node.router && self.revoked_at(node).is_none();
+            let is_here = node.seen.is_none_or(|seen| seen >= recently);
+            is_member && holds && is_here && node.generation < before
+        })
+    }
+
+    pub(crate) fn newest_generation(&self) -> u32 {
         self.naming.first().map_or(1, |n| n.generation)
     }
 
@@ -572,7 +605,7 @@ impl Merged {
         Self {
             revoked: revoked.map(|(node, _)| name(node)).collect(),
             enrolled: nodes(&|before, _| before.is_none()),
-            changed: nodes(&|before, after| before.is_some_and(|b| b != after)),
+            changed: nodes(&|before, after| before.is_some_and(|b| !b.is_as(after))),
             generations: generations(&|before, _| before.is_none()),
             replaced: generations(&|before, after| before.is_some_and(|b| b.hash != after.hash)),
             settings: before.settings != after.settings,

@@ -215,6 +215,16 @@ impl KeyRequest {
         pem::write(comment, &[(KEY_BLOCK, self.key.pkcs8())])
     }
 
+    /// The private key, PKCS #8.
+    pub fn key(&self) -> &[u8] {
+        self.key.pkcs8()
+    }
+
+    /// The request (PKCS #10), DER. It is no secret.
+    pub fn csr(&self) -> &[u8] {
+        &self.csr
+    }
+
     /// The request (PKCS #10) as text. It is no secret.
     pub fn csr_text(&self) -> String {
         String::clone(&pem::write("", &[("CERTIFICATE REQUEST", &self.csr)]))

@@ -44,6 +44,7 @@ pub use crowd::{
 pub use enrol::EnrollRequest;
 pub use fleet::{
     Absorbed, CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, Merged, ROSTER_BYTES_MAX,
+    SEEN_RECENTLY, SEEN_STEP,
 };
 pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
@@ -52,7 +53,7 @@ pub use issue::{KeyRequest, certificate_uris, requested_key_hash};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
-pub use names::{TopicSecret, derive_name, name_of, renewal_blind, types_blind};
+pub use names::{TopicSecret, derive_name, name_of, operations_blind, renewal_blind, types_blind};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};

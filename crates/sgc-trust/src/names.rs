@@ -83,6 +83,16 @@ pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
     Blind(out)
 }
 
+/// The blind under which the authority of a fleet is asked to carry out operations on it.
+pub fn operations_blind(ca: &CaFingerprint) -> Blind {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc operations v1");
+    context.update(&ca.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Blind(out)
+}
+
 /// The blind under which an owner is asked what the types of its interfaces look like: known to all who know the owner,
 /// also to partners, which cannot derive its catalogue's.
 pub fn types_blind(owner: &NodeId) -> Blind {

@@ -43,6 +43,10 @@ pub struct RosterNode {
     pub router: bool,
     /// True if its certificates let it carry others' names.
     pub may_route: bool,
+    /// The newest generation of the naming secret that it was handed; 0 if that is unknown, or if it has none.
+    pub generation: u32,
+    /// When the fleet last handed it something: a certificate, or secrets.
+    pub seen: Option<UnixMillis>,
     /// Its certificates, those that hold longest last; those that are over are forgotten after a day.
     pub certificates: Vec<IssuedCertificate>,
 }
@@ -52,6 +56,12 @@ impl RosterNode {
     pub fn expires(&self, revocation: Option<Revocation>) -> Option<UnixMillis> {
         let good = self.certificates.iter().filter(|c| c.revoked_at(revocation).is_none());
         good.map(|c| c.not_after).max()
+    }
+
+    /// True if another copy says the same of it, apart from when it was last handed something.
+    pub(crate) fn is_as(&self, other: &Self) -> bool {
+        let Self { generation, seen, .. } = *self;
+        *self == Self { generation, seen, ..other.clone() }
     }
 
     /// Enters certificates of it; one that is there already keeps the earlier revocation.
@@ -73,10 +83,12 @@ impl RosterNode {
     fn join(&mut self, other: &Self) {
         let newest =
             |node: &Self| (node.incarnation, node.changed, node.groups.clone(), node.router, node.may_route);
+        let (generation, seen) = (self.generation.max(other.generation), self.seen.max(other.seen));
         if newest(self) < newest(other) {
             let certificates = std::mem::take(&mut self.certificates);
             *self = Self { certificates, ..other.clone() };
         }
+        (self.generation, self.seen) = (generation, seen);
         self.add_certificates(other.certificates.iter().cloned());
     }
 }
@@ -226,6 +238,8 @@ impl Roster {
             w.list(&node.groups, |w, g| w.str(g.as_str()));
             w.bool(node.router);
             w.bool(node.may_route);
+            w.u32(node.generation);
+            w.option(node.seen.as_ref(), |w, at| at.encode(w));
             w.list(&node.certificates, |w, c| {
                 w.bytes(&c.serial);
                 c.not_after.encode(w);
@@ -308,6 +322,7 @@ fn read_node(r: &mut Reader<'_>) -> Result<ReadNode, DecodeError> {
     let (incarnation, changed) = (r.u32()?, time(r)?);
     let groups = read_groups(r)?;
     let (router, may_route) = (r.bool("router")?, r.bool("may route")?);
+    let (generation, seen) = (r.u32()?, r.option("seen", time)?);
     let certificates = r.list("certificates", NODE_CERTIFICATES_MAX, |r| {
         Ok(IssuedCertificate {
             serial: r.bytes("serial", SERIAL_BYTES_MAX)?.into(),
@@ -316,7 +331,9 @@ fn read_node(r: &mut Reader<'_>) -> Result<ReadNode, DecodeError> {
             revoked: r.option("revoked", time)?,
         })
     })?;
-    Ok((RosterNode { name, incarnation, changed, groups, router, may_route, certificates }, None))
+    let node =
+        RosterNode { name, incarnation, changed, groups, router, may_route, generation, seen, certificates };
+    Ok((node, None))
 }
 
 fn read_node_1(r: &mut Reader<'_>) -> Result<ReadNode, DecodeError> {
@@ -332,9 +349,17 @@ fn read_node_1(r: &mut Reader<'_>) -> Result<ReadNode, DecodeError> {
             revoked: r.option("revoked", time)?,
         })
     })?;
-    let (incarnation, changed) = (0, UnixMillis(0));
-    let mut node =
-        RosterNode { name, incarnation, changed, groups, router, may_route, certificates: Vec::new() };
+    let mut node = RosterNode {
+        name,
+        incarnation: 0,
+        changed: UnixMillis(0),
+        groups,
+        router,
+        may_route,
+        generation: 0,
+        seen: None,
+        certificates: Vec::new(),
+    };
     node.add_certificates(certificates);
     Ok((node, revoked_at))
 }
@@ -378,6 +403,8 @@ mod tests {
             groups: groups.iter().map(|g| g.parse().unwrap()).collect(),
             router: false,
             may_route: true,
+            generation: 3,
+            seen: Some(UnixMillis(2)),
             certificates: vec![certificate(&[1; 16], 5, 0, Some(4)), certificate(&[2], 500_000_000, 1, None)],
         };
         let nodes = [node("arm-1", &["a", "b"]), node("desk", &[])];

@@ -430,3 +430,43 @@ fn certificates_of_another_pki_make_identities() {
     let named = import(KINDS[0], vec![other], Some(&secret)).unwrap_err();
     assert!(matches!(named, IdentityError::NameMismatch { .. }));
 }
+
+#[test]
+fn a_roster_knows_who_was_handed_which_secret() {
+    let (mut fleet, now) = (fleet(), at);
+    let enroll = |fleet: &mut Fleet, node: &str, router| {
+        let request = EnrollRequest { router, ..EnrollRequest::new(name(node), NOW) };
+        fleet.enroll(&request, &mut rng(2)).unwrap();
+    };
+    enroll(&mut fleet, "arm-1", false);
+    enroll(&mut fleet, "desk", false);
+    enroll(&mut fleet, "gone", false);
+    enroll(&mut fleet, "cloud", true);
+    let generation = fleet.rotate_secret(now(1), &mut rng(3)).unwrap();
+    fleet.revoke(&[name("gone")], now(1)).unwrap();
+    let lacking = |fleet: &Fleet, days| {
+        fleet.lacking(generation, now(days)).map(|n| n.name.to_string()).collect::<Vec<_>>()
+    };
+    assert_eq!(lacking(&fleet, 1), ["arm-1", "desk"], "neither the router nor who is revoked");
+    assert!(fleet.note_handed(&name("arm-1"), now(1)).unwrap(), "news");
+    assert!(!fleet.note_handed(&name("arm-1"), now(1)).unwrap(), "told a moment ago");
+    assert!(!fleet.note_handed(&name("nobody"), now(1)).unwrap());
+    assert_eq!(lacking(&fleet, 1), ["desk"]);
+    assert!(fleet.note_handed(&name("arm-1"), now(3)).unwrap(), "seen again");
+    let kept = Fleet::parse(&fleet.to_text()).unwrap();
+    let arm = kept.node(&name("arm-1")).unwrap();
+    assert_eq!((arm.generation, arm.seen), (2, Some(now(3))));
+    assert_eq!(kept.node(&name("cloud")).unwrap().generation, 0);
+    // Who was not seen for long is not waited for, nor who has no certificate that holds.
+    assert_eq!(lacking(&fleet, 30), ["desk"]);
+    assert!(lacking(&fleet, 31).is_empty());
+    fleet.renew(&name("desk"), Duration::from_secs(86_400), now(40), &mut rng(4)).unwrap();
+    assert!(lacking(&fleet, 40).is_empty(), "it has the newest now");
+
+    // Another copy knows of a later hand-out, and of no other change.
+    let mut copy = Fleet::parse(&fleet.to_text()).unwrap();
+    copy.note_handed(&name("arm-1"), now(41)).unwrap();
+    let merged = fleet.merge(&copy, now(42)).unwrap();
+    assert!(merged.changed.is_empty(), "{merged:?}");
+    assert_eq!(fleet.node(&name("arm-1")).unwrap().seen, Some(now(41)));
+}

@@ -6,6 +6,7 @@ use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 use crate::control::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, SOURCE_KEY_BYTES_MAX};
 use crate::ids::{Blind, SecretBytes, SourceId};
 use crate::metadata::Metadata;
+use crate::operation::OperationAnswer;
 use crate::packet::Class;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
@@ -32,6 +33,8 @@ pub enum GrantContent {
     Credentials(Credentials),
     /// What the types of interfaces look like, as far as it was asked for and is known.
     Types(Vec<DescribedType>),
+    /// What came of an operation on a fleet; from its authority.
+    Operation(OperationAnswer),
 }
 
 /// One epoch of one topic.
@@ -174,6 +177,10 @@ impl Encode for GrantContent {
                 w.u8(3);
                 w.list(types, |w, t| t.encode(w));
             }
+            Self::Operation(answer) => {
+                w.u8(4);
+                answer.encode(w);
+            }
         }
     }
 }
@@ -201,6 +208,7 @@ impl Decode for GrantContent {
                 })?,
             })),
             3 => Ok(Self::Types(r.list("types", TYPES_PER_QUESTION_MAX, DescribedType::decode)?)),
+            4 => Ok(Self::Operation(OperationAnswer::decode(r)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }

@@ -34,7 +34,7 @@ pub const CRL_BYTES_MAX: usize = 256 * 1024;
 /// Longest certificate signing request, bytes.
 pub const CSR_BYTES_MAX: usize = 4096;
 /// Longest question to an owner, bytes: a signing request is one.
-pub const ASK_BYTES_MAX: usize = CSR_BYTES_MAX;
+pub const ASK_BYTES_MAX: usize = 2 * CSR_BYTES_MAX;
 /// Longest public key that messages are signed with, bytes (SubjectPublicKeyInfo of RSA 4096).
 pub const SOURCE_KEY_BYTES_MAX: usize = 640;
 /// Longest sealed content of an answer, bytes.
@@ -342,7 +342,8 @@ pub enum Request {
         offer: SourceOffer,
     },
     /// To be answered. What is asked, the name says: that of a fleet's authority takes certificate signing requests
-    /// (PKCS #10, DER), that of an owner's types a [`TypeQuestion`](crate::TypeQuestion).
+    /// (PKCS #10, DER), that of its operations an [`OperationRequest`](crate::OperationRequest), that of an owner's types a
+    /// [`TypeQuestion`](crate::TypeQuestion).
     Ask {
         /// The question.
         what: Bytes,

@@ -12,6 +12,7 @@ mod control;
 mod ids;
 mod message;
 mod metadata;
+mod operation;
 mod packet;
 mod qos;
 mod ros_node;
@@ -37,6 +38,11 @@ pub use ids::{
 };
 pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding, PayloadForm};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
+pub use operation::{
+    Challenge, Operation, OperationAnswer, OperationRefusal, OperationRequest, REFUSAL_DETAIL_BYTES_MAX,
+    REVOKED_AT_ONCE_MAX, ROSTER_ROWS_MAX, ROW_CERTIFICATES_MAX, RosterPage, RosterRow, RowCertificate,
+    SecretText,
+};
 pub use packet::{
     AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, LABEL_SAVES_BYTES, MESSAGE_BYTES_MAX,
     PACKET_VERSION, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,

@@ -5,10 +5,11 @@ use bytes::Bytes;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
-    Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, Packet, PacketHeader, Place, Qos, Recover,
-    RefuseReason, RejectReason, Request, RosNode, SecretBytes, Signed, SinkId, SourceAnnounce, SourceId,
-    TopicGrant, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
+    Control, Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, NodeId, Operation,
+    OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader, Place, Qos, Recover,
+    RefuseReason, RejectReason, Request, RosNode, RosterPage, RosterRow, RowCertificate, SecretBytes, Signed,
+    SinkId, SourceAnnounce, SourceId, TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -132,6 +133,45 @@ fn signed_bodies_and_grants_survive_mutation() {
         GrantContent::Catalogue(Catalogue { version: 2, entries: vec![entry] }),
     ];
     survives::<GrantContent>(&contents.map(|c| c.to_vec()), 6);
+}
+
+#[test]
+fn operations_survive_mutation() {
+    let enroll = Operation::Enroll {
+        node: "arm-1".into(),
+        groups: vec!["arms".into()],
+        router: false,
+        may_route: true,
+        again: false,
+        valid_ms: 1,
+        csr: Bytes::from_static(b"csr"),
+    };
+    let challenge = Challenge([1; 16]);
+    let revoke = Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] };
+    let requests = [enroll, revoke].map(|operation| OperationRequest::Execute { challenge, operation });
+    survives::<OperationRequest>(&requests.map(|r| r.to_vec()), 8);
+    let row = RosterRow {
+        name: "arm-1".into(),
+        id: NodeId([1; 32]),
+        incarnation: 1,
+        groups: vec!["arms".into()],
+        router: false,
+        may_route: false,
+        expires: Some(UnixMillis(1)),
+        revoked: None,
+        generation: 2,
+        seen: Some(UnixMillis(2)),
+        certificates: vec![RowCertificate {
+            serial: Bytes::from_static(&[1; 16]),
+            expires: UnixMillis(1),
+            incarnation: 0,
+            revoked: Some(UnixMillis(2)),
+        }],
+    };
+    let page = RosterPage { fleet: "lab".into(), nodes: vec![row], ..RosterPage::default() };
+    let refused = OperationAnswer::Refused { why: OperationRefusal::Fleet, detail: "no".into() };
+    let contents = [OperationAnswer::Roster(page), refused].map(GrantContent::Operation);
+    survives::<GrantContent>(&contents.map(|c| c.to_vec()), 9);
 }
 
 #[test]

@@ -236,6 +236,20 @@ pub(crate) enum CliError {
         /// Why, with what would be right.
         reason: String,
     },
+    /// Members would lose the names that they find others by.
+    #[error(
+        "{}: not handed generation {generation} of the secret yet: {}. They would find nothing any more: renew them, or \
+         wait until they have asked the authority (`sgc fleet list`); --force retires it all the same",
+        path.display(), some(nodes)
+    )]
+    SecretLacking {
+        /// The fleet file.
+        path: PathBuf,
+        /// The generation.
+        generation: u32,
+        /// The members.
+        nodes: Vec<String>,
+    },
     /// A running node refused what it was asked for.
     #[error("the node at {} refused, everything there is as it was: {}", path.display(), reason.lines().last().unwrap_or_default())]
     NodeRefused {
@@ -351,6 +365,7 @@ impl CliError {
             | Self::Making(_)
             | Self::NoFleetHere
             | Self::SeveralFleets { .. }
+            | Self::SecretLacking { .. }
             | Self::CheckIdentity { .. }
             | Self::RouterCannotName { .. }
             | Self::LogFilter { .. }
@@ -442,6 +457,16 @@ fn chain(error: &dyn Error) -> String {
 
 fn one_line(text: &str) -> String {
     text.lines().map(str::trim).collect::<Vec<_>>().join(" ")
+}
+
+/// Names a few of these.
+fn some(names: &[String]) -> String {
+    const SHOWN_MAX: usize = 10;
+    let mut text = names.iter().take(SHOWN_MAX).map(String::as_str).collect::<Vec<_>>().join(", ");
+    if names.len() > SHOWN_MAX {
+        let _ = write!(text, " and {} more", names.len() - SHOWN_MAX);
+    }
+    text
 }
 
 fn count(errors: &ConfigErrors) -> String {

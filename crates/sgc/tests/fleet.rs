@@ -9,7 +9,7 @@ use std::process::{Command, Output, Stdio};
 
 use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 use rustls_pki_types::CertificateDer;
-use sgc_trust::{CertError, Fleet, Identity, TrustAnchors};
+use sgc_trust::{CertError, Fleet, Identity, TrustAnchors, requested_key_hash};
 use sgc_wire::UnixMillis;
 use tempfile::TempDir;
 
@@ -178,7 +178,7 @@ fn the_roster_is_shown() {
     let shown = place.good(&["fleet", "list"]);
     let lines: Vec<_> = shown.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
     assert!(lines[0].ends_with(", renewed by desk, post-quantum"), "{shown}");
-    assert_eq!(lines[1], "NODE ROLE CERTIFICATE GROUPS");
+    assert_eq!(lines[1], "NODE ROLE CERTIFICATE SECRET LAST SEEN GROUPS");
     assert!(lines[2].starts_with("arm-1 member until ") && lines[2].ends_with(" a, b"), "{shown}");
     assert!(lines[3].starts_with("cloud router until "), "{shown}");
     assert!(lines[4].starts_with("relay member, may route revoked 20"), "{shown}");
@@ -395,6 +395,7 @@ fn commands_at_once_lose_nothing() {
 fn renewal_keeps_key_and_place() {
     let place = Place::with_fleet();
     place.good(&["fleet", "enroll", "arm-1", "--group", "arms", "--valid", "1h"]);
+    place.good(&["fleet", "enroll", "desk"]);
     let before = place.identity("arm-1.identity");
     let said = place.good(&["fleet", "rotate-secret"]);
     assert!(said.contains("generation 2 of the naming secret"), "{said}");
@@ -415,7 +416,18 @@ fn renewal_keeps_key_and_place() {
     assert_ne!(name("old.identity"), name("arm-1.identity"));
 
     assert!(place.bad(&["fleet", "retire-secret", "3"]).contains("generation 2 is the newest"));
-    assert!(place.good(&["fleet", "retire-secret", "2"]).ends_with("generations in use: 2\n"));
+    let said = place.bad(&["fleet", "retire-secret", "2"]);
+    assert!(said.contains("not handed generation 2 of the secret yet: desk. They would find"), "{said}");
+    let json: serde_json::Value = serde_json::from_str(&place.good(&["fleet", "list", "--json"])).unwrap();
+    let secrets: Vec<_> = json["nodes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|n| (&n["secret_generation"], n["seen"].is_string()))
+        .collect();
+    assert_eq!(secrets, [(&2.into(), true), (&1.into(), true)]);
+    let done = place.good(&["fleet", "retire-secret", "2", "--force"]);
+    assert!(done.ends_with("generations in use: 2\n"), "{done}");
     place.good(&["fleet", "renew", "arm-1", "--force"]);
     let forced = place.identity("arm-1.identity");
     assert_eq!(generations(&forced), [2]);
@@ -627,6 +639,126 @@ fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
     place.sign(&["-copy_extensions", "copyall"]);
     let said = place.bad(&[&accept[..], &["--force"]].concat());
     assert!(said.contains("is of a later incarnation of the node"), "{said}");
+}
+
+/// A process of `sgc run`, killed at the end.
+struct Running(std::process::Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+impl Place {
+    /// Runs a node of this directory until it is ready.
+    fn start(&self, node: &str, port: u16, more: &str) -> Running {
+        use std::io::BufRead as _;
+        let text = format!(
+            "identity = \"{node}.identity\"\n[node]\nname = \"{node}\"\nstate = \"{node}.state\"\nwatch = false\n{}\
+             [admin]\nsocket = \"{node}.sock\"\n{more}",
+            if node == "cloud" {
+                String::new()
+            } else {
+                format!("routers = [\"quic://127.0.0.1:{port}\"]\n")
+            },
+        );
+        self.write(&format!("{node}.toml"), &text, 0o644);
+        let mut command = self.command(&["run", "-c", &format!("{node}.toml"), "--print-ready"]);
+        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        std::io::BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        assert!(!line.is_empty(), "{node} does not start");
+        Running(child)
+    }
+
+    fn keeper(&self, port: u16) -> Running {
+        let more = "[authority]\nfleet = \"lab.fleet\"\noperators = [\"group:operators\"]\n";
+        self.start("keeper", port, more)
+    }
+}
+
+fn wait(what: &str, is_so: impl Fn() -> bool) {
+    let until = std::time::Instant::now() + std::time::Duration::from_secs(60);
+    while !is_so() {
+        assert!(std::time::Instant::now() < until, "{what}");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
+    place.good(&["fleet", "enroll", "cloud", "--router"]);
+    place.good(&["fleet", "enroll", "desk", "--group", "operators"]);
+    for node in ["keeper", "arm-1", "arm-2"] {
+        place.good(&["fleet", "enroll", node]);
+    }
+    let port = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
+    let keeper = place.keeper(port);
+    let (_desk, _arm) = (place.start("desk", port, ""), place.start("arm-1", port, ""));
+    let at = ["--at", "keeper", "--socket", "desk.sock"];
+    let good = |args: &[&str]| place.good(&[&["fleet"], args, &at].concat());
+    let refused = |args: &[&str]| {
+        let ran = place.run(&[&["fleet"], args].concat());
+        assert_eq!((ran.status.code(), ran.stdout.as_slice()), (Some(1), &b""[..]), "{args:?}");
+        String::from_utf8(ran.stderr).unwrap()
+    };
+
+    let shown = good(&["list"]);
+    assert!(shown.contains("renewed by keeper") && shown.contains("arm-2"), "{shown}");
+    let json: serde_json::Value = serde_json::from_str(&good(&["list", "--json"])).unwrap();
+    assert_eq!(json["nodes"].as_array().unwrap().len(), 5);
+
+    // With a key of the node's own, and with one made here.
+    place.good(&["fleet", "request", "arm-3"]);
+    good(&["enroll", "arm-3", "--csr", "arm-3.csr", "--group", "arms"]);
+    place.good(&["fleet", "accept", "arm-3.answer"]);
+    good(&["enroll", "arm-4"]);
+    let (arm_3, arm_4) = (place.identity("arm-3.identity"), place.identity("arm-4.identity"));
+    assert_eq!(arm_3.groups(), [place.fleet().secret().group_tag("arms")]);
+    assert_eq!(arm_4.node_id(), place.fleet().node_id_of(&"arm-4".parse().unwrap()));
+    good(&["renew", "arm-4", "--valid", "100d"]);
+    let renewed = place.identity("arm-4.identity");
+    assert!(renewed.not_after() > arm_4.not_after());
+    let key = |identity: &Identity| requested_key_hash(&identity.csr());
+    assert_eq!(key(&renewed), key(&arm_4));
+
+    // Refusals say what is wrong.
+    let said = refused(&["revoke", "arm-2", "--at", "keeper", "--socket", "arm-1.sock"]);
+    assert!(said.contains("keeper does not take this node for an operator"), "{said}");
+    let said = refused(&["revoke", "arm-2", "--at", "keepr", "--socket", "desk.sock"]);
+    assert!(said.contains("no authority keepr is in reach of this node"), "{said}");
+    let said = refused(&[&["revoke", "nobody"][..], &at].concat());
+    assert!(said.contains("keeper refuses: the fleet's roster has no node nobody"), "{said}");
+
+    // The authority is killed with the operation under way: it has asked for the lock of the fleet's file.
+    let held = sgc_node::LockedFleet::open(&place.path("lab.fleet")).unwrap();
+    let command =
+        place.command(&[&["fleet", "revoke", "arm-2"][..], &at].concat()).stderr(Stdio::piped()).spawn();
+    let inode =
+        format!(":{} ", std::os::unix::fs::MetadataExt::ino(&fs::metadata(place.path("lab.fleet")).unwrap()));
+    let waits = |line: &str| line.contains("->") && line.contains(&inode);
+    wait("it waits for the file", || fs::read_to_string("/proc/locks").unwrap().lines().any(waits));
+    drop(keeper);
+    drop(held);
+    let _keeper = place.keeper(port);
+    let ran = command.unwrap().wait_with_output().unwrap();
+    let said = String::from_utf8(ran.stderr).unwrap();
+    assert!(
+        said.contains("or was restarted meanwhile") && said.contains("sgc fleet list --at keeper"),
+        "{said}"
+    );
+    let is_revoked = || {
+        let json: serde_json::Value = serde_json::from_str(&good(&["list", "--json"])).unwrap();
+        json["nodes"].as_array().unwrap().iter().any(|n| n["name"] == "arm-2" && n["revoked"].is_string())
+    };
+    assert!(!is_revoked());
+    assert!(good(&["revoke", "arm-2"]).contains("arm-2: revoked\nRevocation list "));
+    assert!(is_revoked());
 }
 
 #[test]

@@ -116,6 +116,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         trust: Vec::new(),
         watch: None,
         authority: None,
+        operators: None,
         rotation: RotationDraft::default(),
         audit: AuditDraft::default(),
         transport: TransportDraft::default(),

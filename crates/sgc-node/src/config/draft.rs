@@ -65,6 +65,7 @@ pub(super) struct Draft {
     pub(super) trust: Vec<Located<String>>,
     pub(super) watch: Option<Located<bool>>,
     pub(super) authority: Option<Located<PathBuf>>,
+    pub(super) operators: Option<Located<Vec<Located<String>>>>,
     pub(super) rotation: RotationDraft,
     pub(super) audit: AuditDraft,
     pub(super) transport: TransportDraft,

@@ -377,6 +377,17 @@ pub enum Mistake {
         /// The longest name, in bytes.
         max: usize,
     },
+    /// Not a node or a group of this fleet.
+    #[error(
+        "`{key}` names {value:?}: operators change the fleet itself, so each is a node (\"desk\") or a group \
+         (\"group:operators\") of it"
+    )]
+    Operator {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
     /// Not the id of a node.
     #[error("`{key}` names {value:?}; a node id is 64 hexadecimal digits: `sgc status` there shows it")]
     NodeId {

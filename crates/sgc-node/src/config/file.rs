@@ -134,6 +134,11 @@ impl FileReader<'_> {
             ),
             watch: self.boolean(node.as_ref(), "watch", "true or false"),
             authority: self.authority(authority.as_ref()),
+            operators: self.strings(
+                authority.as_ref(),
+                "operators",
+                "an array of strings, such as [\"group:operators\"]",
+            ),
             rotation: RotationDraft {
                 every: self.string(rotation.as_ref(), "every", "a string, such as \"1h\""),
                 messages: self.integer(rotation.as_ref(), "messages", "a number, such as 16777216"),

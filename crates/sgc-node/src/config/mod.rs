@@ -106,8 +106,8 @@ pub struct Config {
     pub trust: Vec<PathBuf>,
     /// Whether the file is read again when it changes.
     pub watch: bool,
-    /// The fleet file, if this node is its fleet's authority.
-    pub authority: Option<PathBuf>,
+    /// Set if this node is its fleet's authority.
+    pub authority: Option<AuthorityConfig>,
     /// Where this node keeps what it has to remember, if not in its usual place.
     pub state: Option<PathBuf>,
     /// When topics get new keys.
@@ -120,6 +120,22 @@ pub struct Config {
     pub gateway: Option<GatewayConfig>,
     /// Where the status socket goes, if not in its usual place.
     pub admin_socket: Option<PathBuf>,
+}
+
+/// A fleet's authority.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AuthorityConfig {
+    /// The fleet file.
+    pub fleet: PathBuf,
+    /// Nodes and groups that may have operations on the fleet carried out.
+    pub operators: Vec<Recipient>,
+}
+
+impl AuthorityConfig {
+    /// An authority without operators.
+    pub fn new(fleet: PathBuf) -> Self {
+        Self { fleet, operators: Vec::new() }
+    }
 }
 
 /// How links are made, whatever their transport can do of it.

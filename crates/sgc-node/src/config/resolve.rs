@@ -21,9 +21,9 @@ use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
 use super::schema::nearest;
 use super::{
-    AuditConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig, RosConfig,
-    RotationConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
-    ros_env,
+    AuditConfig, AuthorityConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
+    RosConfig, RotationConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig,
+    UseConfig, ros_env,
 };
 use crate::audit::AuditRoom;
 
@@ -124,7 +124,10 @@ pub(super) fn resolve(
     let uses = resolver.uses(draft, node_name.as_ref());
     let tokens = resolver.tokens(draft);
     let trust = resolver.ca_files(&draft.trust, TRUST_MAX);
+    let operators = draft.operators.as_ref().map(|operators| resolver.operators(operators));
     let authority = draft.authority.as_ref().and_then(|fleet| resolver.fleet(fleet));
+    let authority =
+        authority.map(|fleet| AuthorityConfig { fleet, operators: operators.unwrap_or_default() });
     let state = draft.state.as_ref().and_then(|state| resolver.path(state, "\"/var/lib/sgc/arm-1\""));
     let rotation = resolver.rotation(draft);
     let audit = resolver.audit(draft);
@@ -367,6 +370,28 @@ impl Resolver<'_> {
             && only == name
         {
             self.record(&to.origin, Mistake::OnlyItself { key: to.key, name: name.to_string() });
+        }
+        valid
+    }
+
+    fn operators(&mut self, written: &Located<Vec<Located<String>>>) -> Vec<Recipient> {
+        if written.value.len() > RECIPIENTS_MAX {
+            let (key, count) = (written.key, written.value.len());
+            self.record(&written.origin, Mistake::TooManyEntries { key, count, max: RECIPIENTS_MAX });
+        }
+        let mut valid = Vec::new();
+        for one in written.value.iter().take(RECIPIENTS_MAX) {
+            let Some(operator) = self.keep(one, names::recipient) else { continue };
+            let (key, value) = (one.key, one.value.clone());
+            match operator {
+                Recipient::Everyone | Recipient::Partner(_) => {
+                    self.record(&one.origin, Mistake::Operator { key, value });
+                }
+                _ if valid.contains(&operator) => {
+                    self.record(&one.origin, Mistake::Repeated { key, value });
+                }
+                Recipient::Node(_) | Recipient::Group(_) => valid.push(operator),
+            }
         }
         valid
     }

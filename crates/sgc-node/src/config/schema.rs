@@ -149,7 +149,7 @@ impl Table {
             Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
             Self::Transport => &["congestion", "offload", "mtu_discovery", "dtls_1_2", "dscp", "lane_dscp"],
             Self::Admin => &["socket"],
-            Self::Authority => &["fleet"],
+            Self::Authority => &["fleet", "operators"],
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "files", "off"],
             Self::Partner => &["name", "ca", "node"],

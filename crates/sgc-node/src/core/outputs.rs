@@ -106,6 +106,9 @@ impl<N: RosNetwork> Core<N> {
         self.audit_event(&event);
         match event {
             Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::OperationAsked { sink, peer, request } => self.operation_asked(sink, &peer, &request),
+            Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
+            Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
             Event::RenewRefused { by } => {
                 if self.control_drops.count("renewal_refused") {
@@ -201,6 +204,9 @@ impl<N: RosNetwork> Core<N> {
             Event::RenewAsked { .. }
             | Event::Renewed { .. }
             | Event::RenewRefused { .. }
+            | Event::OperationAsked { .. }
+            | Event::OperationAnswered { .. }
+            | Event::OperationDenied { .. }
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)

@@ -12,7 +12,7 @@ use tracing::{info, warn};
 
 use super::{Core, CoreEvent, now};
 use crate::audit::{AuditEvent, AuditRecord};
-use crate::authority::{Asker, RenewalAnswer, RenewalRefusal, RenewalRequest};
+use crate::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
@@ -52,13 +52,13 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Has the requests that wait answered where that may block, unless others are being answered.
-    fn answer_next_batch(&mut self) {
+    pub(super) fn answer_next_batch(&mut self) {
         let (Some(authority), Some(events)) = (&mut self.authority, self.events.upgrade()) else { return };
         let Some(job) = authority.next_job() else { return };
         let alive = self.alive.clone();
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
-            let _ = events.blocking_send(CoreEvent::RenewalsReady(job(now())));
+            let _ = events.blocking_send(CoreEvent::DeskAnswered(job(now())));
         });
     }
 
@@ -75,8 +75,10 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Gives everyone of a batch what the fleet's file says.
-    pub(super) fn renewals_ready(&mut self, answers: Vec<RenewalAnswer>) {
-        answers.into_iter().for_each(|answer| self.renewal_ready(answer));
+    pub(super) fn desk_answered(&mut self, answers: DeskAnswers) {
+        let DeskAnswers { renewals, operations } = answers;
+        operations.into_iter().for_each(|done| self.operation_done(done));
+        renewals.into_iter().for_each(|answer| self.renewal_ready(answer));
         if let Some(authority) = &mut self.authority {
             authority.queue.end_batch();
         }
@@ -88,6 +90,11 @@ impl<N: RosNetwork> Core<N> {
             && self.control_drops.count_from(why.key(), node)
         {
             warn!(peer = %node.short(), %why, "gives no credentials; counted from here on");
+        }
+        if answer.is_ok()
+            && let Some(authority) = &mut self.authority
+        {
+            authority.note_seen([node], now().unix);
         }
         let answer = answer.map_err(RenewalRefusal::refuse_reason);
         match asker {

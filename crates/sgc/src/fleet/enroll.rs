@@ -4,12 +4,17 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use bytes::Bytes;
 use clap::Args;
-use sgc_trust::{EnrollRequest, GroupName, Identity, LEAF_VALIDITY_DEFAULT, NodeName, pem_contents};
-use sgc_wire::UnixMillis;
+use sgc_node::LockedFleet;
+use sgc_trust::{
+    EnrollRequest, GroupName, Identity, KeyRequest, LEAF_VALIDITY_DEFAULT, Membership, NodeName, pem_contents,
+};
+use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
-use super::{DAY, WhichFleet, copies, parse_span, system_rng, unix_now};
+use super::remote::{Keeping, Remote};
+use super::{DAY, copies, parse_span, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
@@ -23,7 +28,7 @@ pub(super) struct EnrollArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
     node: String,
     #[command(flatten)]
-    which: WhichFleet,
+    keeping: Keeping,
     /// A group for the node to be in; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
@@ -51,7 +56,7 @@ pub(super) struct RenewArgs {
     /// Name of the node
     node: String,
     #[command(flatten)]
-    which: WhichFleet,
+    keeping: Keeping,
     /// Answer this request, which the node made with `sgc fleet request`
     #[arg(long, value_name = "FILE")]
     csr: Option<PathBuf>,
@@ -105,10 +110,67 @@ impl Made {
     }
 }
 
+/// Who makes certificates: a fleet file here, or the authority.
+enum Keeper {
+    File(LockedFleet),
+    Authority(Remote),
+}
+
+impl Keeper {
+    fn of(keeping: &Keeping) -> Result<Self, CliError> {
+        match keeping.remote()? {
+            Some(remote) => Ok(Self::Authority(remote)),
+            None => Ok(Self::File(keeping.which.open()?)),
+        }
+    }
+
+    /// Enrols a node. The roster has it first: a certificate that it does not know cannot be revoked.
+    fn enroll(&mut self, csr: &[u8], request: &EnrollRequest) -> Result<Membership, CliError> {
+        match self {
+            Self::File(file) => {
+                let member = file.fleet.enroll_csr(csr, request, &mut system_rng()?);
+                let member = member.map_err(|e| file.error(e))?;
+                file.save()?;
+                Ok(member)
+            }
+            Self::Authority(remote) => remote.certify(Operation::Enroll {
+                node: request.node.to_string(),
+                groups: request.groups.iter().map(ToString::to_string).collect(),
+                router: request.router,
+                may_route: request.may_route,
+                again: request.again,
+                valid_ms: millis(request.valid),
+                csr: Bytes::copy_from_slice(csr),
+            }),
+        }
+    }
+
+    /// Makes another certificate for a node, in its groups and with its role.
+    fn renew(&mut self, csr: &[u8], node: &NodeName, valid: Duration) -> Result<Membership, CliError> {
+        match self {
+            Self::File(file) => {
+                let member = file.fleet.renew_member(csr, node, valid, unix_now(), &mut system_rng()?);
+                let member = member.map_err(|e| file.error(e))?;
+                file.save()?;
+                Ok(member)
+            }
+            Self::Authority(remote) => remote.certify(Operation::Renew {
+                node: node.to_string(),
+                valid_ms: millis(valid),
+                csr: Bytes::copy_from_slice(csr),
+            }),
+        }
+    }
+}
+
+fn millis(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
     let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
-    let mut file = args.which.open()?;
+    let mut keeper = Keeper::of(&args.keeping)?;
     let request = EnrollRequest {
         groups,
         router: args.router,
@@ -117,57 +179,68 @@ pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
         valid: args.made.valid(),
         ..EnrollRequest::new(node, unix_now())
     };
-    let rng = &mut system_rng()?;
     if let Some(csr) = &args.csr {
         let path = args.made.path(&request.node, "answer");
         args.made.check_free(&path)?;
-        let member = file.fleet.enroll_csr(&read_csr(csr)?, &request, rng).map_err(|e| file.error(e))?;
-        file.save()?;
+        let member = keeper.enroll(&read_csr(csr)?, &request)?;
         files::write_secret(&path, &member.to_text(), args.made.existing())?;
         return output::line(answered_text(&request.node, &path));
     }
     let path = args.made.path(&request.node, "identity");
     args.made.check_free(&path)?;
-    let identity = file.fleet.enroll(&request, rng).map_err(|e| file.error(e))?;
-    // The roster first: a certificate that it does not know cannot be revoked.
-    file.save()?;
+    let key = new_key()?;
+    let member = keeper.enroll(key.csr(), &request)?;
+    let identity = with_key(member, &key, &path)?;
     files::write_secret(&path, &identity.to_text(), args.made.existing())?;
     output::line(enrolled_text(&identity, &request, &path))
 }
 
 pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
-    let mut file = args.which.open()?;
-    let (valid, now, rng) = (args.made.valid(), unix_now(), &mut system_rng()?);
+    let mut keeper = Keeper::of(&args.keeping)?;
+    let valid = args.made.valid();
     if let Some(csr) = &args.csr {
         let path = args.made.path(&node, "answer");
         args.made.check_free(&path)?;
-        let member = file.fleet.renew_member(&read_csr(csr)?, &node, valid, now, rng);
-        let member = member.map_err(|e| file.error(e))?;
-        file.save()?;
+        let member = keeper.renew(&read_csr(csr)?, &node, valid)?;
         files::write_secret(&path, &member.to_text(), args.made.existing())?;
         return output::line(answered_text(&node, &path));
     }
     let path = args.made.path(&node, "identity");
     let old = if files::exists(&path) { Some(sgc_node::load_identity(&path)?) } else { None };
-    let new = match old.filter(|old| !args.made.force && old.node_id() == file.fleet.node_id_of(&node)) {
+    let is_of_node = |old: &Identity| match &keeper {
+        Keeper::File(file) => old.node_id() == file.fleet.node_id_of(&node),
+        Keeper::Authority(_) => *old.node_name() == node,
+    };
+    let new = match old.filter(|old| !args.made.force && is_of_node(old)) {
         Some(old) => {
-            let done = file.fleet.recognize(old.as_peer(), now);
-            if done.map_err(|e| file.error(e))? {
-                copies::say_unknown(file.path(), &path);
+            if let Keeper::File(file) = &mut keeper {
+                let done = file.fleet.recognize(old.as_peer(), unix_now());
+                if done.map_err(|e| file.error(e))? {
+                    copies::say_unknown(file.path(), &path);
+                }
             }
-            let member = file.fleet.renew_member(&old.csr(), &node, valid, now, rng);
-            let new = old.with_membership(member.map_err(|e| file.error(e))?);
-            new.map_err(|source| CliError::Identity { path: path.clone(), source })?
+            let member = keeper.renew(&old.csr(), &node, valid)?;
+            old.with_membership(member).map_err(|source| CliError::Identity { path: path.clone(), source })?
         }
         None => {
             args.made.check_free(&path)?;
-            file.fleet.renew(&node, valid, now, rng).map_err(|e| file.error(e))?
+            let key = new_key()?;
+            with_key(keeper.renew(key.csr(), &node, valid)?, &key, &path)?
         }
     };
-    file.save()?;
     files::write_secret(&path, &new.to_text(), Existing::Replace)?;
     output::line(renewed_text(&path, &node, new.not_after()))
+}
+
+/// A key for a node, made here: no authority ever has it.
+fn new_key() -> Result<KeyRequest, CliError> {
+    KeyRequest::generate(None, &mut system_rng()?).map_err(CliError::Making)
+}
+
+fn with_key(member: Membership, key: &KeyRequest, path: &Path) -> Result<Identity, CliError> {
+    Identity::join(member, key.key(), &mut system_rng()?)
+        .map_err(|source| CliError::Identity { path: path.to_owned(), source })
 }
 
 fn read_csr(path: &Path) -> Result<Zeroizing<Vec<u8>>, CliError> {

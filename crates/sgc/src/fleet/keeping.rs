@@ -7,11 +7,12 @@ use std::time::Duration;
 use clap::Args;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_node::LockedFleet;
+use sgc_node::{LockedFleet, roster_head, roster_row};
 use sgc_transport::LinkUrl;
-use sgc_trust::{EnrollRequest, Fleet, GroupName, NodeName, RosterNode, pem_contents, pem_text};
-use sgc_wire::UnixMillis;
+use sgc_trust::{EnrollRequest, Fleet, NodeName, pem_contents, pem_text};
+use sgc_wire::{RosterPage, RosterRow, UnixMillis};
 
+use super::remote::{Keeping, Remote};
 use super::{WhichFleet, copies, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files;
@@ -27,7 +28,7 @@ const KEEPER_VALID: Duration = Duration::from_secs(600);
 #[derive(Debug, Args)]
 pub(super) struct ListArgs {
     #[command(flatten)]
-    which: WhichFleet,
+    keeping: Keeping,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -52,7 +53,7 @@ pub(super) struct RevokeArgs {
     #[arg(long = "router", value_name = "URL")]
     routers: Vec<LinkUrl>,
     #[command(flatten)]
-    which: WhichFleet,
+    keeping: Keeping,
 }
 
 /// Enter a certificate in the roster that was made before the fleet had one, so that it can be revoked.
@@ -83,6 +84,9 @@ pub(super) struct RetireArgs {
     /// Generations before this one
     #[arg(value_name = "GENERATION")]
     before: u32,
+    /// Even if members lack that generation that hold a certificate and were seen in the last 30 days
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     which: WhichFleet,
 }
@@ -109,11 +113,13 @@ struct GenerationJson {
 struct NodeJson<'a> {
     name: &'a str,
     id: String,
-    groups: Vec<&'a str>,
+    groups: &'a [String],
     role: &'static str,
     incarnation: u32,
     expires: Option<String>,
     revoked: Option<String>,
+    secret_generation: Option<u32>,
+    seen: Option<String>,
     certificates: Vec<CertificateJson>,
 }
 
@@ -126,13 +132,20 @@ struct CertificateJson {
 }
 
 pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
-    let (_, fleet) = args.which.read()?;
+    let roster = match args.keeping.remote()? {
+        Some(remote) => remote.list()?,
+        None => {
+            let (_, fleet) = args.keeping.which.read()?;
+            let nodes = fleet.nodes().map(|node| roster_row(&fleet, node)).collect();
+            RosterPage { nodes, ..roster_head(&fleet) }
+        }
+    };
     if args.json {
-        let json = serde_json::to_string_pretty(&json(&fleet));
+        let json = serde_json::to_string_pretty(&json(&roster));
         let json = json.map_err(|e| CliError::System { what: "JSON", source: std::io::Error::other(e) })?;
         return output::line(json);
     }
-    output::line(table(&fleet, unix_now()))
+    output::line(table(&roster, unix_now()))
 }
 
 pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
@@ -143,7 +156,10 @@ pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
 
 pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let nodes = args.nodes.iter().map(|n| n.parse()).collect::<Result<Vec<NodeName>, _>>()?;
-    let mut file = args.which.open()?;
+    if let Some(remote) = args.keeping.remote()? {
+        return revoke_at(&remote, &nodes);
+    }
+    let mut file = args.keeping.which.open()?;
     let now = unix_now();
     if !nodes.is_empty() {
         let done = file.fleet.revoke(&nodes, now);
@@ -166,6 +182,16 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     }
     output::line(text)?;
     told.failed.map_or(Ok(()), Err)
+}
+
+fn revoke_at(remote: &Remote, nodes: &[NodeName]) -> Result<(), CliError> {
+    let list = remote.revoke(nodes)?;
+    let mut text = String::new();
+    for node in nodes {
+        text.push_str(&format!("{node}: revoked\n"));
+    }
+    text.push_str(&format!("Revocation list {list} of {}: nodes tell it to each other.", remote.at()));
+    output::line(text)
 }
 
 pub(super) fn adopt(args: &AdoptArgs) -> Result<(), CliError> {
@@ -199,11 +225,21 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
 
 pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     let mut file = args.which.open()?;
+    let lacking: Vec<_> = file.fleet.lacking(args.before, unix_now()).map(|n| n.name.to_string()).collect();
+    if !lacking.is_empty() && !args.force && args.before <= newest_of(&file.fleet) {
+        let (path, generation) = (file.path().to_owned(), args.before);
+        return Err(CliError::SecretLacking { path, generation, nodes: lacking });
+    }
     let done = file.fleet.retire_secrets(args.before);
     done.map_err(|e| file.error(e))?;
     file.save()?;
     let left: Vec<_> = file.fleet.generations().iter().map(|g| g.number.to_string()).collect();
     output::line(format!("{}: generations in use: {}", file.path().display(), left.join(", ")))
+}
+
+/// The newest generation of a fleet's secret.
+fn newest_of(fleet: &Fleet) -> u32 {
+    fleet.generations().last().map_or(1, |newest| newest.number)
 }
 
 /// Whom a list was told.
@@ -258,7 +294,7 @@ pub(super) fn list_path(fleet: &Path) -> PathBuf {
     fleet.with_extension(LIST_EXTENSION)
 }
 
-fn role(node: &RosterNode) -> &'static str {
+fn role(node: &RosterRow) -> &'static str {
     match (node.router, node.may_route) {
         (true, _) => "router",
         (false, true) => "member, may route",
@@ -266,8 +302,8 @@ fn role(node: &RosterNode) -> &'static str {
     }
 }
 
-fn state(fleet: &Fleet, node: &RosterNode, now: UnixMillis) -> String {
-    match (fleet.revoked_at(node), node.expires(fleet.revocation_of(&node.name))) {
+fn state(node: &RosterRow, now: UnixMillis) -> String {
+    match (node.revoked, node.expires) {
         (Some(at), _) => format!("revoked {at}"),
         (None, Some(until)) if until < now => format!("expired {until}"),
         (None, Some(until)) => format!("until {until}"),
@@ -275,70 +311,82 @@ fn state(fleet: &Fleet, node: &RosterNode, now: UnixMillis) -> String {
     }
 }
 
-fn table(fleet: &Fleet, now: UnixMillis) -> String {
-    let heading = ["NODE", "ROLE", "CERTIFICATE", "GROUPS"].map(str::to_owned).to_vec();
-    let row = |node: &RosterNode| {
-        let groups: Vec<_> = node.groups.iter().map(GroupName::as_str).collect();
-        vec![node.name.to_string(), role(node).to_owned(), state(fleet, node, now), groups.join(", ")]
+/// The newest generation of the secret that a member was handed; unknown of nodes of earlier versions.
+fn generation(node: &RosterRow) -> Option<u32> {
+    (!node.router && node.generation > 0).then_some(node.generation)
+}
+
+fn table(roster: &RosterPage, now: UnixMillis) -> String {
+    let heading =
+        ["NODE", "ROLE", "CERTIFICATE", "SECRET", "LAST SEEN", "GROUPS"].map(str::to_owned).to_vec();
+    let row = |node: &RosterRow| {
+        let secret = match (node.router, generation(node)) {
+            (true, _) => "none".to_owned(),
+            (false, None) => "?".to_owned(),
+            (false, Some(generation)) => generation.to_string(),
+        };
+        let seen = node.seen.map_or_else(|| "?".to_owned(), |at| at.to_string());
+        vec![node.name.clone(), role(node).to_owned(), state(node, now), secret, seen, node.groups.join(", ")]
     };
-    let rows: Vec<_> = std::iter::once(heading).chain(fleet.nodes().map(row)).collect();
-    let mut text = format!("fleet {}, its CA holds until {}", fleet.name(), fleet.not_after());
-    if let Some(authority) = fleet.authority() {
+    let rows: Vec<_> = std::iter::once(heading).chain(roster.nodes.iter().map(row)).collect();
+    let mut text = format!("fleet {}, its CA holds until {}", roster.fleet, roster.expires);
+    if let Some(authority) = &roster.authority {
         text.push_str(&format!(", renewed by {authority}"));
     }
-    if fleet.post_quantum() {
+    if roster.post_quantum {
         text.push_str(", post-quantum");
     }
+    if let [_, .., (newest, _)] = &roster.generations[..] {
+        text.push_str(&format!(", generation {newest} of the secret is the newest"));
+    }
     text.push('\n');
-    if !fleet.has_roster() {
+    if !roster.has_roster {
         text.push_str(
             "This file is from before fleets kept a roster: nodes enrolled with it are not known here. Enroll them \
              again, or `sgc fleet adopt` their certificates.",
         );
         return text;
     }
-    match fleet.nodes().len() {
+    match roster.nodes.len() {
         0 => text.push_str("No nodes yet: sgc fleet enroll NODE"),
         _ => text.push_str(&output::columns(&rows).join("\n")),
     }
     text
 }
 
-fn json(fleet: &Fleet) -> FleetJson<'_> {
+fn json(roster: &RosterPage) -> FleetJson<'_> {
     let time = |t: UnixMillis| t.to_string();
-    let node = |node: &'_ RosterNode| {
-        let revocation = fleet.revocation_of(&node.name);
-        let certificates = node.certificates.iter().map(|c| CertificateJson {
-            serial: c.serial.iter().map(|b| format!("{b:02x}")).collect(),
-            expires: time(c.not_after),
-            incarnation: c.incarnation,
-            revoked: c.revoked_at(revocation).map(time),
-        });
-        (fleet.node_id_of(&node.name).to_string(), certificates.collect::<Vec<_>>())
-    };
-    let nodes = fleet.nodes().map(|n| {
-        let (id, certificates) = node(n);
-        NodeJson {
-            name: n.name.as_str(),
-            id,
-            groups: n.groups.iter().map(GroupName::as_str).collect(),
-            role: role(n),
-            incarnation: n.incarnation,
-            expires: n.expires(fleet.revocation_of(&n.name)).map(time),
-            revoked: fleet.revoked_at(n).map(time),
-            certificates,
-        }
+    let nodes = roster.nodes.iter().map(|node| NodeJson {
+        name: &node.name,
+        id: node.id.to_string(),
+        groups: &node.groups,
+        role: role(node),
+        incarnation: node.incarnation,
+        expires: node.expires.map(time),
+        revoked: node.revoked.map(time),
+        secret_generation: generation(node),
+        seen: node.seen.map(time),
+        certificates: node
+            .certificates
+            .iter()
+            .map(|c| CertificateJson {
+                serial: c.serial.iter().map(|b| format!("{b:02x}")).collect(),
+                expires: time(c.expires),
+                incarnation: c.incarnation,
+                revoked: c.revoked.map(time),
+            })
+            .collect(),
     });
     let generation =
-        |g: &sgc_trust::Generation| GenerationJson { number: g.number, created: time(g.created) };
+        |(number, made): &(u32, UnixMillis)| GenerationJson { number: *number, created: time(*made) };
     FleetJson {
-        fleet: fleet.name().as_str(),
-        expires: time(fleet.not_after()),
-        authority: fleet.authority().map(NodeName::as_str),
-        post_quantum: fleet.post_quantum(),
-        has_roster: fleet.has_roster(),
-        revocation_list: fleet.crl_number(),
-        secret_generations: fleet.generations().iter().map(generation).collect(),
+        fleet: &roster.fleet,
+        expires: time(roster.expires),
+        authority: roster.authority.as_deref(),
+        post_quantum: roster.post_quantum,
+        has_roster: roster.has_roster,
+        revocation_list: roster.revocation_list,
+        secret_generations: roster.generations.iter().map(generation).collect(),
         nodes: nodes.collect(),
     }
 }

@@ -8,6 +8,7 @@ mod create;
 mod enroll;
 mod keeping;
 mod own_key;
+mod remote;
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};

@@ -1,0 +1,144 @@
+//! `--at AUTHORITY`: operations on a fleet that its authority carries out. A node of this user asks for them over the
+//! mesh, as an operator.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use clap::Args;
+use serde::Deserialize;
+use sgc_node::admin::AdminRequest;
+use sgc_trust::{IdentityError, Membership, NodeName};
+use sgc_wire::{
+    CSR_BYTES_MAX, Decode as _, Operation, OperationAnswer, OperationRefusal, REVOKED_AT_ONCE_MAX, RosterPage,
+};
+use zeroize::Zeroizing;
+
+use super::WhichFleet;
+use crate::error::CliError;
+use crate::status;
+
+/// How long the node may take: it gives up before.
+const ANSWER_MAX: Duration = Duration::from_secs(40);
+
+/// Where the fleet is kept.
+#[derive(Debug, Args)]
+pub(super) struct Keeping {
+    #[command(flatten)]
+    pub(super) which: WhichFleet,
+    /// Have the fleet's authority do it, over the mesh: the name of its node. Your node that runs here asks for it, and
+    /// has to be an operator there (`operators` in [authority])
+    #[arg(long, value_name = "AUTHORITY", conflicts_with = "fleet")]
+    at: Option<String>,
+    /// With --at: the status socket of the node that asks, if it is not the only one here
+    #[arg(long, value_name = "PATH", requires = "at")]
+    socket: Option<PathBuf>,
+}
+
+impl Keeping {
+    /// The authority, if it is to do it.
+    pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
+        let Some(at) = &self.at else { return Ok(None) };
+        let at = at.parse()?;
+        Ok(Some(Remote { at, socket: status::socket(None, self.socket.as_deref())? }))
+    }
+}
+
+/// An authority, and the node that asks it.
+pub(super) struct Remote {
+    at: NodeName,
+    socket: PathBuf,
+}
+
+/// What a node says.
+#[derive(Deserialize)]
+enum Answer {
+    #[serde(rename = "ok")]
+    Done { answer: String },
+    #[serde(rename = "error")]
+    Refused(String),
+}
+
+impl Remote {
+    /// The authority's name.
+    pub(super) fn at(&self) -> &NodeName {
+        &self.at
+    }
+
+    /// Returns the whole roster.
+    pub(super) fn list(&self) -> Result<RosterPage, CliError> {
+        let mut all: Option<RosterPage> = None;
+        loop {
+            let after = all.as_ref().and_then(|page| page.nodes.last()).map(|node| node.name.clone());
+            let OperationAnswer::Roster(mut page) = self.ask(Operation::List { after })? else {
+                return Err(self.surprised());
+            };
+            let before = all.take().map(|page| page.nodes).unwrap_or_default();
+            let is_last = !page.more || page.nodes.is_empty();
+            page.nodes.splice(0..0, before);
+            if is_last {
+                return Ok(page);
+            }
+            all = Some(page);
+        }
+    }
+
+    /// Revokes nodes; returns the number of the list that says so.
+    pub(super) fn revoke(&self, nodes: &[NodeName]) -> Result<u64, CliError> {
+        let mut last = 0;
+        for nodes in nodes.chunks(REVOKED_AT_ONCE_MAX) {
+            let nodes = nodes.iter().map(ToString::to_string).collect();
+            let OperationAnswer::Revoked { list } = self.ask(Operation::Revoke { nodes })? else {
+                return Err(self.surprised());
+            };
+            last = list;
+        }
+        Ok(last)
+    }
+
+    /// Enrols or renews a node; returns everything of its identity but the key.
+    pub(super) fn certify(&self, operation: Operation) -> Result<Membership, CliError> {
+        if let Operation::Enroll { csr, .. } | Operation::Renew { csr, .. } = &operation
+            && csr.len() > CSR_BYTES_MAX
+        {
+            return Err(self.failed("the request for a certificate is too long"));
+        }
+        let OperationAnswer::Membership(text) = self.ask(operation)? else { return Err(self.surprised()) };
+        Membership::parse(text.expose()).map_err(|why: IdentityError| self.failed(&why.to_string()))
+    }
+
+    fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
+        let request = AdminRequest::Operate { at: self.at.clone(), operation };
+        let text = Zeroizing::new(status::ask(&self.socket, &request, ANSWER_MAX)?);
+        let answer = match serde_json::from_str(&text) {
+            Ok(Answer::Done { answer }) => Zeroizing::new(answer),
+            Ok(Answer::Refused(reason)) => return Err(CliError::NotSeen { reason }),
+            Err(_) => return Err(self.surprised()),
+        };
+        let bytes = Zeroizing::new(STANDARD.decode(answer.as_bytes()).map_err(|_| self.surprised())?);
+        match OperationAnswer::from_slice(&bytes) {
+            Ok(OperationAnswer::Refused { why: OperationRefusal::Stale, .. }) => {
+                let at = self.at.to_string();
+                Err(CliError::NotSeen { reason: sgc_node::OperationError::OutcomeUnknown { at }.to_string() })
+            }
+            Ok(OperationAnswer::Refused { why: OperationRefusal::Fleet, detail }) => {
+                Err(self.failed(&detail))
+            }
+            Ok(OperationAnswer::Refused { why, detail }) if detail.is_empty() => {
+                Err(self.failed(&why.to_string()))
+            }
+            Ok(OperationAnswer::Refused { why, detail }) => Err(self.failed(&format!("{why}: {detail}"))),
+            Ok(answer) => Ok(answer),
+            Err(_) => Err(self.surprised()),
+        }
+    }
+
+    fn failed(&self, why: &str) -> CliError {
+        CliError::NotSeen { reason: format!("{} refuses: {why}", self.at) }
+    }
+
+    fn surprised(&self) -> CliError {
+        CliError::NotSeen { reason: format!("the node here or {} is of another version of sgc", self.at) }
+    }
+}
