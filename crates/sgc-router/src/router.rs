@@ -7,7 +7,6 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use sgc_trust::{CLOCK_SKEW_MAX, CrlError, Identity, SignedError, TrustAnchors};
 use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
 use smallvec::SmallVec;
@@ -295,9 +294,6 @@ pub struct Router {
     pub(crate) trees: BTreeMap<Name, Tree>,
     /// Branches that wait for something, and until when.
     pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
-    /// Revocation lists that seemed to be from the future, and when to look at them again.
-    pub(crate) early_crls: Vec<Bytes>,
-    pub(crate) early_at: Option<Instant>,
     /// When to pass on what was beyond the allowance of its signer.
     pub(crate) late_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
@@ -332,8 +328,6 @@ impl Router {
             names: Names::default(),
             trees: BTreeMap::new(),
             deadlines: BTreeSet::new(),
-            early_crls: Vec::new(),
-            early_at: None,
             late_at: None,
             outputs: VecDeque::new(),
             yields: false,
@@ -454,7 +448,6 @@ impl Router {
             self.clock_was_set(now);
         }
         self.close_expired(now);
-        self.retry_crls(now);
         self.expire_nodes(now);
         self.names_timeout(now);
         self.pass_on_late(now);
@@ -476,7 +469,6 @@ impl Router {
             let all = topology
                 .into_iter()
                 .flatten()
-                .chain(self.early_at)
                 .chain(branch)
                 .chain(links)
                 .chain(self.names.deadlines())
@@ -600,7 +592,6 @@ impl Router {
             self.send(link, Control::Clock { time: now.unix });
             self.tell_again(now, link);
         }
-        self.early_at = self.early_at.map(|_| now.instant);
         self.links_changed(now.instant);
     }
 

@@ -9,11 +9,6 @@ use sgc_wire::{Control, Now};
 
 use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
 
-/// Revocation lists from the future that are kept until it is time: one for each CA and a few more.
-const EARLY_CRLS_MAX: usize = 8;
-/// How often it is looked whether it is.
-const EARLY_RETRY: Duration = Duration::from_secs(30);
-
 impl Router {
     /// Takes a revocation list from this node's user; true if it is news, which is then told everywhere.
     pub fn add_crl(&mut self, now: Now, der: &Bytes) -> Result<bool, CrlError> {
@@ -41,7 +36,7 @@ impl Router {
     }
 
     pub(crate) fn handle_crl(&mut self, now: Now, link: LinkId, der: &Bytes) {
-        let known = self.config.anchors.crls().chain(&self.early_crls).any(|known| known == der);
+        let known = self.config.anchors.crls().any(|known| known == der);
         if known || !self.may_bring(link) {
             return;
         }
@@ -50,29 +45,10 @@ impl Router {
             self.charge_stale(link);
         }
         if let Err(why) = learnt {
-            // The clock that is wrong may be this node's own, and nobody tells it of the list again.
-            if matches!(why, CrlError::NotYetValid { .. }) && self.early_crls.len() < EARLY_CRLS_MAX {
-                self.early_crls.push(der.clone());
-                self.early_at.get_or_insert(now.instant + EARLY_RETRY);
-            }
             if why.is_forgery() {
                 self.count_forgery(now, link);
             }
             self.drop_frame(link, DropReason::Crl(why));
-        }
-    }
-
-    /// Looks once more at revocation lists that seemed to be from the future.
-    pub(crate) fn retry_crls(&mut self, now: Now) {
-        if self.early_at.take_if(|at| *at <= now.instant).is_none() {
-            return;
-        }
-        for der in std::mem::take(&mut self.early_crls) {
-            // It verified but for its time, so nothing else can be wrong with it.
-            if matches!(self.learn_crl(now, LinkId::LOCAL, &der), Err(CrlError::NotYetValid { .. })) {
-                self.early_crls.push(der);
-                self.early_at = Some(now.instant + EARLY_RETRY);
-            }
         }
     }
 

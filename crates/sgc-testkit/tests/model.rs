@@ -13,7 +13,7 @@ use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
     DataDrop, Dice, Member, MessageId, Model, NodeKey, Sharing, What, World, WorldConfig, revocation_list,
 };
-use sgc_trust::{CertError, CrlError, OpenError, SignedError};
+use sgc_trust::{CertError, OpenError, SignedError};
 
 /// Seeds that every run of the tests replays: small ones, and those that once showed a bug.
 const COMMITTED: &[u64] = &[
@@ -472,7 +472,6 @@ impl Run {
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
                     ) || match &dropped.reason {
                         DropReason::NotVerified { why, .. } => clock(why),
-                        DropReason::Crl(why) => self.clocks && matches!(why, CrlError::NotYetValid { .. }),
                         _ => false,
                     }
                 }

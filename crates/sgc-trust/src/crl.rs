@@ -16,7 +16,6 @@ use webpki::BorrowedCertRevocationList;
 use crate::revocations::{
     CaLists, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation, RevocationList, RevokedNodes,
 };
-use crate::signed::CLOCK_SKEW_MAX;
 use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchors, VerifiedPeer, sha256};
 use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, without_zeros};
 
@@ -126,9 +125,6 @@ impl TrustAnchors {
         if now.secs() > anchor.validity.not_after.secs() {
             return Err(CrlError::CaExpired { not_after: anchor.validity.not_after, now });
         }
-        if fields.this_update.0 > now.0.saturating_add(CLOCK_SKEW_MAX.as_millis() as u64) {
-            return Err(CrlError::NotYetValid { this_update: fields.this_update, now });
-        }
         let mut serials = BTreeMap::new();
         for entry in &list {
             let entry = entry.map_err(CrlError::from_webpki)?;
@@ -221,16 +217,6 @@ pub enum CrlError {
          `sgc fleet merge` the copies of the fleet's file and hand out the list of the merged one"
     )]
     TooManyLists,
-    /// It is from the future.
-    #[error(
-        "the revocation list begins at {this_update} and the clock here says {now}: which clock is wrong?"
-    )]
-    NotYetValid {
-        /// Its beginning.
-        this_update: UnixMillis,
-        /// The time of the check.
-        now: UnixMillis,
-    },
 }
 
 impl CrlError {
@@ -238,11 +224,7 @@ impl CrlError {
     pub fn is_forgery(&self) -> bool {
         match self {
             // A CA that is not trusted here may be trusted there, clocks differ, and there may be room elsewhere.
-            Self::UnknownIssuer
-            | Self::NotYetValid { .. }
-            | Self::CaExpired { .. }
-            | Self::TooManyNodes
-            | Self::TooManyLists => false,
+            Self::UnknownIssuer | Self::CaExpired { .. } | Self::TooManyNodes | Self::TooManyLists => false,
             Self::TooLong { .. }
             | Self::Malformed(_)
             | Self::Partial

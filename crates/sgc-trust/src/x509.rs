@@ -246,7 +246,6 @@ pub(crate) struct ListFields<'a> {
     pub(crate) signature: &'a [u8],
     /// The issuer's name without its outer tag.
     pub(crate) issuer: &'a [u8],
-    pub(crate) this_update: UnixMillis,
     /// Big-endian, without leading zeros; absent in lists of another profile.
     pub(crate) number: Option<&'a [u8]>,
     /// True if it has an issuing distribution point: it may speak of some certificates only.
@@ -266,7 +265,7 @@ impl<'a> ListFields<'a> {
         fields.enter(INTEGER)?; // version
         fields.enter(SEQUENCE)?; // signature algorithm
         let issuer = fields.enter(SEQUENCE)?.0;
-        let this_update = fields.time()?;
+        fields.time()?; // this update
         while fields.peek().is_some_and(|tag| tag != CRL_EXTENSIONS) {
             fields.skip()?; // next update, revoked certificates
         }
@@ -279,7 +278,7 @@ impl<'a> ListFields<'a> {
             }
             revoked_nodes = extensions.find_extension(REVOKED_NODES)?;
         }
-        Some(Self { tbs, algorithm, signature, issuer, this_update, number, is_scoped, revoked_nodes })
+        Some(Self { tbs, algorithm, signature, issuer, number, is_scoped, revoked_nodes })
     }
 
     /// What is signed of a list made anew, with this value of the extension that revokes nodes behind its other
