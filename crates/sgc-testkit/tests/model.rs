@@ -471,7 +471,7 @@ impl Run {
                         // Passed on by those who have not heard of it.
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
                     ) || match &dropped.reason {
-                        DropReason::NotVerified { why, .. } => clock(why),
+                        DropReason::Clock { .. } => self.clocks,
                         _ => false,
                     }
                 }
