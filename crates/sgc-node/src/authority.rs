@@ -139,9 +139,9 @@ impl DeskQueue {
     }
 
     /// Queues an operation, or gives it back if too many wait.
-    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), OperationJob> {
+    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
         if self.operations.len() >= OPERATIONS_WAITING_MAX {
-            return Err(job);
+            return Err(Box::new(job));
         }
         self.operations.push_back(job);
         Ok(())
