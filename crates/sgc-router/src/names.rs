@@ -164,7 +164,7 @@ impl Names {
 
     /// Names that are advertised.
     fn live(&self) -> usize {
-        self.words.len() - self.withdrawn
+        self.words.len().saturating_sub(self.withdrawn)
     }
 
     /// Names that are advertised, asked for or heard of.
@@ -510,7 +510,7 @@ impl Router {
     /// Names are not of this record any more; without any it is gone.
     fn release(&mut self, id: RecordId, names: usize, gone: Gone) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
-        record.live -= names;
+        record.live = record.live.saturating_sub(names);
         let is_gone = record.live == 0;
         let (owner, withdraw, from) = (record.owner.node_id, record.withdraw, record.from);
         self.count(&owner, withdraw, from, names, usize::saturating_sub);

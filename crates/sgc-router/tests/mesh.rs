@@ -675,6 +675,27 @@ fn what_an_owner_advertises_is_bounded_in_records_and_bytes() {
 }
 
 #[test]
+fn a_name_that_is_said_many_times_at_once_is_one_name() {
+    let limits = Limits { adverts_per_owner_max: 4, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    let mallory = identity(&Member::new("mallory"));
+    // Withdrawn 256 times it takes the room of one, so others' names find theirs.
+    bench.frame(1, bench.advert_of(&mallory, 10, true, &[numbered(0); 256]));
+    assert_eq!(bench.router.stats().tombstones, 1);
+    let honest = bench.advert_of(&bench.user, 10, false, &[A]);
+    bench.frame(1, honest);
+    assert!(!bench.dropped.contains(&"limit"), "{:?}", bench.dropped);
+    // Records of such names give way like others: without that, making room never ends.
+    for n in 1..=10 {
+        bench.frame(1, bench.advert_of(&mallory, 10 + n, false, &[numbered(n as usize); 256]));
+        assert!(bench.router.stats().names <= 1 + 4, "{:?}", bench.router.stats());
+    }
+    // And they end with their lease.
+    bench.pass(2 * LEASE);
+    assert_eq!(bench.router.stats().names, 0);
+}
+
+#[test]
 fn a_sequence_number_without_a_greater_one_is_not_believed() {
     let mut bench = Bench::new();
     for seq in [u64::MAX, u64::MAX - 1, bench.clock.now().unix.0 + (11 * 365 * 86_400_000)] {

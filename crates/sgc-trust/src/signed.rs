@@ -86,7 +86,7 @@ pub struct VerifiedAdvert {
     pub owner: VerifiedPeer,
     /// What it says.
     pub body: AdvertBody,
-    /// The names of `body.blinds`, in their order.
+    /// The names of `body.blinds`, each once.
     pub names: Vec<Name>,
 }
 
@@ -151,7 +151,10 @@ pub fn verify_advert(
     let owner = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     owner.verify_signature(ADVERT, &signed.body, &signed.signature)?;
     verify_seq(body.seq, body.issued_at)?;
-    let names = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
+    let mut names: Vec<_> = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
+    // A signer may say one name several times, and whoever counts them relies on it that each is there once.
+    names.sort_unstable();
+    names.dedup();
     Ok(VerifiedAdvert { owner, body, names })
 }
 
