@@ -54,6 +54,11 @@ impl LaneDoor {
         if expected.len() >= EXPECTED_MAX || expected.contains_key(&token) {
             return false;
         }
+        // One that offers again and again leaves room for other links' lanes.
+        let of_link = expected.values().filter(|lane| std::ptr::eq(lane.lanes.as_ptr(), Arc::as_ptr(lanes)));
+        if of_link.count() >= LANES_MAX {
+            return false;
+        }
         let node = lanes.link.peer().node_id;
         expected
             .insert(token, Expected { node, name, lanes: Arc::downgrade(lanes), until: now + ARRIVAL_MAX });
