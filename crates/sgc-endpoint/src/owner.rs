@@ -305,7 +305,7 @@ impl Endpoint {
         for share in self.shares.shares.values_mut() {
             let policy = &share.spec.policy;
             share.since.retain(|_, since| {
-                let stands = !anchors.is_peer_revoked(&since.peer) && since.peer.not_after >= now;
+                let stands = anchors.stands(&since.peer) && since.peer.not_after >= now;
                 stands && policy.permits(&since.peer, Role::Subscribe).is_ok()
             });
         }
@@ -315,6 +315,9 @@ impl Endpoint {
     pub(crate) fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
         if self.anchors.is_peer_revoked(peer) {
             Some(RefuseReason::Revoked)
+        } else if !self.anchors.stands(peer) {
+            // Its CA was taken out of those that are trusted here.
+            Some(RefuseReason::NotVerified)
         } else if peer.not_after < self.now.unix {
             Some(RefuseReason::Expired)
         } else {

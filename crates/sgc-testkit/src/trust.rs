@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use sgc_trust::TrustAnchors;
 use sgc_wire::{Now, UnixMillis};
 
 use crate::cast::{identity, with_fleet};
@@ -27,13 +28,25 @@ impl World {
     /// Lets a node believe another fleet's CA too.
     pub fn trust_fleet(&mut self, node: NodeKey, fleet: &str) {
         self.note(format!("{node:?} trusts {fleet}"));
+        let Node { identity, anchors, .. } = &self.nodes[node.0];
+        let both = with_fleet(anchors.as_deref().unwrap_or(identity.anchors()), fleet);
+        self.trust(node, both);
+    }
+
+    /// Takes every other fleet than its own out of those that a node trusts.
+    pub fn trust_own_fleet_only(&mut self, node: NodeKey) {
+        self.note(format!("{node:?} trusts its own fleet only"));
+        let own = self.nodes[node.0].identity.anchors().clone();
+        self.trust(node, own);
+    }
+
+    fn trust(&mut self, node: NodeKey, trusted: TrustAnchors) {
         let now = self.now_at(node);
-        let Node { identity, anchors, running, .. } = &mut self.nodes[node.0];
-        let known = anchors.as_deref().unwrap_or(identity.anchors());
-        let both = Arc::new(with_fleet(known, fleet));
-        *anchors = Some(both.clone());
+        let Node { anchors, running, .. } = &mut self.nodes[node.0];
+        let trusted = Arc::new(trusted);
+        *anchors = Some(trusted.clone());
         if let Some(running) = running {
-            running.set_anchors(now, both);
+            running.set_anchors(now, trusted);
         }
         self.settle(node);
     }

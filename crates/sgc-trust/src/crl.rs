@@ -78,6 +78,12 @@ impl TrustAnchors {
         self.is_path_revoked(&peer.path)
     }
 
+    /// Returns whether a peer whose certificate was verified would still be believed, but for the time: its CA is trusted,
+    /// and nothing on the path to it is revoked.
+    pub fn stands(&self, peer: &VerifiedPeer) -> bool {
+        self.ca_spki(&peer.ca).is_some() && !self.is_peer_revoked(peer)
+    }
+
     /// True if the key of the first CA made this signature, with any algorithm that it has.
     pub(crate) fn signed_by_first(&self, message: &[u8], signature: &[u8]) -> bool {
         let Some((key_algorithm, key)) = self.anchors.first().and_then(|a| split_spki(&a.spki)) else {

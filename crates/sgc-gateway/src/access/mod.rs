@@ -386,7 +386,7 @@ impl Access {
         if now > peer.not_after {
             return Err(Denied::CertificateExpired { node, expires: peer.not_after });
         }
-        if self.rules.anchors.as_ref().is_some_and(|anchors| anchors.is_peer_revoked(peer)) {
+        if self.rules.anchors.as_ref().is_some_and(|anchors| !anchors.stands(peer)) {
             return Err(Denied::CertificateRevoked { node });
         }
         let mut scope = Scope::default();

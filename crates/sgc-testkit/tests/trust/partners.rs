@@ -92,3 +92,19 @@ fn a_partner_that_is_taken_out_or_revoked_by_its_own_ca_is_cut() {
         assert_received(world, *desk, *arm, &published);
     }
 }
+
+#[test]
+fn a_partner_whose_ca_is_no_longer_trusted_loses_the_key_though_a_policy_still_names_it() {
+    let (mut scene, visitor) = scene(104, with_umbrella);
+    let Scene { world, arm, desk, .. } = &mut scene;
+    world.join_blindly(visitor, *arm, "/chatter");
+    world.until_granted(visitor, *arm, "/chatter");
+    let published = publish_steadily(world, *arm, ms(10), ms(2000), |_, _| ());
+    world.trust_own_fleet_only(*arm);
+    world.run(ms(1500));
+    assert_eq!(world.granted(*arm, "/chatter"), [*desk]);
+    assert_eq!(world.epoch(*arm, "/chatter"), Some(2));
+    assert!(grants(world, visitor, *arm).iter().all(|(_, g)| g.epoch == 1));
+    world.run(ms(1000));
+    assert_received(world, *desk, *arm, &published);
+}
