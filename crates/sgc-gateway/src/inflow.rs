@@ -37,7 +37,7 @@ impl Inflow {
     }
 
     /// Takes room for bytes that came.
-    fn add(&self, bytes: usize) -> Result<(), GatewayError> {
+    pub(crate) fn add(&self, bytes: usize) -> Result<(), GatewayError> {
         let Some(quota) = self.quota.get() else { return Ok(()) };
         let mut held = lock(&self.held);
         held.bytes += bytes;
@@ -48,9 +48,11 @@ impl Inflow {
         Ok(())
     }
 
-    /// Gives back the room of a message that is done.
-    pub(crate) fn done(&self) {
-        *lock(&self.held) = Held::default();
+    /// Gives back the room of a message that is done, but for so many bytes that are still kept.
+    pub(crate) fn done_but(&self, kept: usize) {
+        let mut held = lock(&self.held);
+        held.bytes = kept;
+        held.room.truncate(kept.saturating_sub(1) / UNIT_BYTES);
     }
 }
 
@@ -137,8 +139,8 @@ mod tests {
         short.admit(&quota);
         short.add(UNIT_BYTES).unwrap();
         assert!(short.add(1 << 20).is_err());
-        short.done();
-        begun.iter().for_each(Inflow::done);
+        short.done_but(0);
+        begun.iter().for_each(|inflow| inflow.done_but(0));
         let mut stream = Metered::new(&[7; 200_000][..], Arc::new(short));
         assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 200_000);
         assert_eq!(lock(&stream.inflow.held).room.len(), (200_000 - 1) / UNIT_BYTES);

@@ -160,7 +160,12 @@ impl Session {
 
     /// Gives back the room of a message that is done.
     pub(crate) fn message_is_done(&self) {
-        self.inflow.done();
+        self.message_is_done_but(0);
+    }
+
+    /// The same where so many bytes of what came are still kept.
+    pub(crate) fn message_is_done_but(&self, kept: usize) {
+        self.inflow.done_but(kept);
     }
 
     /// Waits until the client's right ends, and says why it has. Whoever serves the client ends all that it has then.

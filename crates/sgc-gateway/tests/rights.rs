@@ -464,3 +464,52 @@ async fn types_of_what_a_client_does_not_see_are_not_told() {
         assert!(is_told || answer["values"] == *words, "{answer}");
     }
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_learns_neither_names_nor_types_out_of_its_scope_by_asking_for_them() {
+    let place = Place::new().await;
+    let program = place.site.session("program");
+    let _service = program.serve("/hidden", Some("acme/srv/Work")).await.unwrap();
+    let _action = program.serve_action("/secret", Some("example_interfaces/action/Fibonacci")).await.unwrap();
+    let token = place.token(1, UnixMillis(now().0 + HOUR_MS));
+    let mut page = place.web_socket(&format!("/?token={token}"), None).await;
+    // A list of arguments needs the type for the names of its members.
+    for service in ["/hidden", "/none"] {
+        for of in [json!(null), json!("acme/srv/Work"), json!("acme/srv/None"), json!("std_srvs/srv/SetBool")]
+        {
+            let mut op = json!({"op": "call_service", "id": "call", "service": service, "args": [1]});
+            if !of.is_null() {
+                op["type"] = of;
+            }
+            say(&mut page, &op).await;
+            let answer = hear(&mut page).await;
+            let told = format!("token 1 may not call {service}: its scope does not have it");
+            assert_eq!((&answer["values"], &answer["result"]), (&json!(told), &json!(false)), "{op}");
+        }
+    }
+    for action in ["/secret", "/none"] {
+        for of in ["example_interfaces/action/Fibonacci", "acme/action/None", "std_srvs/action/Other"] {
+            let op = json!({"op": "send_action_goal", "id": "goal", "action": action, "action_type": of,
+                "args": [1]});
+            say(&mut page, &op).await;
+            let answer = loop {
+                let answer = hear(&mut page).await;
+                if answer["op"] == "action_result" {
+                    break answer;
+                }
+            };
+            let told = format!("token 1 may not call {action}: its scope does not have it");
+            assert!(answer["values"].as_str().unwrap().ends_with(&told), "{op}: {answer}");
+            let op = json!({"op": "advertise_action", "id": "serve", "action": action, "type": of});
+            say(&mut page, &op).await;
+            let answer = loop {
+                let answer = hear(&mut page).await;
+                if answer["op"] == "status" && answer["id"] == "serve" {
+                    break answer;
+                }
+            };
+            let told = format!("token 1 may not serve {action}: its scope does not have it");
+            assert!(answer["msg"].as_str().unwrap().ends_with(&told), "{op}: {answer}");
+        }
+    }
+}

@@ -14,9 +14,10 @@ use super::options::RosbridgeOptions;
 use super::outbox::Outbox;
 use super::rosapi::{RosApi, local_name};
 use super::topics::fragment_id;
+use crate::access::Right;
 use crate::content::Content;
 use crate::error::GatewayError;
-use crate::session::Session;
+use crate::session::{Session, action_of};
 
 /// A service that a client calls.
 #[derive(Clone, Debug)]
@@ -122,6 +123,7 @@ async fn ask(session: &Session, options: &RosbridgeOptions, call: &Call, outbox:
 }
 
 async fn on_network(session: &Session, call: &Call) -> Result<bytes::Bytes, GatewayError> {
+    session.check(Right::Call, action_of(&call.service))?;
     let layout = || {
         let of = session.service_type(&call.service, call.type_name.as_deref())?;
         session.hub().types().layout(&format!("{of}_Request"), None)

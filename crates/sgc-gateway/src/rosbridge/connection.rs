@@ -161,7 +161,7 @@ impl Connection {
     /// Does what a client asks for; only what ends the connection is an error.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
         let taken = self.take_op(text).await;
-        self.session.message_is_done();
+        self.session.message_is_done_but(self.fragments.bytes());
         taken
     }
 
@@ -636,6 +636,7 @@ impl Connection {
                 Compression::Cbor | Compression::CborRaw => Compression::Cbor,
             },
         };
+        self.session.check(Right::Call, &wanted.action).map_err(|error| op.gateway(error))?;
         let layout = || {
             let of = self.session.action_type(&wanted.action, wanted.type_name.as_deref())?;
             self.session.hub().types().layout(&format!("{of}_Goal"), None)
@@ -666,6 +667,7 @@ impl Connection {
         let action = op.needed_name("action")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
+        self.session.check(Right::Serve, &action).map_err(|error| op.gateway(error))?;
         self.actions.remove(&action);
         let full = self.session.action_type(&action, Some(&type_name)).map_err(|error| op.gateway(error))?;
         let serving = self.session.serve_action(&action, Some(&full)).await;
@@ -747,7 +749,74 @@ fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
+    use sgc_testkit::FakeDomain;
+    use sgc_wire::UnixMillis;
+
     use super::*;
+    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::budget::UNIT_BYTES;
+    use crate::hub::{Hub, HubOptions};
+    use crate::inflow::Inflow;
+    use crate::session::SessionLimits;
+    use crate::types::{Shipped, Types};
+
+    /// Returns a client of another host.
+    fn remote_client() -> Client {
+        let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
+        let peer: SocketAddr = "10.0.0.1:1".parse().unwrap();
+        let now = UnixMillis(1_795_000_000_000);
+        let admission =
+            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+        access.admit(&admission).unwrap()
+    }
+
+    #[tokio::test]
+    async fn pieces_that_are_never_whole_stay_within_the_quota_of_their_credential() {
+        const CREDENTIAL_BYTES: usize = 512 << 20;
+        const LEFT_BYTES: usize = 8 << 20;
+        const PIECE_BYTES: usize = 1 << 20;
+        let own = Arc::new(FakeDomain::default().join(false));
+        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let client = remote_client();
+        let quota = hub.shared.quotas.quota(&client);
+        let units = |bytes: usize| u32::try_from(bytes / UNIT_BYTES).unwrap();
+        let _other = quota.room_at_once(units(CREDENTIAL_BYTES - LEFT_BYTES)).unwrap();
+        let piece = |number: usize| {
+            let data = "x".repeat(PIECE_BYTES);
+            format!(r#"{{"op":"fragment","id":"a","num":{number},"total":2,"data":"{data}"}}"#)
+        };
+        let mut begun = Vec::new();
+        let refused = loop {
+            let inflow: Arc<Inflow> = Arc::default();
+            let session = Session::new(&hub, client.clone(), SessionLimits::default());
+            let session = Arc::new(session.metered_by(Arc::clone(&inflow)));
+            let (outbox, outgoing) = Outbox::new(1 << 20, session.quota().clone());
+            let mut connection = Connection::new(session, Arc::default(), outbox);
+            let text = piece(0);
+            if let Err(refused) = inflow.add(text.len()) {
+                break refused;
+            }
+            connection.take(&text).await.unwrap();
+            begun.push((connection, inflow, outgoing));
+            assert!(begun.len() < 100, "nothing stops it");
+        };
+        let is_of_credential =
+            matches!(refused, GatewayError::Crowded { pool: crate::quota::Pool::Credential, .. });
+        assert!(is_of_credential, "{refused}");
+        assert_eq!(begun.len(), LEFT_BYTES / PIECE_BYTES);
+        // A message that is whole gives all its room back.
+        let before = begun.len();
+        begun.truncate(1);
+        assert!(quota.room_at_once(units((before - 1) * PIECE_BYTES)).is_ok());
+        let (connection, inflow, _outgoing) = begun.first_mut().unwrap();
+        let text = piece(1);
+        inflow.add(text.len()).unwrap();
+        connection.take(&text).await.unwrap();
+        assert_eq!(connection.fragments.bytes(), 0);
+        assert!(quota.room_at_once(units(LEFT_BYTES)).is_ok());
+    }
 
     #[tokio::test(start_paused = true)]
     async fn who_errs_now_and_then_is_forgiven() {

@@ -46,6 +46,11 @@ impl Fragments {
         Self { bytes_max, bytes: 0, messages: VecDeque::new() }
     }
 
+    /// Returns the number of bytes that are kept.
+    pub(super) fn bytes(&self) -> usize {
+        self.bytes
+    }
+
     /// Takes a piece; the message, if it is whole now. A piece that came before is left out. After an error all of the
     /// message is forgotten.
     pub(super) fn take(
