@@ -22,7 +22,7 @@ use crate::content::{Content, Form, serialise, write};
 use crate::error::GatewayError;
 use crate::feed::Subscription;
 use crate::hub::{Shared, lock};
-use crate::publisher::Publication;
+use crate::publisher::{Account, Publication};
 use crate::quota::{Charge, Quota, Resource, Waiting};
 use crate::service::{Caller, Replier, Request, Serving};
 use crate::session::{Session, Subscribe};
@@ -397,14 +397,14 @@ impl ActionServing {
         let cancel_type = "action_msgs/srv/CancelGoal".to_owned();
         let cancels = Serving::new(shared, part("cancel_goal"), cancel_type, None).await?;
         let feedback_type = format!("{of}_FeedbackMessage");
+        let account = || Account { quota: quota.clone(), charge: None, kept: None };
         let feedback =
-            Publication::new(shared, part("feedback"), feedback_type, Qos::default(), (quota.clone(), None))
-                .await?;
+            Publication::new(shared, part("feedback"), feedback_type, Qos::default(), account()).await?;
         let kept = Arc::new(Waiting::new(results_bytes_max, quota.clone()));
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
-        let status = Publication::new(shared, part("status"), status_type, latched, (quota, None)).await?;
+        let status = Publication::new(shared, part("status"), status_type, latched, account()).await?;
         let server = Arc::new(ActionServer {
             action: action.to_owned(),
             layouts,

@@ -23,7 +23,7 @@ use crate::ros::LocalReader;
 use crate::session::Waits;
 
 /// Messages of one writer that are kept for who subscribes later, of a topic whose writers do so too.
-const LATCHED_DEPTH_MAX: usize = 100;
+pub(crate) const LATCHED_DEPTH_MAX: usize = 100;
 /// Bytes of them, of all writers of a topic.
 const LATCHED_BYTES_MAX: usize = 64 << 20;
 

@@ -16,7 +16,7 @@ use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::hub::{Shared, lock};
-use crate::quota::{Charge, Quota};
+use crate::quota::{Charge, Quota, Waiting};
 
 /// How long readers may take to acknowledge what was written last before its writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
@@ -31,6 +31,64 @@ const AHEAD_BYTES_MAX: usize = 64 << 10;
 /// A reliable writer that keeps its last messages does not wait for readers while these have not more bytes than that: Cyclone
 /// lets 30 kB be unacknowledged when it begins, more later.
 const UNACKNOWLEDGED_BYTES_MIN: usize = 24 << 10;
+
+/// Messages that a transient-local writer of a topic with keys keeps, of all instances (`sgc-dds`).
+const KEYED_KEPT_MAX: usize = 4096;
+
+/// Whom a [`Publication`] counts for.
+#[derive(Debug)]
+pub(crate) struct Account {
+    /// The quota of its client.
+    pub(crate) quota: Quota,
+    /// Its place among the publications of its client's credential, if it has one of its own.
+    pub(crate) charge: Option<Charge>,
+    /// Bytes of messages that the client's transient-local writers keep, if its messages are counted.
+    pub(crate) kept: Option<Arc<Waiting>>,
+}
+
+/// Lengths of the messages that a transient-local writer keeps for readers that come later.
+#[derive(Debug)]
+struct Kept {
+    waiting: Arc<Waiting>,
+    depth: usize,
+    lengths: Mutex<Lengths>,
+}
+
+#[derive(Debug, Default)]
+struct Lengths {
+    /// Lengths in bytes, the newest last.
+    each: VecDeque<usize>,
+    sum: usize,
+}
+
+impl Kept {
+    fn new(waiting: Arc<Waiting>, depth: usize) -> Self {
+        Self { waiting, depth: depth.max(1), lengths: Mutex::default() }
+    }
+
+    /// Takes room for a message, which takes the place of the oldest one if the writer keeps as many as it may.
+    fn take(&self, bytes: usize) -> Result<(), GatewayError> {
+        let mut lengths = lock(&self.lengths);
+        let is_full = lengths.each.len() >= self.depth;
+        let oldest = lengths.each.front().copied().filter(|_| is_full).unwrap_or(0);
+        match bytes.checked_sub(oldest) {
+            Some(more) => self.waiting.take("bytes of messages that are kept for later readers", more)?,
+            None => self.waiting.sub(oldest - bytes),
+        }
+        if is_full {
+            lengths.each.pop_front();
+        }
+        lengths.each.push_back(bytes);
+        lengths.sum = lengths.sum - oldest + bytes;
+        Ok(())
+    }
+}
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        self.waiting.sub(lock(&self.lengths).sum);
+    }
+}
 
 /// What one client publishes on a topic; ends when dropped, once reliable readers have what was written.
 pub struct Publication {
@@ -55,6 +113,8 @@ struct Line {
     /// Held by who writes what waits, so that it keeps its order.
     turn: Mutex<()>,
     published: AtomicU64,
+    /// What the writer keeps, where it is counted: until the writer ends.
+    kept: Option<Kept>,
 }
 
 #[derive(Default)]
@@ -98,7 +158,7 @@ impl Publication {
         topic: String,
         type_name: String,
         qos: Qos,
-        (quota, charge): (Quota, Option<Charge>),
+        account: Account,
     ) -> Result<Self, GatewayError> {
         shared
             .run(move |shared| {
@@ -115,10 +175,12 @@ impl Publication {
                     type_hash: Some(hash.map_or_else(|| layout.type_hash(), str::to_owned)),
                     qos,
                 };
+                let kept = account.kept.filter(|_| spec.qos.is_transient_local());
+                let kept = kept.map(|kept| Kept::new(kept, kept_max(&spec)));
                 let writer: Arc<dyn RosWriter> = Arc::from(shared.ros.writer(&spec)?);
                 shared.know(own_endpoint(EndpointKind::Writer, writer.guid(), &spec));
                 let (ahead, turn, published) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
-                let line = Arc::new(Line { writer, ahead, turn, published });
+                let line = Arc::new(Line { writer, ahead, turn, published, kept });
                 let bytes_at_once_max = bytes_at_once_max(&spec);
                 let may_block = AtomicBool::new(bytes_at_once_max == 0);
                 let shared = Arc::clone(shared);
@@ -130,8 +192,8 @@ impl Publication {
                     type_name,
                     bytes_at_once_max,
                     may_block,
-                    quota,
-                    _charge: charge,
+                    quota: account.quota,
+                    _charge: account.charge,
                 })
             })
             .await
@@ -178,6 +240,9 @@ impl Publication {
     async fn write_ahead(&self, payload: Bytes) -> Result<(), GatewayError> {
         if payload.len() > PAYLOAD_BYTES_MAX {
             return Err(GatewayError::TooLong { bytes: payload.len(), max: PAYLOAD_BYTES_MAX });
+        }
+        if let Some(kept) = &self.line.kept {
+            kept.take(payload.len())?;
         }
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let stamp_ns = since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX));
@@ -280,6 +345,14 @@ impl Drop for Publication {
             shared.forget(&[line.writer.guid()]);
             drop(line);
         });
+    }
+}
+
+/// How many messages a transient-local writer keeps at most.
+fn kept_max(spec: &EndpointSpec) -> usize {
+    match &spec.qos.history {
+        History::KeepLast(depth) if spec.keyless => *depth as usize,
+        _ => KEYED_KEPT_MAX,
     }
 }
 

@@ -291,6 +291,28 @@ impl Waiting {
         })
     }
 
+    /// Takes room for so many bytes, unless the client or one of its pools has less.
+    pub(crate) fn take(&self, what: &'static str, bytes: usize) -> Result<(), GatewayError> {
+        let add = |to: &AtomicUsize, max: usize| {
+            let fits = |now: usize| now.checked_add(bytes).filter(|sum| *sum <= max);
+            to.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
+        };
+        if !add(&self.bytes, self.bytes_max) {
+            return Err(GatewayError::TooMany { what, max: self.bytes_max });
+        }
+        for (at, counts) in self.quota.pools.iter().enumerate() {
+            let max = self.bytes_max.saturating_mul(counts.share());
+            if !add(&counts.bytes, max) {
+                self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+                for taken in self.quota.pools.iter().take(at) {
+                    taken.bytes.fetch_sub(bytes, Ordering::Relaxed);
+                }
+                return Err(self.quota.refuse(what, counts.pool, max));
+            }
+        }
+        Ok(())
+    }
+
     pub(crate) fn add(&self, bytes: usize) {
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         for counts in &*self.quota.pools {
@@ -396,6 +418,24 @@ mod tests {
         // Whoever counts gives back.
         fifth.sub(0);
         assert_eq!(fifth.bytes(), 0);
+    }
+
+    #[test]
+    fn bytes_that_are_refused_leave_nothing_behind() {
+        let quotas: Arc<Quotas> = Arc::default();
+        let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
+        let first = waiting("10.0.0.1:1");
+        let refused = first.take("bytes", 101).unwrap_err();
+        assert_eq!(refused, GatewayError::TooMany { what: "bytes", max: 100 });
+        let sessions: Vec<_> = (0..12).map(|n| waiting(&format!("10.0.0.{}:1", 2 + n / 4))).collect();
+        sessions.iter().for_each(|session| session.take("bytes", 100).unwrap());
+        let crowded = |pool, max| GatewayError::Crowded { what: "bytes", max, pool };
+        assert_eq!(waiting("10.0.0.2:1").take("bytes", 1).unwrap_err(), crowded(Pool::Credential, 400));
+        assert_eq!(first.take("bytes", 1).unwrap_err(), crowded(Pool::Remote, 1200));
+        assert_eq!(first.bytes(), 0);
+        sessions.iter().for_each(|session| session.sub(100));
+        first.take("bytes", 100).unwrap();
+        first.sub(100);
     }
 
     #[tokio::test]

@@ -8,17 +8,17 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_cdr::{Library, TypeName};
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
-use sgc_wire::Qos;
+use sgc_wire::{History, Qos};
 
 use crate::access::{Client, Denied, Right, Scope};
 use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
 use crate::error::GatewayError;
-use crate::feed::{FeedKey, Intaking, Subscription};
+use crate::feed::{FeedKey, Intaking, LATCHED_DEPTH_MAX, Subscription};
 use crate::graph::Graph;
 use crate::hub::Hub;
 use crate::inflow::Inflow;
-use crate::publisher::Publication;
+use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
 use crate::quota::{Charge, Quota, Resource, Waiting};
 use crate::service::Serving;
@@ -32,7 +32,8 @@ const DEPTH_MAX: usize = 10_000;
 /// What one client may have at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
-    /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case.
+    /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case. Its
+    /// transient-local writers keep so many, too.
     pub waiting_bytes_max: usize,
     /// Subscriptions.
     pub subscriptions_max: usize,
@@ -97,6 +98,8 @@ pub struct Session {
     limits: SessionLimits,
     calls: Arc<AtomicUsize>,
     waiting: Arc<Waiting>,
+    /// Bytes of messages that its transient-local writers keep.
+    kept: Arc<Waiting>,
     waits: Arc<AtomicUsize>,
     /// The quota of its credential.
     quota: Quota,
@@ -130,13 +133,15 @@ impl Session {
     /// A client's.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
         let quota = hub.shared.quotas.quota(&client);
+        let waiting = || Arc::new(Waiting::new(limits.waiting_bytes_max, quota.clone()));
         Self {
             hub: hub.clone(),
             client,
             access: None,
             limits,
             calls: Arc::default(),
-            waiting: Arc::new(Waiting::new(limits.waiting_bytes_max, quota.clone())),
+            waiting: waiting(),
+            kept: waiting(),
             waits: Arc::default(),
             quota,
             inflow: Arc::default(),
@@ -180,9 +185,10 @@ impl Session {
     pub fn again(&self, client: Client) -> Self {
         let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
         let [calls, waits] = [&self.calls, &self.waits].map(Arc::clone);
-        let (waiting, quota) = (Arc::clone(&self.waiting), self.hub.shared.quotas.quota(&client));
+        let [waiting, kept] = [&self.waiting, &self.kept].map(Arc::clone);
+        let quota = self.hub.shared.quotas.quota(&client);
         let inflow = Arc::clone(&self.inflow);
-        Self { hub, client, access, limits, calls, waiting, waits, quota, inflow }
+        Self { hub, client, access, limits, calls, waiting, kept, waits, quota, inflow }
     }
 
     /// Who it is.
@@ -366,8 +372,10 @@ impl Session {
     pub(crate) async fn advertise_checked(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
         let charge = self.quota.take(Resource::Publications, &self.limits)?;
-        let quota = (self.quota.clone(), Some(charge));
-        Publication::new(&self.hub.shared, wanted.topic, type_name, wanted.qos, quota).await
+        let (quota, kept) = (self.quota.clone(), Some(Arc::clone(&self.kept)));
+        let account = Account { quota, charge: Some(charge), kept };
+        let qos = kept_within_bounds(wanted.qos);
+        Publication::new(&self.hub.shared, wanted.topic, type_name, qos, account).await
     }
 
     /// Calls a service and waits for its reply, which comes in the form that is asked for.
@@ -401,6 +409,19 @@ impl Session {
         let charge = self.quota.take(Resource::Servings, &self.limits)?;
         Serving::new(&self.hub.shared, service.to_owned(), type_name, Some(charge)).await
     }
+}
+
+/// Bounds the number of messages that a transient-local writer keeps for readers that come later.
+fn kept_within_bounds(qos: Qos) -> Qos {
+    if !qos.is_transient_local() {
+        return qos;
+    }
+    let max = u32::try_from(LATCHED_DEPTH_MAX).unwrap_or(u32::MAX);
+    let depth = match qos.history {
+        History::KeepLast(depth) => depth.clamp(1, max),
+        History::KeepAll => max,
+    };
+    Qos { history: History::KeepLast(depth), ..qos }
 }
 
 /// The action that a topic or service is a part of; any other is itself.

@@ -11,7 +11,7 @@ use sgc_gateway::{
     Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Session,
     SessionLimits, Subscribe,
 };
-use sgc_wire::{History, Qos, UnixMillis};
+use sgc_wire::{Durability, History, Qos, UnixMillis};
 
 use support::{STRING, Site, eventually};
 
@@ -132,4 +132,65 @@ async fn topics_services_and_calls_of_one_host_are_bounded_over_its_connections(
     topics.pop();
     host.advertise(wanted).await.unwrap();
     calls.iter().for_each(tokio::task::JoinHandle::abort);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
+    const MESSAGE_BYTES: usize = 100 << 10;
+    let site = Site::new().await;
+    let content = Content::json(format!(r#"{{"data":"{}"}}"#, "x".repeat(MESSAGE_BYTES)));
+    let latched = |history| Qos { durability: Durability::TransientLocal, history, ..Qos::default() };
+    let wanted = |topic: &str, history| Advertise {
+        topic: topic.to_owned(),
+        type_name: Some(STRING.into()),
+        qos: latched(history),
+    };
+    // One session, whatever depth it says.
+    let one = session(&site, "10.0.0.1:1");
+    let publication = one.advertise(wanted("/all", History::KeepAll)).await.unwrap();
+    let offered = || {
+        let graph = site.hub.graph();
+        Some(graph.topics.get("/all")?.publishers.first()?.qos.history)
+    };
+    eventually(|| offered() == Some(History::KeepLast(100))).await;
+    let mut published = 0;
+    let refused = loop {
+        match publication.publish(&content).await {
+            Ok(()) => published += 1,
+            Err(refused) => break refused,
+        }
+        assert!(published < 1000, "nothing stops it");
+    };
+    assert_eq!(published, LIMITS.waiting_bytes_max / MESSAGE_BYTES);
+    assert!(matches!(refused, GatewayError::TooMany { .. }), "{refused}");
+    drop(publication);
+    // A writer keeps its last messages only, and many connections have a bound, too.
+    let mut held = Vec::new();
+    let refused = loop {
+        let host = session(&site, "10.0.0.2:1");
+        let publication = host.advertise(wanted("/one", History::KeepLast(10))).await.unwrap();
+        let mut refused = None;
+        for _ in 0..30 {
+            if let Err(why) = publication.publish(&content).await {
+                refused = Some(why);
+                break;
+            }
+        }
+        held.push((host, publication));
+        if let Some(refused) = refused {
+            break refused;
+        }
+        assert!(held.len() < 100, "nothing stops it");
+    };
+    assert!(is_of(&refused, Pool::Credential), "{refused}");
+    assert_eq!(held.len(), SHARES[0] + 1);
+    // What goes makes room, once its writer has ended.
+    held.remove(0);
+    let (_, last) = held.last().unwrap();
+    let until_room = async {
+        while last.publish(&content).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
 }
