@@ -259,6 +259,31 @@ async fn acquire<'a>(pools: impl Iterator<Item = (&'a Arc<Semaphore>, u32)>) -> 
     Some(Permits(held))
 }
 
+/// Bytes that wait, until dropped.
+#[derive(Debug)]
+pub(crate) struct Held {
+    waiting: Arc<Waiting>,
+    bytes: usize,
+}
+
+impl Held {
+    /// Takes room for so many bytes, unless the client or one of its pools has less.
+    pub(crate) fn new(
+        waiting: &Arc<Waiting>,
+        what: &'static str,
+        bytes: usize,
+    ) -> Result<Self, GatewayError> {
+        waiting.take(what, bytes)?;
+        Ok(Self { waiting: Arc::clone(waiting), bytes })
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.waiting.sub(self.bytes);
+    }
+}
+
 /// Bytes of messages that wait for one client, within its own bound and those of its pools.
 #[derive(Debug)]
 pub(crate) struct Waiting {
@@ -424,7 +449,7 @@ mod tests {
     fn bytes_that_are_refused_leave_nothing_behind() {
         let quotas: Arc<Quotas> = Arc::default();
         let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
-        let first = waiting("10.0.0.1:1");
+        let first = Arc::new(waiting("10.0.0.1:1"));
         let refused = first.take("bytes", 101).unwrap_err();
         assert_eq!(refused, GatewayError::TooMany { what: "bytes", max: 100 });
         let sessions: Vec<_> = (0..12).map(|n| waiting(&format!("10.0.0.{}:1", 2 + n / 4))).collect();
@@ -434,8 +459,10 @@ mod tests {
         assert_eq!(first.take("bytes", 1).unwrap_err(), crowded(Pool::Remote, 1200));
         assert_eq!(first.bytes(), 0);
         sessions.iter().for_each(|session| session.sub(100));
-        first.take("bytes", 100).unwrap();
-        first.sub(100);
+        let held = Held::new(&first, "bytes", 100).unwrap();
+        assert!(Held::new(&first, "bytes", 1).is_err());
+        drop(held);
+        assert_eq!(first.bytes(), 0);
     }
 
     #[tokio::test]

@@ -20,7 +20,7 @@ use crate::hub::Hub;
 use crate::inflow::Inflow;
 use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
-use crate::quota::{Charge, Quota, Resource, Waiting};
+use crate::quota::{Charge, Held, Quota, Resource, Waiting};
 use crate::service::Serving;
 use crate::types::InterfaceType;
 
@@ -33,7 +33,7 @@ const DEPTH_MAX: usize = 10_000;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
     /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case. Its
-    /// transient-local writers keep so many, too.
+    /// transient-local writers keep so many, too, and the arguments of its calls and goals have so many.
     pub waiting_bytes_max: usize,
     /// Subscriptions.
     pub subscriptions_max: usize,
@@ -100,6 +100,8 @@ pub struct Session {
     waiting: Arc<Waiting>,
     /// Bytes of messages that its transient-local writers keep.
     kept: Arc<Waiting>,
+    /// Bytes of arguments of its calls and goals, until these are done or sent.
+    arguments: Arc<Waiting>,
     waits: Arc<AtomicUsize>,
     /// The quota of its credential.
     quota: Quota,
@@ -142,6 +144,7 @@ impl Session {
             calls: Arc::default(),
             waiting: waiting(),
             kept: waiting(),
+            arguments: waiting(),
             waits: Arc::default(),
             quota,
             inflow: Arc::default(),
@@ -185,10 +188,10 @@ impl Session {
     pub fn again(&self, client: Client) -> Self {
         let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
         let [calls, waits] = [&self.calls, &self.waits].map(Arc::clone);
-        let [waiting, kept] = [&self.waiting, &self.kept].map(Arc::clone);
+        let [waiting, kept, arguments] = [&self.waiting, &self.kept, &self.arguments].map(Arc::clone);
         let quota = self.hub.shared.quotas.quota(&client);
         let inflow = Arc::clone(&self.inflow);
-        Self { hub, client, access, limits, calls, waiting, kept, waits, quota, inflow }
+        Self { hub, client, access, limits, calls, waiting, kept, arguments, waits, quota, inflow }
     }
 
     /// Who it is.
@@ -204,6 +207,11 @@ impl Session {
     /// Bytes of messages that wait for it in all its subscriptions.
     pub fn waiting_bytes(&self) -> usize {
         self.waiting.bytes()
+    }
+
+    /// Takes room for the arguments of a call or a goal that is under way.
+    pub(crate) fn hold_arguments(&self, bytes: usize) -> Result<Held, GatewayError> {
+        Held::new(&self.arguments, "bytes of arguments that wait", bytes)
     }
 
     /// Returns the quota of its credential.

@@ -3,17 +3,28 @@
 #![allow(clippy::unwrap_used)]
 
 mod support;
+#[path = "support/viewer.rs"]
+mod viewer;
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use futures_util::{SinkExt as _, StreamExt as _};
+use serde_json::{Value as Json, json};
+use sgc_gateway::rosbridge::{self, RosbridgeOptions};
 use sgc_gateway::{
     Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Session,
     SessionLimits, Subscribe,
 };
 use sgc_wire::{Durability, History, Qos, UnixMillis};
 
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::Role;
+
 use support::{STRING, Site, eventually};
+use viewer::Viewer;
 
 const LIMITS: SessionLimits = SessionLimits {
     waiting_bytes_max: 1 << 20,
@@ -193,4 +204,101 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
         }
     };
     tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
+}
+
+/// What is told where a credential has no room for more arguments of calls.
+fn arguments_crowded() -> String {
+    let max = SHARES[0] * LIMITS.waiting_bytes_max;
+    format!("{max} bytes of arguments that wait at most for {}", Pool::Credential)
+}
+
+/// Arguments of which one session has room for one, but not for two.
+fn long_arguments() -> String {
+    let pad = " ".repeat(LIMITS.waiting_bytes_max - (64 << 10));
+    format!(r#"{{"data": true{pad}}}"#)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn arguments_of_calls_that_wait_are_bounded_over_connections() {
+    let site = Site::new().await;
+    let of = "std_srvs/srv/SetBool";
+    let mut silent = site.session("program").serve("/silent", Some(of)).await.unwrap();
+    let arguments = long_arguments();
+    let call = |id: usize| {
+        format!(
+            r#"{{"op": "call_service", "id": "{id}", "service": "/silent", "timeout": 60, "args": {arguments}}}"#
+        )
+    };
+    let mut pages = Vec::new();
+    let refused: Json = loop {
+        let (here, there) = tokio::io::duplex(1 << 20);
+        let options = RosbridgeOptions::default();
+        let config = options.websocket();
+        let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(config)).await;
+        let host = Arc::new(session(&site, "10.0.0.1:1"));
+        let served = tokio::spawn(rosbridge::serve(there, host, options));
+        let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
+        page.send(Message::text(call(pages.len()))).await.unwrap();
+        let asked = tokio::select! {
+            answer = page.next() => Err(answer.unwrap().unwrap().into_text().unwrap()),
+            request = silent.next() => Ok(request.unwrap()),
+        };
+        pages.push((page, served));
+        match asked {
+            Ok(_) => assert!(pages.len() < 100, "nothing stops it"),
+            Err(told) => break serde_json::from_str(&told).unwrap(),
+        }
+    };
+    assert_eq!(pages.len(), SHARES[0] + 1);
+    assert!(refused["values"].as_str().unwrap().ends_with(&arguments_crowded()), "{refused}");
+    // A session has its own bound, and whoever goes makes room.
+    let (page, _) = &mut pages[0];
+    page.send(Message::text(call(200))).await.unwrap();
+    let told = page.next().await.unwrap().unwrap().into_text().unwrap();
+    let own = format!("{} bytes of arguments that wait at most for a client", LIMITS.waiting_bytes_max);
+    assert!(told.contains(&own), "{told}");
+    drop(pages.remove(0).0);
+    let (last, _) = pages.last_mut().unwrap();
+    let until_room = async {
+        loop {
+            last.send(Message::text(call(201))).await.unwrap();
+            tokio::select! {
+                refused = last.next() => drop(refused.unwrap().unwrap()),
+                request = silent.next() => break drop(request),
+            }
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn requests_of_viewers_that_wait_are_bounded_over_connections() {
+    let site = Site::new().await;
+    let of = Some("std_srvs/srv/SetBool");
+    let mut silent = site.session("program").serve("/silent", of).await.unwrap();
+    let mut payload = b"json".to_vec();
+    payload.extend(long_arguments().as_bytes());
+    let mut viewers = Vec::new();
+    let refused = loop {
+        let (mut viewer, _) = Viewer::new(session(&site, "10.0.0.1:1")).await;
+        let id = loop {
+            let listed = viewer.text("advertiseServices").await;
+            let listed = listed["services"].as_array().unwrap();
+            if let Some(known) = listed.iter().find(|known| known["name"] == json!("/silent")) {
+                break u32::try_from(known["id"].as_u64().unwrap()).unwrap();
+            }
+        };
+        viewer.binary(2, &[id, 1, 4], &payload).await;
+        let asked = tokio::select! {
+            failure = viewer.text("serviceCallFailure") => Err(failure),
+            request = silent.next() => Ok(request.unwrap()),
+        };
+        viewers.push(viewer);
+        match asked {
+            Ok(_) => assert!(viewers.len() < 100, "nothing stops it"),
+            Err(told) => break told,
+        }
+    };
+    assert_eq!(viewers.len(), SHARES[0] + 1);
+    assert_eq!(refused["message"], arguments_crowded());
 }

@@ -95,7 +95,7 @@ impl Question {
 
 /// What came of work that was done beside.
 enum Done {
-    Called { service: u32, call: u32, encoding: String, bytes: usize, reply: Result<Bytes, Refusal> },
+    Called { service: u32, call: u32, encoding: String, reply: Result<Bytes, Refusal> },
     Parameters { id: Option<String>, is_asked: bool, answer: Answer },
 }
 
@@ -128,8 +128,6 @@ pub(super) struct Connection<'o> {
     published: BTreeMap<u32, Published>,
     jobs: FuturesUnordered<BoxFuture<'static, Done>>,
     parameter_jobs: usize,
-    /// Bytes of requests under way.
-    call_bytes: usize,
     connections: Option<Connections>,
     parameters: Arc<Parameters>,
     watched: Watched,
@@ -155,7 +153,6 @@ impl<'o> Connection<'o> {
             published: BTreeMap::new(),
             jobs: FuturesUnordered::new(),
             parameter_jobs: 0,
-            call_bytes: 0,
             connections: None,
             watched: Watched::default(),
             events: None,
@@ -474,27 +471,26 @@ impl<'o> Connection<'o> {
 
     fn call(&mut self, service: u32, call: u32, encoding: String, payload: Bytes) {
         let bytes = payload.len();
-        let bytes_max = self.session.limits().waiting_bytes_max;
         let wanted = match (self.services.get(service), form(&encoding)) {
             (None, _) => Err(Refusal::Service(service)),
             (_, None) => Err(Refusal::encoding(&encoding)),
             (_, Some(Form::Cdr)) if bytes < CDR_HEADER_BYTES => Err(Refusal::NotSerialised(bytes)),
-            (Some(_), _) if self.call_bytes > 0 && self.call_bytes + bytes > bytes_max => {
-                Err(GatewayError::TooMany { what: "bytes of requests under way", max: bytes_max }.into())
+            (Some((name, type_name)), Some(form)) => {
+                let held = self.session.hold_arguments(bytes).map_err(Refusal::Gateway);
+                held.map(|held| (name.to_owned(), type_name.to_owned(), form, held))
             }
-            (Some((name, type_name)), Some(form)) => Ok((name.to_owned(), type_name.to_owned(), form)),
         };
-        let (name, type_name, form) = match wanted {
+        let (name, type_name, form, held) = match wanted {
             Ok(wanted) => wanted,
             Err(error) => return self.call_failed(service, call, &error),
         };
-        self.call_bytes += bytes;
         let (session, max) = (Arc::clone(&self.session), self.options.call_max);
         self.jobs.push(Box::pin(async move {
             let request = Content { form, bytes: payload };
             let reply = session.call(&name, Some(&type_name), &request, form, max).await;
             let reply = reply.map_err(Refusal::Gateway);
-            Done::Called { service, call, encoding, bytes, reply }
+            drop(held);
+            Done::Called { service, call, encoding, reply }
         }));
     }
 
@@ -524,16 +520,13 @@ impl<'o> Connection<'o> {
 
     fn done(&mut self, done: Done) {
         match done {
-            Done::Called { service, call, encoding, bytes, reply } => {
-                self.call_bytes -= bytes;
-                match reply {
-                    Ok(reply) => {
-                        let response = protocol::service_call_response(service, call, &encoding, &reply);
-                        self.outbox.answer(Frame::Binary(response));
-                    }
-                    Err(error) => self.call_failed(service, call, &error),
+            Done::Called { service, call, encoding, reply } => match reply {
+                Ok(reply) => {
+                    let response = protocol::service_call_response(service, call, &encoding, &reply);
+                    self.outbox.answer(Frame::Binary(response));
                 }
-            }
+                Err(error) => self.call_failed(service, call, &error),
+            },
             Done::Parameters { id, is_asked, answer } => {
                 self.parameter_jobs -= 1;
                 for node in &answer.answered {

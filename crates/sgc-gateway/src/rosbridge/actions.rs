@@ -9,7 +9,7 @@ use serde_json::Value as Json;
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 
-use super::calls::{Held, ended};
+use super::calls::ended;
 use super::envelope::{Compression, Envelope};
 use super::input;
 use super::op::{OpId, told};
@@ -20,6 +20,7 @@ use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, G
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::hub::lock;
+use crate::quota::Held;
 use crate::session::Session;
 
 /// How long a goal is waited for: as good as for ever.

@@ -1,7 +1,6 @@
 //! [`Call`]: a service that a client calls, on the network or of the gateway's own `rosapi`.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use serde_json::Value as Json;
@@ -29,32 +28,6 @@ pub(super) struct Call {
     pub(super) max: Duration,
     pub(super) fragment_size: Option<usize>,
     pub(super) compression: Compression,
-}
-
-/// Bytes of arguments that wait, until dropped.
-#[derive(Debug)]
-pub(super) struct Held {
-    waiting: Arc<AtomicUsize>,
-    bytes: usize,
-}
-
-impl Drop for Held {
-    fn drop(&mut self) {
-        self.waiting.fetch_sub(self.bytes, Ordering::Relaxed);
-    }
-}
-
-impl Held {
-    /// Refuses what is too much beside what waits already; alone, arguments may be of any length.
-    pub(super) fn new(waiting: &Arc<AtomicUsize>, bytes: usize, max: usize) -> Result<Self, GatewayError> {
-        let now = waiting.load(Ordering::Relaxed);
-        if now > 0 && now.saturating_add(bytes) > max {
-            return Err(GatewayError::TooMany { what: "bytes of arguments that wait", max });
-        }
-        // Only the connection adds, and one op after the other.
-        waiting.fetch_add(bytes, Ordering::Relaxed);
-        Ok(Self { waiting: Arc::clone(waiting), bytes })
-    }
 }
 
 /// What is answered to a call that is refused before it begins.
@@ -133,21 +106,4 @@ async fn on_network(session: &Session, call: &Call) -> Result<bytes::Bytes, Gate
     let ask =
         |request: Content| async move { session.call(service, type_name, &request, form, call.max).await };
     input::tolerate_later(&args, ask).await
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn arguments_wait_within_a_bound_and_are_given_back() {
-        let waiting: Arc<AtomicUsize> = Arc::default();
-        let first = Held::new(&waiting, 100, 10).unwrap();
-        assert!(matches!(Held::new(&waiting, 1, 10), Err(GatewayError::TooMany { max: 10, .. })));
-        drop(first);
-        let held = [Held::new(&waiting, 4, 10).unwrap(), Held::new(&waiting, 6, 10).unwrap()];
-        assert!(Held::new(&waiting, 1, 10).is_err());
-        drop(held);
-        assert_eq!(waiting.load(Ordering::Relaxed), 0);
-    }
 }

@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
 use tokio::sync::{Notify, oneshot, watch};
@@ -10,7 +9,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use super::actions::{ServedAction, Wanted, pursue};
-use super::calls::{Call, End, Held, answer, refuse};
+use super::calls::{Call, End, answer, refuse};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
@@ -27,11 +26,14 @@ use crate::aside::aside_if_long;
 use crate::content::Content;
 use crate::error::GatewayError;
 use crate::publisher::Publication;
+use crate::quota::Held;
 use crate::session::{Advertise, Session, Subscribe, action_of};
 use crate::types::InterfaceType;
 
 /// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
 const SETTLE_MAX: Duration = Duration::from_millis(500);
+/// How long a call waits for its reply at most, whatever its client says.
+const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
 /// Errors that a client may make at once, and a second: who makes more is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
@@ -96,8 +98,6 @@ pub(super) struct Connection {
     tasks: JoinSet<(u64, Option<OpId>)>,
     under_way: BTreeMap<u64, UnderWay>,
     next_number: u64,
-    /// Bytes of arguments of these, until they are sent.
-    waiting: Arc<AtomicUsize>,
     fragments: Fragments,
     patience: Patience,
 }
@@ -143,7 +143,6 @@ impl Connection {
             tasks: JoinSet::new(),
             under_way: BTreeMap::new(),
             next_number: 0,
-            waiting: Arc::default(),
             fragments,
             patience: Patience::new(),
         }
@@ -506,7 +505,7 @@ impl Connection {
             service: op.needed_name("service")?,
             type_name: op.name("type")?,
             args: op.raw("args").map(str::to_owned),
-            max: op.seconds("timeout")?.unwrap_or(self.options.call_max),
+            max: op.seconds("timeout")?.map_or(self.options.call_max, |said| said.min(TIMEOUT_MAX)),
             fragment_size: fragment_size(op)?,
             compression: match compression(op)? {
                 Compression::None => Compression::None,
@@ -535,8 +534,7 @@ impl Connection {
     /// There is a bound on the bytes of their arguments, too.
     fn hold(&self, op: &Op<'_>) -> Result<Held, OpError> {
         let bytes = op.raw("args").map_or(0, str::len);
-        let held = Held::new(&self.waiting, bytes, self.session.limits().waiting_bytes_max);
-        held.map_err(|error| op.gateway(error))
+        self.session.hold_arguments(bytes).map_err(|error| op.gateway(error))
     }
 
     async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
