@@ -3,7 +3,7 @@
 use bytes::Bytes;
 use sgc_cdr::{Layout, Library, TypeName, Value};
 
-/// Runs one input of the target: a choice, a text and bytes ([`crate::choice_text_bytes`]).
+/// Runs one input of the target: a byte that chooses, a text with its length (16 bits) in front, and bytes.
 pub fn run(input: &[u8]) {
     let Some(input) = crate::choice_text_bytes(input) else { return };
     let (which, text, bytes) = input;
