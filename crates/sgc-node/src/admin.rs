@@ -82,7 +82,7 @@ pub enum AdminRequest {
     Publish(PublishWish),
     /// Call a service.
     Call(CallWish),
-    /// Have an authority carry an operation on the fleet out; answered with an [`OperationAnswer`], encoded.
+    /// Have an authority carry an operation on the fleet out; answered with an [`sgc_wire::OperationAnswer`], encoded.
     Operate {
         /// The authority's node name.
         at: NodeName,

@@ -1,6 +1,6 @@
 //! What an operator has to see to: mistakes outside of this program that look like its faults, or like attacks.
 //!
-//! Each is known on every node that it concerns, and [`Alerts`] remembers those that no state of a machine shows. They
+//! Each is known on every node that it concerns, and `Alerts` remembers those that no state of a machine shows. They
 //! are shown by `sgc status` and `sgc why`; nothing is decided by them.
 
 use std::collections::BTreeMap;

@@ -28,7 +28,7 @@ pub(super) struct Keeping {
     #[command(flatten)]
     pub(super) which: WhichFleet,
     /// Have the fleet's authority do it, over the mesh: the name of its node. Your node that runs here asks for it, and
-    /// has to be an operator there (`operators` in [authority])
+    /// has to be an operator there (`operators` in its configuration)
     #[arg(long, value_name = "AUTHORITY", conflicts_with = "fleet")]
     at: Option<String>,
     /// With --at: the status socket of the node that asks, if it is not the only one here
