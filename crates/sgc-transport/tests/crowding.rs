@@ -77,7 +77,13 @@ fn crowded_listener(scheme: &str, fleet: &sgc_trust::Fleet) -> Server {
     let mut server = Server::start_on(scheme, enroll(fleet, "router"), options);
     // Refusals are for the counters here.
     let mut results = std::mem::replace(&mut server.results, tokio::sync::mpsc::channel(1).1);
-    tokio::spawn(async move { while results.recv().await.is_some() {} });
+    tokio::spawn(async move {
+        // A link that is dropped says goodbye, perhaps before its dialer has returned.
+        let mut kept = Vec::new();
+        while let Some(result) = results.recv().await {
+            kept.extend(result);
+        }
+    });
     server
 }
 
@@ -100,7 +106,6 @@ async fn one_address_that_stalls_keeps_nobody_else_out(scheme: &str) {
         held.push(stall(scheme, &server, &arm, attacker(1), number).await);
     }
     wait_for_pending(&server, PLACES_PER_ADDRESS as u64).await;
-    assert!(server.metrics.handshakes_pending() <= PLACES_PER_ADDRESS as u64);
     let turned_away = (FLOOD - PLACES_PER_ADDRESS) as u64;
     soon(async {
         while server.metrics.refused(RefusalKind::TooManyFromAddress) < turned_away {
@@ -109,6 +114,13 @@ async fn one_address_that_stalls_keeps_nobody_else_out(scheme: &str) {
     })
     .await;
     assert_eq!(server.metrics.refused(RefusalKind::TooMany), 0);
+    // A handshake that gave way is counted until its task has ended.
+    soon(async {
+        while server.metrics.handshakes_pending() > PLACES_PER_ADDRESS as u64 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    })
+    .await;
     dial(arm, &server.url).await.unwrap();
 }
 
