@@ -7,6 +7,14 @@
 // A panic is how a target reports a defect.
 #![allow(clippy::unwrap_used)]
 
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
+use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_wire::UnixMillis;
+
 pub mod access;
 pub mod bodies;
 pub mod cdr;
@@ -42,6 +50,18 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("sink", sink::run),
     ("values", values::run),
 ];
+
+/// Returns identities of one fleet that are valid now.
+fn members(names: [&str; 2]) -> [Arc<Identity>; 2] {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
+    let now = UnixMillis(now.as_millis() as u64);
+    let mut rng = ChaCha20Rng::seed_from_u64(1);
+    let fleet = Fleet::create("acme".parse().unwrap(), now, &mut rng).unwrap();
+    names.map(|name| {
+        let request = EnrollRequest::new(name.parse().unwrap(), now);
+        Arc::new(fleet.issue(&request, &mut rng).unwrap())
+    })
+}
 
 /// Splits an input into a byte that chooses, a text with its length in front (16 bits, big-endian), and the bytes behind.
 /// A text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
