@@ -407,6 +407,22 @@ fn a_lost_catalogue_takes_no_topic_along() {
 }
 
 #[test]
+fn a_catalogue_that_lists_one_name_many_times_changes_no_route() {
+    let mut b = bench(&[], &[("/chatter", None)]);
+    let name = theirs("/chatter", STRING);
+    let plain = entry("/chatter", STRING, Qos::default(), &[]);
+    let kept = entry("/chatter", STRING, latched(), &[]);
+    let first = b.catalogue(vec![plain.clone(), kept.clone(), plain.clone()]);
+    let [Command::Join { name: joined, transient_local, .. }] = &first[..] else { panic!("{first:?}") };
+    assert_eq!((*joined, *transient_local), (name, false), "the first entry counts");
+    b.routes.handle_granted(&name, None);
+    b.commands();
+    for _ in 0..3 {
+        assert_eq!(b.catalogue(vec![plain.clone(), kept.clone(), kept.clone()]), []);
+    }
+}
+
+#[test]
 fn each_far_latched_publisher_gets_a_writer_of_its_own() {
     let mut b = bench(&[], &[("/tf_static", None)]);
     let name = theirs("/tf_static", STRING);

@@ -17,7 +17,10 @@ use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 
 impl<R: RngCore> Routes<R> {
     /// An owner's catalogue arrived or changed.
-    pub fn handle_catalogue(&mut self, now: Instant, owner: NodeId, catalogue: Catalogue) {
+    pub fn handle_catalogue(&mut self, now: Instant, owner: NodeId, mut catalogue: Catalogue) {
+        // Two entries with one name would replace each other's route whenever a catalogue comes.
+        let mut blinds = BTreeSet::new();
+        catalogue.entries.retain(|entry| blinds.insert(entry.blind));
         self.owners.remove(&owner);
         self.owner_is_back(now, owner, &catalogue);
         self.catalogues.insert(owner, catalogue.clone());
