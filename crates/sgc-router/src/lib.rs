@@ -12,6 +12,7 @@
 mod fib;
 mod limits;
 mod links;
+mod lists;
 mod mapping;
 mod memory;
 mod names;

@@ -48,6 +48,10 @@ pub struct Limits {
     /// Announcements that had to be verified and were no news, or more than their signer may have passed on, which a
     /// neighbour may bring at once; refilled by an eighth of it a second. A router may bring sixteen times as many.
     pub stale_burst: u32,
+    /// Revocation lists of one CA that are news and are taken from neighbours at once; refilled by one a second. What is
+    /// beyond it waits, and only the newest of it is taken. The CA of this node's own fleet has no such bound. Greater
+    /// than [`sgc_trust::FLEET_LISTS_MAX`], so that all lists in force fit.
+    pub lists_burst: u32,
     /// Things that do not verify which a node may bring before its link is closed; one is forgiven a second.
     pub forgeries_max: u32,
 }
@@ -72,6 +76,7 @@ impl Default for Limits {
             queries_burst: 65_536,
             announcements_burst: 256,
             stale_burst: 256,
+            lists_burst: 64,
             forgeries_max: 64,
         }
     }
@@ -140,7 +145,7 @@ impl Allowance {
 
 /// A bucket of tokens that refills with time.
 #[derive(Debug)]
-struct Budget {
+pub(crate) struct Budget {
     burst: u32,
     /// Tokens a second.
     rate: u32,
@@ -149,11 +154,11 @@ struct Budget {
 }
 
 impl Budget {
-    fn new(burst: u32, rate: u32) -> Self {
+    pub(crate) fn new(burst: u32, rate: u32) -> Self {
         Self { burst, rate: rate.max(1), used: 0.0, at: None }
     }
 
-    fn used_at(&self, now: Instant, factor: u32) -> f64 {
+    pub(crate) fn used_at(&self, now: Instant, factor: u32) -> f64 {
         let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
         (self.used - elapsed.as_secs_f64() * f64::from(self.rate) * f64::from(factor)).max(0.0)
     }
@@ -162,7 +167,13 @@ impl Budget {
         self.used_at(now, factor) + f64::from(tokens) <= f64::from(self.burst) * f64::from(factor)
     }
 
-    fn take(&mut self, now: Instant, tokens: u32, factor: u32) -> bool {
+    /// Returns when one token is there.
+    pub(crate) fn next_at(&self, now: Instant) -> Instant {
+        let missing = (self.used_at(now, 1) + 1.0 - f64::from(self.burst)).max(0.0);
+        now + Duration::from_secs_f64(missing / f64::from(self.rate))
+    }
+
+    pub(crate) fn take(&mut self, now: Instant, tokens: u32, factor: u32) -> bool {
         let room = self.has_room(now, tokens, factor);
         self.used = self.used_at(now, factor);
         self.at = Some(now);

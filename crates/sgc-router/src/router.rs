@@ -7,13 +7,14 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_trust::{CLOCK_SKEW_MAX, CrlError, Identity, SignedError, TrustAnchors};
+use sgc_trust::{CLOCK_SKEW_MAX, CaFingerprint, CrlError, Identity, SignedError, TrustAnchors};
 use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::FibEntry;
 use crate::limits::{Allowance, Limits};
 use crate::links::{LinkState, Neighbour};
+use crate::lists::ListAllowances;
 use crate::mapping::{Mapping, MappingKind};
 use crate::names::Names;
 use crate::topology::{Topology, Ways};
@@ -209,6 +210,12 @@ pub enum DropReason {
     /// A revocation list that is not believed.
     #[error("revocation list not believed: {0}")]
     Crl(CrlError),
+    /// A revocation list that is news, beyond the allowance of its CA. The newest of such waits.
+    #[error("new revocation lists of the CA {ca} come faster than one a second; the newest of them waits")]
+    ListFlood {
+        /// The CA that signed it.
+        ca: CaFingerprint,
+    },
     /// A signed body from a clock that is not near the one here.
     #[error(
         "{what} signed at {signed}, which is not near {now}: one of the two clocks is wrong, or it is a replay"
@@ -240,7 +247,12 @@ impl DropReason {
             | Self::Crl(_)
             | Self::Clock { .. }
             | Self::NotRouter => true,
-            Self::Stale { .. } | Self::Unknown { .. } | Self::WrongWay { .. } | Self::NoLink => false,
+            // An honest neighbour passes on what the CA signs.
+            Self::ListFlood { .. }
+            | Self::Stale { .. }
+            | Self::Unknown { .. }
+            | Self::WrongWay { .. }
+            | Self::NoLink => false,
         }
     }
 
@@ -257,6 +269,7 @@ impl DropReason {
             Self::WrongWay { .. } => "wrong_way",
             Self::NoLink => "no_link",
             Self::Crl(_) => "crl",
+            Self::ListFlood { .. } => "crl_flood",
             Self::Clock { .. } => "clock",
             Self::NotRouter => "not_router",
         }
@@ -296,6 +309,7 @@ pub struct Router {
     pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
     /// When to pass on what was beyond the allowance of its signer.
     pub(crate) late_at: Option<Instant>,
+    pub(crate) lists: ListAllowances,
     pub(crate) outputs: VecDeque<Output>,
     /// True once another run of this node took over from this one.
     yields: bool,
@@ -329,6 +343,7 @@ impl Router {
             trees: BTreeMap::new(),
             deadlines: BTreeSet::new(),
             late_at: None,
+            lists: ListAllowances::default(),
             outputs: VecDeque::new(),
             yields: false,
             clock: ClockWatch::new(now),
@@ -451,6 +466,7 @@ impl Router {
         self.expire_nodes(now);
         self.names_timeout(now);
         self.pass_on_late(now);
+        self.take_waiting_lists(now);
         self.branches_timeout(now);
     }
 
@@ -472,7 +488,8 @@ impl Router {
                 .chain(branch)
                 .chain(links)
                 .chain(self.names.deadlines())
-                .chain(self.late_at);
+                .chain(self.late_at)
+                .chain(self.lists.next_at());
             Output::Timeout(all.min())
         })
     }

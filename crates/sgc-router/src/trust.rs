@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{CertError, CertId, CrlError, SignedError, TrustAnchors, VerifiedPeer};
+use sgc_trust::{CertError, CertId, CrlError, CrlNews, SignedError, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Control, Now};
 
 use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
@@ -12,13 +12,16 @@ use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
 impl Router {
     /// Takes a revocation list from this node's user; true if it is news, which is then told everywhere.
     pub fn add_crl(&mut self, now: Now, der: &Bytes) -> Result<bool, CrlError> {
-        self.learn_crl(now, LinkId::LOCAL, der)
+        let Some(anchors) = self.config.anchors.with_crl(der, now.unix)? else { return Ok(false) };
+        self.take_list(now, LinkId::LOCAL, der, anchors);
+        Ok(true)
     }
 
     /// Believes these CAs, with their revocation lists, from here on. Everything that rests on a certificate which
     /// is no longer good ends: links, routes, branches.
     pub fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
         self.now = now;
+        self.lists.retain(|ca| anchors.ca_spki(ca).is_some());
         self.config.anchors = anchors;
         let links: Vec<_> = self
             .links
@@ -36,11 +39,11 @@ impl Router {
     }
 
     pub(crate) fn handle_crl(&mut self, now: Now, link: LinkId, der: &Bytes) {
-        let known = self.config.anchors.crls().any(|known| known == der);
+        let known = self.config.anchors.crls().any(|known| known == der) || self.lists.awaits(der);
         if known || !self.may_bring(link) {
             return;
         }
-        let learnt = self.learn_crl(now, link, der);
+        let learnt = self.learn_or_wait(now, link, der);
         if !matches!(learnt, Ok(true)) {
             self.charge_stale(link);
         }
@@ -52,8 +55,33 @@ impl Router {
         }
     }
 
-    fn learn_crl(&mut self, now: Now, from: LinkId, der: &Bytes) -> Result<bool, CrlError> {
-        let Some(anchors) = self.config.anchors.with_crl(der, now.unix)? else { return Ok(false) };
+    /// Looks again at the lists that waited for the allowance of their CA.
+    pub(crate) fn take_waiting_lists(&mut self, now: Now) {
+        for waiting in self.lists.due(now.instant) {
+            // It was verified when it came. By now it may be no news, or its CA may be over or trusted no more.
+            if let Err(why) = self.learn_or_wait(now, waiting.from, &waiting.der) {
+                self.drop_frame(waiting.from, DropReason::Crl(why));
+            }
+        }
+    }
+
+    /// Takes a list that a neighbour brought, if it is news and its CA has room; true if so.
+    fn learn_or_wait(&mut self, now: Now, link: LinkId, der: &Bytes) -> Result<bool, CrlError> {
+        let Some(CrlNews { ca, number, anchors }) = self.config.anchors.crl_news(der, now.unix)? else {
+            return Ok(false);
+        };
+        let is_own = ca == self.config.identity.as_peer().ca;
+        if !is_own && !self.lists.take(now.instant, ca, self.config.limits.lists_burst) {
+            self.lists.wait(now.instant, &ca, number, link, der.clone());
+            self.drop_frame(link, DropReason::ListFlood { ca });
+            return Ok(false);
+        }
+        self.take_list(now, link, der, anchors);
+        Ok(true)
+    }
+
+    /// Believes a list from here on and passes it on.
+    fn take_list(&mut self, now: Now, from: LinkId, der: &Bytes, anchors: TrustAnchors) {
         let anchors = Arc::new(anchors);
         self.outputs.push_back(Output::Trust(anchors.clone()));
         self.set_anchors(now, anchors);
@@ -62,7 +90,6 @@ impl Router {
         for link in others {
             self.send(link, Control::Crl { der: der.clone() });
         }
-        Ok(true)
     }
 
     /// True if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.

@@ -22,15 +22,21 @@ use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, wit
 impl TrustAnchors {
     /// With one more list, if it verifies and says something that is not known. `Ok(None)`: it is no news.
     pub fn with_crl(&self, der: &[u8], now: UnixMillis) -> Result<Option<Self>, CrlError> {
+        Ok(self.crl_news(der, now)?.map(|news| news.anchors))
+    }
+
+    /// Verifies a list and returns what it adds, with its CA and number; `Ok(None)` if it adds nothing.
+    pub fn crl_news(&self, der: &[u8], now: UnixMillis) -> Result<Option<CrlNews>, CrlError> {
         if self.crls().any(|known| known == der) {
             return Ok(None);
         }
         let (ca, list) = self.verify_list(der, now)?;
+        let number = CrlNumber::from_bytes(&list.number);
         let known = self.lists.get(&ca).cloned().unwrap_or_default();
         let Some(more) = known.with(Arc::new(list))? else { return Ok(None) };
         let mut lists = BTreeMap::clone(&self.lists);
         lists.insert(ca, more);
-        Ok(Some(self.with_lists(Arc::new(lists))))
+        Ok(Some(CrlNews { ca, number, anchors: self.with_lists(Arc::new(lists)) }))
     }
 
     /// The same CAs, and what is revoked here or elsewhere by those of them that are known there.
@@ -139,6 +145,30 @@ impl TrustAnchors {
         }
         let list = RevocationList { der: Bytes::copy_from_slice(der), number: number.into(), serials, nodes };
         Ok((anchor.fingerprint, list))
+    }
+}
+
+/// A verified list that says something new.
+pub struct CrlNews {
+    /// The trusted CA that signed it.
+    pub ca: CaFingerprint,
+    /// Its number among the lists of that CA.
+    pub number: CrlNumber,
+    /// The trust anchors with it.
+    pub anchors: TrustAnchors,
+}
+
+/// The CRL number of a list (RFC 5280, 5.2.3). The greater of two numbers of one CA is the newer list's.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct CrlNumber {
+    // Compared first, so that the bytes, which have no leading zeros, compare as a number.
+    len: usize,
+    bytes: Box<[u8]>,
+}
+
+impl CrlNumber {
+    fn from_bytes(number: &[u8]) -> Self {
+        Self { len: number.len(), bytes: number.into() }
     }
 }
 

@@ -36,7 +36,7 @@ mod x509;
 mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
-pub use crl::CrlError;
+pub use crl::{CrlError, CrlNews, CrlNumber};
 pub use crowd::{
     AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places, REPEAT_SOURCES_MAX,
     REPEAT_WINDOW, Repeated, Repeats,

@@ -2,7 +2,7 @@
 
 use sgc_endpoint::{Event, Output as EndpointOutput};
 use sgc_ros::RosNetwork;
-use sgc_router::{LinkClose, LinkId, Output as RouterOutput};
+use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
 use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
@@ -68,7 +68,10 @@ impl<N: RosNetwork> Core<N> {
             }
             RouterOutput::Dropped(dropped) => {
                 let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
-                if first && dropped.reason.is_suspicious() {
+                // A neighbour may be honest and bring what a partner's CA makes too much of.
+                let is_told =
+                    dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
+                if first && is_told {
                     let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
                     warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
                 } else {

@@ -1,10 +1,11 @@
 //! A node of another fleet whose CA is trusted: it gets what it was named for, and nothing else.
 
+use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};
-use sgc_testkit::{Member, NodeKey, Sharing, WorldConfig, revocation_list};
-use sgc_wire::RefuseReason;
+use sgc_testkit::{Member, NodeKey, Sharing, World, WorldConfig, revocation_list, serial_list};
+use sgc_wire::{Control, RefuseReason};
 
-use crate::{Scene, assert_received, events, grants, ms, publish_steadily, scene_with};
+use crate::{Scene, assert_received, drops, events, frames, grants, ms, publish_steadily, scene_with};
 
 /// The scene with `/chatter` for its own fleet as `sharing` says, and a node of another fleet that everyone trusts.
 fn scene(seed: u64, sharing: impl FnOnce(Sharing) -> Sharing) -> (Scene, NodeKey) {
@@ -107,4 +108,50 @@ fn a_partner_whose_ca_is_no_longer_trusted_loses_the_key_though_a_policy_still_n
     assert!(grants(world, visitor, *arm).iter().all(|(_, g)| g.epoch == 1));
     world.run(ms(1000));
     assert_received(world, *desk, *arm, &published);
+}
+
+#[test]
+fn new_lists_of_a_partners_ca_are_passed_on_at_its_allowance_and_the_newest_counts() {
+    let (mut scene, visitor) = scene(110, |sharing| sharing);
+    let Scene { world, east, west, desk, .. } = &mut scene;
+    let ghosts = |fleet: &str| -> Vec<Member> {
+        (0..200).map(|n| Member { fleet: fleet.into(), ..Member::new(&format!("ghost-{n}")) }).collect()
+    };
+    let (foreign, own) = (ghosts("umbrella"), ghosts("acme"));
+    let lists = |fleet: &str, members: &[Member]| -> Vec<Bytes> {
+        (1..=200).map(|n| revocation_list(fleet, &members[..n], n as u64)).collect()
+    };
+    let (foreign_lists, own_lists) = (lists("umbrella", &foreign), lists("acme", &own));
+    for (foreign, own) in foreign_lists.iter().zip(&own_lists) {
+        world.inject(visitor, *west, &Control::Crl { der: foreign.clone() });
+        world.inject(*desk, *west, &Control::Crl { der: own.clone() });
+        world.run(ms(2));
+    }
+    let (newest, newest_of_fleet) = (foreign_lists[199].clone(), own_lists[199].clone());
+    let passed_on = |world: &World| {
+        let frames = frames(world, *west, *east);
+        let of = |lists: &[Bytes]| {
+            let is_one = |frame: &&Control| matches!(frame, Control::Crl { der } if lists.contains(der));
+            frames.iter().filter(is_one).count()
+        };
+        (of(&foreign_lists), of(&own_lists))
+    };
+    world.run(ms(100));
+    let (of_partner, of_fleet) = passed_on(world);
+    assert_eq!(of_partner, 64, "of 200 in half a second");
+    assert_eq!(of_fleet, 200, "its own fleet's are never held back");
+    assert_eq!(drops(world, *west, "crl_flood"), 136);
+    assert!(!world.revocations(*west).contains(&newest));
+    world.run(ms(3000));
+    assert_eq!(passed_on(world).0, of_partner + 1, "of those that waited, the newest");
+    for router in [*west, *east] {
+        let known = world.revocations(router);
+        assert!(known.contains(&newest) && known.contains(&newest_of_fleet));
+    }
+    // Once it has been quiet, the next list is taken at once.
+    world.run(ms(2000));
+    let serials = serial_list("umbrella", &foreign[..1], 202);
+    world.inject(visitor, *west, &Control::Crl { der: serials.clone() });
+    world.run(ms(200));
+    assert!(world.revocations(*east).contains(&serials));
 }
