@@ -23,6 +23,7 @@ use cyclors::{
 use sgc_ros::EndpointSpec;
 
 use crate::entity::{Entity, c_string};
+use crate::fragments::{self, ReceivedFragment};
 use crate::identity::{
     CYCLONE, IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity,
 };
@@ -33,7 +34,7 @@ use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 /// no other version than the one that is written there with `=`, and whoever writes another one there meets the assertion
 /// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
 /// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), the callers of
-/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with what stands here.
+/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with the text here and in `fragments.rs`.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
@@ -199,28 +200,6 @@ struct Xmsg {
 #[repr(C)]
 struct XmsgMarker {
     offset: usize,
-}
-
-/// The beginning of `struct ddsi_rdata` (`ddsi_radmin.h`), a fragment of a received sample.
-#[repr(C)]
-struct ReceivedFragment {
-    message: *const ReceivedMessage,
-    next: *const ReceivedFragment,
-    first: u32,
-    end: u32,
-    submessage_offset: u16,
-    payload_offset: u16,
-}
-
-/// `struct ddsi_rmsg` (`ddsi_radmin.h`); the packet follows it.
-#[repr(C)]
-struct ReceivedMessage {
-    references: u32,
-    last_chunk: *mut c_void,
-    trace: bool,
-    chunk_buffer: *mut c_void,
-    chunk_next: *mut c_void,
-    chunk_bytes: u64,
 }
 
 /// RTPS submessage kinds and their lengths up to the inline QoS, bytes (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
@@ -417,7 +396,8 @@ unsafe extern "C" fn from_ser(
     fragments: *const cyclors::ddsi_rdata,
     bytes: usize,
 ) -> *mut ddsi_serdata {
-    if bytes > PAYLOAD_BYTES_MAX {
+    // SAFETY: the fragments are those that Cyclone gave for this function.
+    if bytes > PAYLOAD_BYTES_MAX || !unsafe { fragments::cover_exactly(fragments, bytes) } {
         return std::ptr::null_mut();
     }
     let mut payload = Vec::with_capacity(bytes);
@@ -431,15 +411,12 @@ unsafe extern "C" fn from_ser(
                 from = origin(fragment);
             }
             let (first, end) = (fragment.first as usize, fragment.end as usize);
-            // They may overlap, and never leave a gap.
-            if end > had && first <= had && end <= bytes {
+            // They may overlap.
+            if end > had {
                 let start = fragment.message.add(1).cast::<u8>().add(usize::from(fragment.payload_offset));
                 payload.extend_from_slice(std::slice::from_raw_parts(start.add(had - first), end - had));
             }
             at = fragment.next;
-        }
-        if payload.len() != bytes {
-            return std::ptr::null_mut();
         }
         Identified::allocate(sertype, kind, payload, None, from)
     }

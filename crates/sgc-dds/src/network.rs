@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cyclors::{
-    DDS_RETCODE_PRECONDITION_NOT_MET, cdds_create_blob_topic, dds_create_domain, dds_create_participant,
-    dds_create_publisher, dds_create_subscriber, dds_domain_set_deafmute, dds_get_children,
+    DDS_RETCODE_PRECONDITION_NOT_MET, dds_create_domain, dds_create_participant, dds_create_publisher,
+    dds_create_subscriber, dds_domain_set_deafmute, dds_get_children,
 };
 use sgc_ros::{
     DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError, RosNetwork,
@@ -23,11 +23,11 @@ use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, reason};
 use crate::graph::Announcer;
 use crate::intake::Pace;
-use crate::keyed;
 use crate::log;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
 use crate::service::{CycloneClient, CycloneServer};
+use crate::topic;
 use crate::user_data;
 use crate::writer::CycloneWriter;
 
@@ -204,19 +204,7 @@ impl Participant {
 
     /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.
     pub(crate) fn topic(&self, spec: &EndpointSpec) -> Result<Entity, String> {
-        if !spec.keyless {
-            return keyed::topic(self, &spec.topic, &spec.type_name);
-        }
-        let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
-        // SAFETY: both strings are copied and, despite their type, not written to.
-        Entity::new(unsafe {
-            cdds_create_blob_topic(
-                self.entity.handle(),
-                name.as_ptr().cast_mut(),
-                type_name.as_ptr().cast_mut(),
-                spec.keyless,
-            )
-        })
+        topic::topic(self, spec)
     }
 
     /// The publisher or subscriber for a spec, if its partitions need one of their own.

@@ -15,8 +15,8 @@ use cyclors::{
 
 use sgc_ros::SampleKind;
 
-use crate::keyed;
 use crate::payload::Frame;
+use crate::topic;
 
 /// One reference to a sample.
 #[derive(Debug)]
@@ -75,7 +75,7 @@ impl Serdata {
     /// What a received sample says of its instance.
     pub(crate) fn kind(&self) -> SampleKind {
         // SAFETY: valid while the reference is held.
-        let (status, key_only) = unsafe { ((*self.0).statusinfo, keyed::is_key_only(self.0)) };
+        let (status, key_only) = unsafe { ((*self.0).statusinfo, topic::is_key_only(self.0)) };
         match key_only {
             true if status & DDSI_STATUSINFO_DISPOSE != 0 => SampleKind::Dispose,
             true => SampleKind::Unregister,

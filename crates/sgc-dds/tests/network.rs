@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+use std::net::UdpSocket;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex};
@@ -330,6 +331,70 @@ fn large_messages_arrive_intact() {
         write(&writer, &payload);
         let got = next(&samples).payload;
         assert!(got == padded(&payload), "{bytes} bytes came as {}", got.len());
+    }
+}
+
+/// Length of the fragments of [`fragment`], bytes.
+const FRAGMENT_BYTES: u16 = 52;
+
+/// An RTPS message with one fragment of a best-effort writer's sample (RTPS 2.5, 9.4.5.5); fragments count from 1.
+fn fragment(writer: Guid, number: u32, fragment: u32, sample_bytes: u32) -> Vec<u8> {
+    let body = 32 + FRAGMENT_BYTES;
+    let mut packet = b"RTPS\x02\x01\x01\x10".to_vec();
+    packet.extend(&writer.0[..12]);
+    // DATA_FRAG, little endian.
+    packet.extend([0x16, 1]);
+    packet.extend(body.to_le_bytes());
+    // No extra flags; the payload is 28 bytes behind this field; for any reader.
+    packet.extend([0, 0, 28, 0, 0, 0, 0, 0]);
+    packet.extend(&writer.0[12..]);
+    packet.extend([0; 4]);
+    packet.extend(number.to_le_bytes());
+    packet.extend(fragment.to_le_bytes());
+    packet.extend([1, 0]);
+    packet.extend(FRAGMENT_BYTES.to_le_bytes());
+    packet.extend(sample_bytes.to_le_bytes());
+    let header: &[u8] = if fragment == 1 { &[0, 1, 0, 0] } else { &[7; 4] };
+    packet.extend(header);
+    packet.resize(packet.len() + usize::from(FRAGMENT_BYTES) - header.len(), 7);
+    packet
+}
+
+/// Cyclone and `cyclors` copy a sample's fragments into memory of the length that the first one announces. Four bytes beyond
+/// it are in what the allocator gives for 100: this would harm nobody, and be seen as a sample.
+#[test]
+fn fragments_that_reach_beyond_their_sample_are_refused() {
+    const DOMAIN: u32 = 91;
+    let (ros, sgc) = (open(DOMAIN, None), open(DOMAIN, Some("arm-1")));
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    // Ports of the first participants of a host (RTPS 2.5, 9.6.2.3). Cyclone takes the one of discovery for data as well.
+    let send = |packet: &[u8]| {
+        for participant in 0..8 {
+            let port = (7400 + 250 * DOMAIN + 10 + 2 * participant) as u16;
+            socket.send_to(packet, ("127.0.0.1", port)).unwrap();
+        }
+    };
+    for keyless in [true, false] {
+        let spec = with(EndpointSpec { keyless, ..spec(&format!("pieces{keyless}")) }, |q| {
+            q.reliability = Reliability::BestEffort;
+        });
+        let (_reader, samples) = read(&sgc, &spec);
+        let writer = writer(&ros, &spec, 1);
+        // The reader's side knows the writer.
+        write(&writer, &string_cdr("known"));
+        assert_eq!(next(&samples).payload, padded(&string_cdr("known")));
+        for (number, announced) in [(1000, [100, 104]), (1001, [104, 104])] {
+            for (at, bytes) in (1..).zip(announced) {
+                send(&fragment(writer.guid(), number, at, bytes));
+            }
+        }
+        let sample = next(&samples);
+        assert_eq!(
+            sample.payload.len(),
+            2 * usize::from(FRAGMENT_BYTES),
+            "the sample of 100 bytes was taken"
+        );
+        quiet(&samples);
     }
 }
 
