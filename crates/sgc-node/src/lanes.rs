@@ -19,7 +19,7 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
 use crate::control_queue::ControlQueue;
-use crate::finding::{BACKOFF_MAX, wait};
+use crate::finding::{BACKOFF_MAX, doubled, wait};
 use crate::links::Inflow;
 
 /// Lanes of one link.
@@ -30,6 +30,10 @@ const EXPECTED_MAX: usize = 1024;
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 /// How long a lane may take to come once it was agreed on.
 const ARRIVAL_MAX: Duration = Duration::from_secs(15);
+/// The first wait, before jitter, after the peer refused a lane for lack of places. It is doubled each time.
+const REFUSED_MIN: Duration = Duration::from_secs(30);
+/// The longest such wait, before jitter.
+const REFUSED_MAX: Duration = Duration::from_secs(600);
 
 /// The lanes that this node was told to await. Clones share.
 #[derive(Clone, Default)]
@@ -254,11 +258,11 @@ impl Lanes {
     async fn keep(self: Arc<Self>, name: Name, dial: Dial) {
         // For jitter alone.
         let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
-        let mut failures = 0;
+        let (mut failures, mut refusals) = (0, 0u32);
         loop {
             match self.open(name, &dial).await {
                 Ok(lane) => {
-                    failures = 0;
+                    (failures, refusals) = (0, 0);
                     self.attach(name, lane.clone());
                     let end = lane.closed().await;
                     let goodbye = matches!(&end, LinkError::Closed { reason: CloseReason::Goodbye, .. });
@@ -271,8 +275,12 @@ impl Lanes {
                     debug!(name = %name.short(), "a lane ended: {end}");
                 }
                 Err(LaneFailure::Refused) => {
-                    info!(remote = %self.link.remote(), "{}; the topic shares the link", LaneFailure::Refused);
-                    return;
+                    if refusals == 0 {
+                        info!(remote = %self.link.remote(), "{}; the topic shares the link, and one is asked for again seldom", LaneFailure::Refused);
+                    }
+                    refusals = refusals.saturating_add(1);
+                    sleep(doubled(REFUSED_MIN, refusals, REFUSED_MAX, &mut rng)).await;
+                    continue;
                 }
                 Err(why) if failures == 0 => {
                     warn!(remote = %self.link.remote(), "no connection of its own for a topic: {why}; it shares the link and it is tried again");
@@ -359,5 +367,97 @@ fn end(lane: Lane) {
     }
     if let Some((_, up)) = lane.up {
         up.close(CloseReason::Goodbye);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use sgc_transport::{CredentialStore, LinkOptions, Listener};
+    use sgc_trust::{EnrollRequest, Fleet};
+    use tokio::sync::mpsc;
+
+    use super::*;
+    use crate::control_queue::Outgoing;
+    use crate::core::now;
+
+    /// A router that nodes of its fleet dial.
+    struct Bench {
+        fleet: Fleet,
+        listener: Listener,
+        door: LaneDoor,
+    }
+
+    /// The lanes of one end of a link, and the frames that it sends.
+    type End = (Arc<Lanes>, mpsc::Receiver<Outgoing>);
+
+    impl Bench {
+        fn new() -> Self {
+            let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+            let router = Self::credentials(&fleet, "router");
+            let addr = "quic://127.0.0.1:0".parse().unwrap();
+            let listener = Listener::bind(&addr, router, LinkOptions::default(), Arc::default()).unwrap();
+            Self { fleet, listener, door: LaneDoor::default() }
+        }
+
+        fn credentials(fleet: &Fleet, node: &str) -> CredentialStore {
+            let request = EnrollRequest::new(node.parse().unwrap(), now().unix);
+            CredentialStore::new(Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap()))
+        }
+
+        /// A link of this node to the router: the node's end, and the router's.
+        async fn link(&mut self, node: &str) -> (End, End) {
+            let store = Self::credentials(&self.fleet, node);
+            let dialer = Arc::new(Dialer::new(store, LinkOptions::default(), Arc::default()));
+            let url: LinkUrl = self.listener.local().to_string().parse().unwrap();
+            let (near, far) = tokio::join!(dialer.dial(&url), self.listener.accept());
+            let end = |link, dial, door| {
+                let (frames, sent) = ControlQueue::new();
+                (Lanes::new(link, frames, dial, door), sent)
+            };
+            let near = end(near.unwrap(), Some((dialer, url)), LaneDoor::default());
+            (near, end(far.unwrap().unwrap(), None, self.door.clone()))
+        }
+    }
+
+    fn offer(lanes: &Arc<Lanes>, sent: &mut mpsc::Receiver<Outgoing>, n: u16, name: Name) -> bool {
+        let mut token = [0; 16];
+        token[..2].copy_from_slice(&n.to_be_bytes());
+        lanes.handle(&Control::LaneOffer { token: LaneToken(token), name }).unwrap();
+        let Outgoing::Frame(Control::LaneAnswer { accepted, .. }) = sent.try_recv().unwrap() else {
+            panic!("an answer")
+        };
+        accepted
+    }
+
+    #[tokio::test]
+    async fn one_link_that_offers_again_and_again_leaves_places_for_the_lanes_of_others() {
+        let mut bench = Bench::new();
+        let (_, (greedy, mut to_greedy)) = bench.link("greedy").await;
+        let (_, (other, mut to_other)) = bench.link("other").await;
+        // Each offer of one name has a token of its own, and none of the lanes comes.
+        let offers = 0..u16::try_from(2 * EXPECTED_MAX).unwrap();
+        let accepted = offers.filter(|n| offer(&greedy, &mut to_greedy, *n, Name([1; 32]))).count();
+        assert_eq!(accepted, LANES_MAX);
+        assert!(offer(&other, &mut to_other, u16::MAX, Name([2; 32])));
+    }
+
+    #[tokio::test]
+    async fn a_lane_that_was_refused_is_offered_again_seldom() {
+        let mut bench = Bench::new();
+        let ((lanes, mut sent), _far) = bench.link("robot").await;
+        tokio::time::pause();
+        lanes.set_wanted(Name([1; 32]), true);
+        let mut last = tokio::time::Instant::now();
+        for refusals in 0..8 {
+            let frame = timeout(2 * REFUSED_MAX, sent.recv()).await.expect("it is offered again");
+            let Some(Outgoing::Frame(Control::LaneOffer { token, .. })) = frame else { panic!("an offer") };
+            let most = REFUSED_MIN.saturating_mul(2u32.pow(refusals) / 2).min(REFUSED_MAX);
+            let waited = last.elapsed();
+            assert!(most / 2 <= waited && waited <= most + ANSWER_MAX, "{refusals}: {waited:?} of {most:?}");
+            lanes.handle(&Control::LaneAnswer { token, accepted: false }).unwrap();
+            last = tokio::time::Instant::now();
+        }
     }
 }

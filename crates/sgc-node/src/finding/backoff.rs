@@ -80,7 +80,7 @@ pub(crate) fn wait(failures: u32, max: Duration, rng: &mut ChaCha20Rng) -> Durat
 }
 
 /// `least` doubled for each time after the first, at most `max`, with jitter.
-fn doubled(least: Duration, times: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
+pub(crate) fn doubled(least: Duration, times: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
     let doubled = least.saturating_mul(2u32.saturating_pow(times.saturating_sub(1).min(16)));
     jittered(doubled.min(max), rng)
 }

@@ -27,7 +27,7 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
 use backoff::BACKOFF_MIN;
-pub(crate) use backoff::{BACKOFF_MAX, Backoff, wait};
+pub(crate) use backoff::{BACKOFF_MAX, Backoff, doubled, wait};
 pub use board::RouterStatus;
 pub(crate) use board::{Board, Line};
 pub(crate) use claims::{Claim, Claims};
