@@ -156,6 +156,18 @@ impl Names {
         self.records.get(&self.id(name)?)
     }
 
+    /// The owners of what is advertised or withdrawn.
+    pub(crate) fn owners(&self) -> impl Iterator<Item = &NodeId> {
+        self.owners.keys()
+    }
+
+    /// The names that the advertisements of an owner speak for.
+    fn names_of(&self, owner: &NodeId) -> impl Iterator<Item = &Name> {
+        let records = self.owners.get(owner).into_iter().flat_map(|of_owner| &of_owner.records);
+        let named = records.filter_map(|(_, id)| Some((id, self.records.get(id)?)));
+        named.flat_map(move |(id, r)| r.names.iter().filter(move |n| self.words.get(*n) == Some(id)))
+    }
+
     /// The advertisement that speaks for a name.
     fn id(&self, name: &Name) -> Option<RecordId> {
         let id = self.words.get(name)?;
@@ -813,9 +825,22 @@ impl Router {
         }
     }
 
-    /// The ways to nodes are others by now.
+    /// The ways to these owners may be others by now. Names that nobody advertises have no way before or after.
+    pub(crate) fn ways_to_owners_changed(&mut self, owners: &[NodeId]) {
+        let counts = |n: &&Name| self.names.watchers.contains_key(*n) || self.trees.contains_key(*n);
+        let names: BTreeSet<_> =
+            owners.iter().flat_map(|owner| self.names.names_of(owner).filter(counts)).copied().collect();
+        self.check_ways(names);
+        self.answer_asks(owners);
+    }
+
+    /// The links of a node that carries nobody else's names are others by now.
     pub(crate) fn ways_changed(&mut self) {
-        let names: BTreeSet<_> = self.names.watchers.keys().chain(self.trees.keys()).copied().collect();
+        self.check_ways(self.names.watchers.keys().chain(self.trees.keys()).copied().collect());
+    }
+
+    fn check_ways(&mut self, names: BTreeSet<Name>) {
+        self.topology.names_checked += names.len() as u64;
         self.routes_changed(&names.into_iter().collect::<Vec<_>>());
     }
 
@@ -989,16 +1014,20 @@ impl Router {
         }
     }
 
-    /// Answers what could not be answered before.
-    pub(crate) fn answer_asks(&mut self) {
-        let open: Vec<_> = self
-            .links
-            .iter()
-            .flat_map(|(link, s)| s.asks.keys().map(move |n| (*link, *n)))
-            .filter(|(link, n)| self.way(n).is_some_and(|(way, _)| way != *link))
-            .collect();
-        for (link, name) in open {
-            let Some(owner) = self.names.record(&name).map(|r| r.owner.node_id) else { continue };
+    /// Answers what could not be answered before of the names of these owners.
+    fn answer_asks(&mut self, owners: &[NodeId]) {
+        let asking: Vec<_> = self.links.iter().filter(|(_, s)| !s.asks.is_empty()).collect();
+        let mut open = Vec::new();
+        for owner in owners.iter().filter(|_| !asking.is_empty()) {
+            for name in self.names.names_of(owner) {
+                let by = asking.iter().filter(|(_, s)| s.asks.contains_key(name)).map(|(link, _)| **link);
+                open.extend(by.map(|link| (link, *owner, *name)));
+            }
+        }
+        for (link, owner, name) in open {
+            if self.way(&name).is_none_or(|(way, _)| way == link) {
+                continue;
+            }
             self.answer(link, &owner, &[name]);
             self.tell_record(link, &name);
         }

@@ -400,8 +400,9 @@ impl Router {
     pub fn handle_link_quality(&mut self, now: Now, link: LinkId, round_trip: Duration, suspect: bool) {
         self.now = now;
         let Some(state) = self.links.get_mut(&link) else { return };
+        let node = state.node;
         if state.cost.measure(now.instant, round_trip, suspect) {
-            self.links_changed(now.instant);
+            self.links_changed(now.instant, &node);
         }
     }
 
@@ -572,7 +573,7 @@ impl Router {
             self.supersede(old, Some(link), alive);
         }
         self.tell_all(link);
-        self.links_changed(self.now.instant);
+        self.links_changed(self.now.instant, &node);
     }
 
     /// Tells a neighbour what it is to know of this node, and of the network if it is a router.
@@ -609,7 +610,7 @@ impl Router {
             self.send(link, Control::Clock { time: now.unix });
             self.tell_again(now, link);
         }
-        self.links_changed(now.instant);
+        self.topology.touch_own(now.instant);
     }
 
     /// Tells a neighbour what it was told when it greeted, at most once in [`TELL_AGAIN_EVERY`].
@@ -638,7 +639,7 @@ impl Router {
         self.cut_link(link, state.branches);
         self.unhear(link);
         if state.hello.is_some() {
-            self.links_changed(self.now.instant);
+            self.links_changed(self.now.instant, &state.node);
         }
     }
 

@@ -35,6 +35,8 @@ pub struct Ways {
     pub searches: u64,
     /// When one found other ways than the one before.
     pub changed: Option<Instant>,
+    /// Names whose ways were looked at again because of them.
+    pub names_checked: u64,
 }
 
 /// A node as it described itself.
@@ -63,6 +65,15 @@ impl NodeRecord {
     }
 }
 
+/// Changes that ways depend on.
+#[derive(Debug, Default)]
+struct Changes {
+    /// Nodes that this node gained or lost a link to, or that describe themselves in another way.
+    nodes: BTreeSet<NodeId>,
+    /// Nodes that a router gained or lost.
+    attached: BTreeSet<NodeTag>,
+}
+
 /// All nodes that described themselves, and the ways to the routers among them.
 #[derive(Debug, Default)]
 pub(crate) struct Topology {
@@ -74,6 +85,10 @@ pub(crate) struct Topology {
     /// Nodes whose link states wait for their allowance to be passed on.
     pub(crate) late: BTreeSet<NodeId>,
     paths: BTreeMap<NodeId, Path>,
+    /// Changes since the last search.
+    changes: Changes,
+    /// Names whose ways were looked at again after a search.
+    pub(crate) names_checked: u64,
     /// When to search for ways, if something changed.
     pub(crate) search_at: Option<Instant>,
     searched: Option<Instant>,
@@ -117,8 +132,39 @@ impl Topology {
         in_force.into_iter().chain(self.memory.newest(node)).max_by_key(|(seq, _)| *seq)
     }
 
-    /// Something changed that ways depend on.
-    pub(crate) fn touch(&mut self, now: Instant) {
+    /// A link of this node to another one changed.
+    pub(crate) fn link_changed(&mut self, now: Instant, node: &NodeId) {
+        self.changes.nodes.insert(*node);
+        self.touch(now);
+    }
+
+    /// A node describes itself in another way, or not any more. A mere renewal changes no way.
+    fn record_changed(
+        &mut self,
+        now: Instant,
+        node: &NodeId,
+        old: Option<&NodeRecord>,
+        new: Option<&NodeRecord>,
+    ) {
+        let says = |record: Option<&NodeRecord>| record.map(|r| (r.transit, r.routers.clone()));
+        let attached = |record: Option<&NodeRecord>| {
+            record.into_iter().flat_map(|r| &r.attached).copied().collect::<BTreeSet<_>>()
+        };
+        let (before, after) = (attached(old), attached(new));
+        let same = says(old) == says(new);
+        if same && before == after {
+            return;
+        }
+        self.changes.attached.extend(before.symmetric_difference(&after));
+        // The edges between routers are the search's.
+        let is_router = |record: Option<&NodeRecord>| record.is_some_and(|r| r.transit);
+        if !same && !(is_router(old) && is_router(new)) {
+            self.changes.nodes.insert(*node);
+        }
+        self.touch(now);
+    }
+
+    fn touch(&mut self, now: Instant) {
         let at = self.searched.map_or(now, |at| now.max(at + SEARCH_EVERY));
         self.search_at.get_or_insert(at);
     }
@@ -153,7 +199,12 @@ impl Topology {
 
     /// What the searches for ways came to.
     pub(crate) fn ways(&self) -> Ways {
-        Ways { routers: self.paths.len(), searches: self.searches, changed: self.ways_changed }
+        Ways {
+            routers: self.paths.len(),
+            searches: self.searches,
+            changed: self.ways_changed,
+            names_checked: self.names_checked,
+        }
     }
 
     /// Returns `true` if a later run of a node than the one that `started` then is linked to another router than `own`,
@@ -164,7 +215,13 @@ impl Topology {
         record.routers.iter().any(|at| at.node != *own && self.paths.contains_key(&at.node) && says(at))
     }
 
-    fn search(&mut self, now: Instant, root: NodeId) {
+    /// Searches for the ways to all routers; returns which of these owners may have another way by now.
+    fn search<'a>(
+        &mut self,
+        now: Instant,
+        root: NodeId,
+        owners: impl Iterator<Item = &'a NodeId>,
+    ) -> Vec<NodeId> {
         self.search_at = None;
         self.searched = Some(now);
         let nodes = &self.nodes;
@@ -180,12 +237,37 @@ impl Topology {
         self.searches += 1;
         if paths != self.paths {
             self.ways_changed = Some(now);
-            self.paths = paths;
         }
+        let before = std::mem::replace(&mut self.paths, paths);
+        let Changes { mut nodes, attached } = std::mem::take(&mut self.changes);
+        let moved = |node: &NodeId| {
+            let path = self.paths.get(node);
+            path != before.get(node) || path.is_some_and(|p| nodes.contains(&p.first))
+        };
+        let routers: BTreeSet<_> = self
+            .paths
+            .keys()
+            .chain(before.keys())
+            .filter(|n| nodes.contains(*n) || moved(n))
+            .copied()
+            .collect();
+        if attached.is_empty() && routers.is_empty() {
+            return nodes.into_iter().collect();
+        }
+        nodes.extend(&routers);
+        let concerned = |owner: &NodeId| {
+            let over = || self.nodes.get(owner).into_iter().flat_map(|r| &r.routers);
+            nodes.contains(owner)
+                || attached.contains(&owner.tag())
+                || over().any(|at| routers.contains(&at.node))
+        };
+        owners.filter(|owner| concerned(owner)).copied().collect()
     }
 
     fn insert(&mut self, now: Instant, node: NodeId, record: NodeRecord, max: usize) {
-        if let Some(old) = self.take(&node) {
+        let old = self.take(&node);
+        self.record_changed(now, &node, old.as_ref(), Some(&record));
+        if let Some(old) = old {
             self.memory.superseded(now, &node, old.seq, old.digest, max);
         }
         self.seen.insert(record.digest, node);
@@ -196,6 +278,7 @@ impl Topology {
     /// Takes a link state out of force; returns the number below which advertisements of its node are void.
     fn end(&mut self, now: Instant, node: &NodeId, max: usize) -> Option<u64> {
         let old = self.take(node)?;
+        self.record_changed(now, node, Some(&old), None);
         self.memory.ended(now, node, old.seq, old.digest, &old.signed, max);
         Some(old.floor)
     }
@@ -210,10 +293,10 @@ impl Topology {
 }
 
 impl Router {
-    /// This node's links or their costs changed.
-    pub(crate) fn links_changed(&mut self, now: Instant) {
+    /// This node's links to a neighbour or their costs changed.
+    pub(crate) fn links_changed(&mut self, now: Instant, neighbour: &NodeId) {
         self.topology.touch_own(now);
-        self.topology.touch(now);
+        self.topology.link_changed(now, neighbour);
     }
 
     pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: Signed) {
@@ -283,7 +366,6 @@ impl Router {
         };
         let floor = record.floor;
         self.topology.insert(now.instant, node, record, nodes_max);
-        self.topology.touch(now.instant);
         self.void_names(&node, floor);
         if node != neighbour {
             self.supersede_runs_before(&node, floor);
@@ -363,7 +445,6 @@ impl Router {
             expires: now.instant + LEASE,
         };
         self.topology.insert(now.instant, node, record, self.config.limits.nodes_max);
-        self.topology.touch(now.instant);
         self.tell_link_state(LinkId::LOCAL, &node);
     }
 
@@ -389,12 +470,13 @@ impl Router {
             return;
         }
         if self.config.transit {
-            self.topology.search(now.instant, self.config.node);
+            let owners = self.topology.search(now.instant, self.config.node, self.names.owners());
+            self.ways_to_owners_changed(&owners);
         } else {
             self.topology.search_at = None;
+            self.topology.changes = Changes::default();
+            self.ways_changed();
         }
-        self.ways_changed();
-        self.answer_asks();
     }
 
     pub(crate) fn expire_nodes(&mut self, now: Now) {
@@ -414,7 +496,6 @@ impl Router {
         if let Some(floor) = self.topology.end(now, node, self.config.limits.nodes_max) {
             self.names.run_ended(now, node, floor, self.config.limits.nodes_max);
         }
-        self.topology.touch(now);
     }
 
     /// Forgets what nodes said whose certificates are no longer believed.
@@ -428,8 +509,8 @@ impl Router {
             .collect();
         for node in gone {
             // It counts again if its certificate does.
-            self.topology.take(&node);
-            self.topology.touch(now);
+            let old = self.topology.take(&node);
+            self.topology.record_changed(now, &node, old.as_ref(), None);
         }
     }
 

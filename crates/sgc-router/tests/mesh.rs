@@ -927,6 +927,48 @@ fn numbered(n: usize) -> Blind {
     Blind(blind)
 }
 
+/// Names that nobody advertises.
+fn unknown_names(bench: &Bench, from: usize, count: usize) -> Vec<Name> {
+    (from..from + count).map(|n| bench.name(&numbered(1_000_000 + n))).collect()
+}
+
+#[test]
+fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    let mut names = unknown_names(&bench, 0, 4000);
+    names.push(bench.name(&A));
+    bench.frame(4, Control::Interest { names });
+    bench.pass(ms(200));
+    let checked = |bench: &Bench| bench.router.ways().names_checked;
+    let before = checked(&bench);
+    let desk = bench.user.clone();
+    for n in 0..20 {
+        // A member that signs again and again what it said, or that its link costs more each time.
+        for cost in [1000, 1000 + n * 1000] {
+            bench.seq += 1;
+            let body = LinkStateBody { transit: false, ..bench.link_state(&desk, bench.seq, &[(0, cost)]) };
+            bench.frame(4, Control::LinkState { signed: desk.sign_link_state(&body) });
+            bench.pass(ms(100));
+        }
+    }
+    assert_eq!((checked(&bench), bench.dropped.as_slice()), (before, [""; 0].as_slice()));
+    let searches = bench.router.ways().searches;
+    bench.owner_says(1, 0, &[(4, 500)]);
+    assert_eq!((checked(&bench), bench.router.ways().searches), (before, searches), "a renewal");
+    bench.owner_says(1, 0, &[(4, 600)]);
+    assert_eq!((checked(&bench), bench.route(&A)), (before + 1, Some((1, 6600))));
+    bench.says(2, 2, &[(0, 1000), (4, 2000)], false);
+    assert_eq!((checked(&bench), bench.route(&A)), (before + 2, Some((2, 3600))));
+    bench.says(2, 4, &[(1, 5000), (2, 2000)], false);
+    assert_eq!((checked(&bench), bench.route(&A)), (before + 3, None), "its router has lost it");
+    bench.says(2, 4, &[(1, 5000), (2, 2000)], true);
+    bench.link_down(2);
+    bench.pass(ms(200));
+    assert_eq!((checked(&bench), bench.route(&A)), (before + 5, Some((1, 6600))));
+}
+
 #[test]
 fn the_loss_of_a_link_with_many_names_is_told_in_few_frames() {
     let mut bench = Bench::new();
