@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 /// Longest way, in links, that data can take.
 pub(crate) const HOPS_MAX: u8 = sgc_wire::HOP_LIMIT - 3;
+/// How often a name that somebody waits for is asked for again.
+pub(crate) const QUERY_EVERY: Duration = Duration::from_secs(20);
 /// How many times as many requests a router may bring as a proxy.
 const ROUTER_FACTOR: u32 = 16;
 
@@ -22,8 +24,12 @@ pub struct Limits {
     pub branches_per_peer_max: usize,
     /// Branches of one name.
     pub branches_per_name_max: usize,
-    /// Names that one link may ask for.
-    pub interests_per_link_max: usize,
+    /// Names that one node may be interested in, over all its links; as many that nobody knows may one link of a router
+    /// have asked for.
+    pub interests_per_peer_max: usize,
+    /// Names that nobody knows which all routers are asked for on behalf of one node within 20 s, for the first time and again.
+    /// Others wait for their turn. On behalf of a router, sixteen times as many.
+    pub unknown_per_peer_max: u32,
     /// Advertisements and withdrawals of one owner that are in force; beyond it the oldest are void.
     pub adverts_per_owner_max: usize,
     /// Bytes of them.
@@ -40,7 +46,8 @@ pub struct Limits {
     /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which
     /// speaks for many, may bring sixteen times as many.
     pub joins_burst: u32,
-    /// Names that a neighbour may ask for at once; refilled by an eighth of it a second.
+    /// Names that a neighbour may ask for at once; refilled by an eighth of it a second. A router may ask for sixteen times as
+    /// many.
     pub queries_burst: u32,
     /// Advertisements and link states of a node that are passed on at once, each to all routers; refilled by an eighth of it
     /// a second. What is beyond it waits, and only the newest of it goes on.
@@ -65,7 +72,8 @@ impl Default for Limits {
             nodes_max: 1_000_000,
             branches_per_peer_max: 65_536,
             branches_per_name_max: 4096,
-            interests_per_link_max: 65_536,
+            interests_per_peer_max: 65_536,
+            unknown_per_peer_max: 1024,
             adverts_per_owner_max: 512,
             advert_bytes_per_owner_max: 4 << 20,
             tombstones_max: 100_000,
@@ -90,6 +98,10 @@ pub(crate) struct Allowance {
     announcements: Budget,
     stale: Budget,
     forgeries: Budget,
+    /// Names that all are asked for, for the first time.
+    first: Turns,
+    /// The same, again.
+    again: Turns,
     /// Branches that it has here.
     pub(crate) branches: usize,
 }
@@ -102,6 +114,8 @@ impl Allowance {
             announcements: Budget::new(limits.announcements_burst, limits.announcements_burst / 8),
             stale: Budget::new(limits.stale_burst, limits.stale_burst / 8),
             forgeries: Budget::new(limits.forgeries_max, 1),
+            first: Turns::new(limits.unknown_per_peer_max),
+            again: Turns::new(limits.unknown_per_peer_max),
             branches: 0,
         }
     }
@@ -112,8 +126,14 @@ impl Allowance {
     }
 
     /// Takes a question for so many names; false if that is too many.
-    pub(crate) fn may_query(&mut self, now: Instant, names: usize) -> bool {
-        self.queries.take(now, names.max(1).try_into().unwrap_or(u32::MAX), 1)
+    pub(crate) fn may_query(&mut self, now: Instant, names: usize, is_router: bool) -> bool {
+        let names = names.max(1).try_into().unwrap_or(u32::MAX);
+        self.queries.take(now, names, if is_router { ROUTER_FACTOR } else { 1 })
+    }
+
+    /// The turns of names that all are asked for on its behalf.
+    pub(crate) fn turns(&mut self, again: bool) -> &mut Turns {
+        if again { &mut self.again } else { &mut self.first }
     }
 
     /// Takes something that it signed for all; false if that is too much to pass on now.
@@ -139,7 +159,41 @@ impl Allowance {
     /// True if nothing is used, so that forgetting it gives nothing back.
     pub(crate) fn is_whole(&self, now: Instant) -> bool {
         let budgets = [&self.joins, &self.queries, &self.announcements, &self.stale, &self.forgeries];
-        self.branches == 0 && budgets.iter().all(|b| b.used_at(now, 1) <= 0.0)
+        let turns = [&self.first, &self.again];
+        self.branches == 0
+            && turns.iter().all(|t| t.next.is_none_or(|at| at <= now))
+            && budgets.iter().all(|b| b.used_at(now, 1) <= 0.0)
+    }
+}
+
+/// Turns that are given out in order: so many in each [`QUERY_EVERY`].
+#[derive(Debug)]
+pub(crate) struct Turns {
+    max: u32,
+    /// When all that were given out are paid for.
+    next: Option<Instant>,
+}
+
+impl Turns {
+    fn new(max: u32) -> Self {
+        Self { max: max.max(1), next: None }
+    }
+
+    fn interval(&self, is_router: bool) -> Duration {
+        QUERY_EVERY / self.max.saturating_mul(if is_router { ROUTER_FACTOR } else { 1 })
+    }
+
+    /// When the next one is.
+    pub(crate) fn next(&self, now: Instant, is_router: bool) -> Instant {
+        let ahead = QUERY_EVERY - self.interval(is_router);
+        self.next.and_then(|next| next.checked_sub(ahead)).map_or(now, |at| at.max(now))
+    }
+
+    /// Takes it.
+    pub(crate) fn take(&mut self, now: Instant, is_router: bool) -> Instant {
+        let at = self.next(now, is_router);
+        self.next = Some(self.next.map_or(now, |next| next.max(now)) + self.interval(is_router));
+        at
     }
 }
 

@@ -11,14 +11,13 @@ use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
 use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed};
 use smallvec::SmallVec;
 
+use crate::limits::QUERY_EVERY;
 use crate::links::{COST_SUSPECT, LinkState};
 use crate::mapping::{Ask, Known};
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::topology::cost_differs;
 
-/// How often a name that somebody waits for is asked for again.
-const QUERY_EVERY: Duration = Duration::from_secs(20);
 /// For how long one who asked is told of what becomes known.
 const QUERY_LEASE: Duration = Duration::from_secs(60);
 /// The same question goes on at most that often.
@@ -640,19 +639,21 @@ impl Router {
     }
 
     pub(crate) fn handle_interest(&mut self, now: Now, link: LinkId, names: &[Name]) {
-        let Some(node) = self.links.get(&link).map(|l| l.node) else { return };
-        if link != LinkId::LOCAL && !self.allowance(&node).may_query(now.instant, names.len()) {
+        let Some((node, is_router)) = self.links.get(&link).map(|l| (l.node, l.is_transit())) else { return };
+        if link != LinkId::LOCAL && !self.allowance(&node).may_query(now.instant, names.len(), is_router) {
             return self.drop_frame(link, DropReason::Limit { what: "names asked for per second" });
         }
+        let others = self.links_of.get(&node).into_iter().flatten().filter(|l| **l != link);
+        let others: usize = others.filter_map(|l| self.links.get(l)).map(|l| l.interests.len()).sum();
         let mut news = Vec::new();
         for name in names {
             let Some(state) = self.links.get_mut(&link) else { return };
-            if state.interests.len() >= self.config.limits.interests_per_link_max {
-                self.drop_frame(link, DropReason::Limit { what: "interests per link" });
-                break;
-            }
             if state.interests.contains_key(name) {
                 continue;
+            }
+            if others + state.interests.len() >= self.config.limits.interests_per_peer_max {
+                self.drop_frame(link, DropReason::Limit { what: "interests of a node" });
+                break;
             }
             state.interests.insert(*name, None);
             self.names.watchers.entry(*name).or_default().insert(link);
@@ -666,11 +667,37 @@ impl Router {
             for name in news {
                 let record = self.names.record(&name);
                 let needs = self.way(&name).is_none() || record.is_some_and(|r| r.asked.is_some());
-                if needs && !self.names.asking.contains_key(&name) {
-                    self.names.ask_again(name, now.instant);
+                // Another may have come for it before, and have many before it.
+                let due = self.names.asking.get(&name).copied();
+                if needs && due.is_none_or(|at| at > now.instant + QUERY_EVERY) {
+                    let turn = self.turn(&name, false);
+                    self.names.ask_again(name, due.map_or(turn, |at| at.min(turn)));
                 }
             }
         }
+    }
+
+    /// When all may be asked for a name on behalf of those who wait for it: of the one whose turn comes first. This node's
+    /// own endpoint need not wait.
+    fn turn(&mut self, name: &Name, again: bool) -> Instant {
+        let now = self.now.instant;
+        let watchers: SmallVec<[LinkId; 8]> =
+            self.names.watchers.get(name).into_iter().flatten().copied().collect();
+        let mut first: Option<(Instant, NodeId, bool)> = None;
+        for link in watchers {
+            if link == LinkId::LOCAL || first.is_some_and(|(at, ..)| at <= now) {
+                break;
+            }
+            let Some((node, is_router)) = self.links.get(&link).map(|l| (l.node, l.is_transit())) else {
+                continue;
+            };
+            let at = self.allowance(&node).turns(again).next(now, is_router);
+            if first.is_none_or(|(known, ..)| at < known) {
+                first = Some((at, node, is_router));
+            }
+        }
+        let Some((_, node, is_router)) = first else { return now };
+        self.allowance(&node).turns(again).take(now, is_router)
     }
 
     pub(crate) fn handle_uninterest(&mut self, link: LinkId, names: &[Name]) {
@@ -820,7 +847,8 @@ impl Router {
                 .copied()
                 .collect();
             for name in lost {
-                self.names.ask_again(name, self.now.instant);
+                let turn = self.turn(&name, false);
+                self.names.ask_again(name, turn);
             }
         }
     }
@@ -909,9 +937,10 @@ impl Router {
             return self.drop_frame(link, DropReason::NotRouter);
         }
         let node = state.node;
-        if !self.allowance(&node).may_query(now.instant, names.len()) {
+        if !self.allowance(&node).may_query(now.instant, names.len(), true) {
             return self.drop_frame(link, DropReason::Limit { what: "names asked for per second" });
         }
+        let mut is_full = false;
         let until = now.instant + QUERY_LEASE;
         self.names.prune_at.get_or_insert(until);
         let (mut unknown, mut refresh) = (Vec::new(), BTreeMap::<LinkId, Vec<Name>>::new());
@@ -935,14 +964,18 @@ impl Router {
                 continue;
             }
             let Some(state) = self.links.get_mut(&link) else { return };
-            if state.asks.len() >= self.config.limits.interests_per_link_max {
-                self.drop_frame(link, DropReason::Limit { what: "names asked for" });
-                break;
+            if !state.asks.contains_key(name) && state.asks.len() >= self.config.limits.interests_per_peer_max
+            {
+                is_full = true;
+                continue;
             }
             state.asks.insert(*name, until);
             if before.is_none_or(|q| !q.open || q.at + QUERY_AGAIN <= now.instant) {
                 unknown.push(*name);
             }
+        }
+        if is_full {
+            self.drop_frame(link, DropReason::Limit { what: "names asked for" });
         }
         if hops >= HOP_LIMIT - 1 {
             return self.drop_frame(link, DropReason::HopLimit);
@@ -958,9 +991,19 @@ impl Router {
         if names.is_empty() {
             return;
         }
-        let room = self.config.limits.tombstones_max.saturating_sub(self.names.passed_on.len());
-        let names = &names[..names.len().min(room)];
-        self.names.passed_on.extend(names.iter().map(|n| (*n, Question { id, at: now, open: true })));
+        let max = self.config.limits.tombstones_max;
+        let passed_on = &mut self.names.passed_on;
+        let mut names = names.to_vec();
+        names.retain(|name| {
+            let may = passed_on.len() < max || passed_on.contains_key(name);
+            if may {
+                passed_on.insert(*name, Question { id, at: now, open: true });
+            }
+            may
+        });
+        if names.is_empty() {
+            return;
+        }
         self.names.prune_at.get_or_insert(now + QUERY_LEASE);
         let targets: Vec<_> = self
             .links
@@ -1070,10 +1113,16 @@ impl Router {
                     self.names.asking.remove(&name);
                     continue;
                 }
-                Ask::Everyone => everyone.push(name),
-                Ask::One(link) => one.entry(link).or_default().push(name),
+                Ask::Everyone => {
+                    everyone.push(name);
+                    let turn = self.turn(&name, true);
+                    self.names.ask_again(name, turn + QUERY_EVERY);
+                }
+                Ask::One(link) => {
+                    one.entry(link).or_default().push(name);
+                    self.names.ask_again(name, now.instant + QUERY_EVERY);
+                }
             }
-            self.names.ask_again(name, now.instant + QUERY_EVERY);
         }
         let id = self.question();
         self.pass_on(now.instant, None, id, 0, &everyone);

@@ -466,7 +466,8 @@ fn an_answer_that_is_not_renewed_in_time_is_asked_of_everyone() {
 
 #[test]
 fn questions_are_bounded() {
-    let limits = Limits { queries_burst: 16, interests_per_link_max: 8, ..Limits::default() };
+    // A router may ask for sixteen times as many.
+    let limits = Limits { queries_burst: 1, interests_per_peer_max: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
     let names: Vec<_> = (0..12).map(|n| bench.name(&numbered(n))).collect();
     bench.frame(1, Control::Query { id: 0, hops: 0, names });
@@ -967,6 +968,78 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
     bench.link_down(2);
     bench.pass(ms(200));
     assert_eq!((checked(&bench), bench.route(&A)), (before + 5, Some((1, 6600))));
+}
+
+/// The names that a link was asked for since the last frame.
+fn asked_of(bench: &Bench, link: u32) -> Vec<Name> {
+    let queries = bench.sent.iter().filter_map(|(to, frame)| match frame {
+        Control::Query { names, .. } if *to == link => Some(names.clone()),
+        _ => None,
+    });
+    queries.flatten().collect()
+}
+
+#[test]
+fn a_router_may_ask_again_for_what_it_asked_for_when_there_is_no_room_for_more() {
+    let limits = Limits { interests_per_peer_max: 8, tombstones_max: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Query, limits);
+    let names = unknown_names(&bench, 0, 8);
+    bench.frame(1, Control::Query { id: 1, hops: 0, names: names.clone() });
+    assert_eq!(asked_of(&bench, 2), names);
+    bench.pass(Duration::from_secs(20));
+    bench.frame(1, Control::Query { id: 2, hops: 0, names: names.clone() });
+    assert_eq!((asked_of(&bench, 2), bench.dropped.as_slice()), (names.clone(), [""; 0].as_slice()));
+    bench.pass(Duration::from_secs(20));
+    // One too many keeps the others from nothing.
+    let more = [unknown_names(&bench, 8, 1), names.clone()].concat();
+    bench.frame(1, Control::Query { id: 3, hops: 0, names: more });
+    assert_eq!((asked_of(&bench, 2), bench.dropped.as_slice()), (names, ["limit"].as_slice()));
+}
+
+#[test]
+fn interests_are_counted_over_all_links_of_a_node() {
+    let limits = Limits { interests_per_peer_max: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Flood, limits);
+    bench.with_proxies();
+    bench.up(7, &bench.owner.clone(), false, 1000);
+    let neighbour = Neighbour::from(bench.owner.as_peer());
+    bench.router.handle_link_up(bench.clock.now(), LinkId(8), neighbour);
+    bench.frame(8, hello(7, false));
+    let names = unknown_names(&bench, 0, 12);
+    bench.frame(7, Control::Interest { names: names[..6].to_vec() });
+    bench.frame(7, Control::Interest { names: names[..6].to_vec() });
+    bench.frame(8, Control::Interest { names: names[6..].to_vec() });
+    assert_eq!((bench.router.stats().names, bench.dropped.as_slice()), (8, ["limit"].as_slice()));
+    bench.frame(8, Control::Interest { names: names[6..8].to_vec() });
+    assert_eq!(bench.dropped.len(), 1, "there already");
+    bench.frame(5, Control::Interest { names: names[8..].to_vec() });
+    assert_eq!((bench.router.stats().names, bench.dropped.len()), (12, 1), "another node has its own");
+}
+
+#[test]
+fn names_that_nobody_has_are_asked_for_in_turn_and_anothers_at_once() {
+    let limits = Limits { unknown_per_peer_max: 8, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Query, limits);
+    bench.with_proxies();
+    bench.pass(ms(200));
+    let names = unknown_names(&bench, 0, 100);
+    bench.frame(4, Control::Interest { names: names.clone() });
+    assert_eq!(asked_of(&bench, 1).len(), 8);
+    let last = names[99];
+    bench.frame(5, Control::Interest { names: vec![last] });
+    assert_eq!(asked_of(&bench, 1), [last], "it is not behind what another wants");
+    let (mut most, mut all) = (0, std::collections::BTreeSet::new());
+    for _ in 0..15 {
+        bench.sent.clear();
+        bench.pass(Duration::from_secs(20));
+        let asked = asked_of(&bench, 1);
+        most = most.max(asked.len());
+        all.extend(asked);
+    }
+    // As many for the first time as again, and the one of the other.
+    assert!(most <= 8 + 8 + 2, "{most}");
+    assert_eq!(all.len(), 100, "each has its turn");
+    assert_eq!(bench.dropped, [""; 0]);
 }
 
 #[test]

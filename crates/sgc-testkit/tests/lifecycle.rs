@@ -652,7 +652,7 @@ fn routes_beyond_a_proxys_limit_are_refused_and_others_unharmed() {
 #[test]
 fn interests_beyond_a_links_limit_are_refused_and_others_unharmed() {
     let mut config = WorldConfig::new(43);
-    config.router_limits = Limits { interests_per_link_max: 4, ..Limits::default() };
+    config.router_limits = Limits { interests_per_peer_max: 4, ..Limits::default() };
     let Line { mut world, arm, cloud, desk } = line_with(config);
     world.share(arm, "/chatter", Sharing::to_fleet());
     world.use_topic(desk, arm, "/chatter");
