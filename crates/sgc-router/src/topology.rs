@@ -158,7 +158,8 @@ impl Topology {
         self.changes.attached.extend(before.symmetric_difference(&after));
         // The edges between routers are the search's.
         let is_router = |record: Option<&NodeRecord>| record.is_some_and(|r| r.transit);
-        if !same && !(is_router(old) && is_router(new)) {
+        let edges_only = is_router(old) && is_router(new);
+        if !same && !edges_only {
             self.changes.nodes.insert(*node);
         }
         self.touch(now);
