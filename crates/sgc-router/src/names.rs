@@ -5,6 +5,7 @@
 //! sees no topology; it goes by what its routers tell it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
@@ -34,7 +35,8 @@ pub(crate) type RecordId = u64;
 /// A verified advertisement or withdrawal.
 #[derive(Debug)]
 pub(crate) struct Record {
-    pub(crate) owner: VerifiedPeer,
+    /// Shared with the branches of its names.
+    pub(crate) owner: Arc<VerifiedPeer>,
     pub(crate) seq: u64,
     withdraw: bool,
     names: Box<[Name]>,
@@ -370,7 +372,7 @@ impl Router {
         let open = |n| self.names.passed_on.get(n).is_some_and(|q| q.open);
         let asked = news.iter().any(|n| self.names.asking.contains_key(n) || open(n));
         let record = Record {
-            owner: advert.owner,
+            owner: Arc::new(advert.owner),
             seq,
             withdraw,
             names: advert.names.into(),
@@ -1132,6 +1134,14 @@ impl Router {
                 let id = self.question();
                 self.send(link, Control::Query { id, hops: 0, names: chunk.to_vec() });
             }
+        }
+    }
+
+    /// Asks one router for its newest word on a name.
+    pub(crate) fn ask_neighbour(&mut self, link: LinkId, name: Name) {
+        if self.config.transit && self.links.get(&link).is_some_and(LinkState::is_transit) {
+            let id = self.question();
+            self.send(link, Control::Query { id, hops: 0, names: vec![name] });
         }
     }
 

@@ -172,6 +172,13 @@ pub enum DropReason {
         /// The owner in the advertisement.
         owner: NodeId,
     },
+    /// An answer that none of the owner's keys known here signed. Its sink asks again, and the neighbour is asked for the
+    /// owner's advertisement: the owner may have another certificate by now.
+    #[error("answer is not signed with a key of {owner:?} that is known here")]
+    OwnerKey {
+        /// The owner of the name.
+        owner: NodeId,
+    },
     /// An advertisement that is older than what is known, or withdrawn.
     #[error("advertisement {seq} is not newer than {known}")]
     Stale {
@@ -249,6 +256,7 @@ impl DropReason {
             | Self::NotRouter => true,
             // An honest neighbour passes on what the CA signs.
             Self::ListFlood { .. }
+            | Self::OwnerKey { .. }
             | Self::Stale { .. }
             | Self::Unknown { .. }
             | Self::WrongWay { .. }
@@ -261,6 +269,7 @@ impl DropReason {
         match self {
             Self::NotVerified { .. } => "not_verified",
             Self::NotOwner { .. } => "not_owner",
+            Self::OwnerKey { .. } => "owner_key",
             Self::Stale { .. } => "stale",
             Self::HopLimit => "hop_limit",
             Self::Limit { .. } => "limit",

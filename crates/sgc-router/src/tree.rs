@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_trust::{CertId, SignedError, verify_answer, verify_join};
+use sgc_trust::{CertId, SignedError, VerifiedPeer, verify_answer, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role, Signed,
     SinkId,
@@ -37,6 +37,8 @@ pub(crate) struct Branch {
     neighbour: NodeId,
     /// The link towards the owner.
     pub(crate) up: LinkId,
+    /// The owner as its advertisement proved it when the request was passed on.
+    owner: Arc<VerifiedPeer>,
     pub(crate) peer: NodeId,
     /// The certificates of its request.
     pub(crate) certs: Arc<[CertId]>,
@@ -107,6 +109,7 @@ impl Router {
             }
         };
         let (name, sink) = (join.body.name, join.body.sink);
+        let owner = self.names.record(&name).map(|record| record.owner.clone());
         let reject = |this: &mut Self, reason| this.send(link, Control::Reject { name, sink, reason });
         if let Some(known) = self.trees.get_mut(&name).and_then(|t| t.branches.get_mut(&sink)) {
             // A sink has one place in the tree and asks once: the same request over another link is a replay, or has
@@ -115,10 +118,12 @@ impl Router {
                 return reject(self, RejectReason::NoRoute);
             }
             known.certs = join.peer.path;
+            known.owner = owner.unwrap_or_else(|| known.owner.clone());
             let up = known.up;
             return self.send(up, Control::Join { signed });
         }
-        let Some((up, _)) = self.way(&name).filter(|(up, _)| *up != link) else {
+        let way = self.way(&name).filter(|(up, _)| *up != link);
+        let Some(((up, _), owner)) = way.zip(owner) else {
             return reject(self, RejectReason::NoRoute);
         };
         if !(up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit) {
@@ -136,6 +141,7 @@ impl Router {
             link,
             neighbour: node,
             up,
+            owner,
             peer: join.peer.node_id,
             certs: join.peer.path,
             role: join.body.request.role(),
@@ -156,31 +162,28 @@ impl Router {
     }
 
     pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: Signed) {
-        // The name is needed to find the key that the signature must verify with; it is believed only after.
+        // The name and sink are needed to find the keys that may have signed; they are believed only after.
         let body = match AnswerBody::from_slice(&signed.body) {
             Ok(body) => body,
             Err(why) => return self.not_verified(now, link, "answer", SignedError::Decode(why)),
         };
         let (name, sink) = (body.name, body.sink);
-        let branch = self.branch(&name, &sink).map(|b| (b.up, b.link));
-        let Some((_, down)) = branch.filter(|(up, _)| *up == link) else {
+        let branch = self.branch(&name, &sink);
+        let Some(branch) = branch.filter(|b| b.up == link) else {
+            let reason = match branch {
+                None => DropReason::Unknown { what: "answer" },
+                Some(_) => DropReason::WrongWay { what: "answer" },
+            };
             // The owner granted a sink that has left meanwhile, or a request that came here in a circle: neither it nor
             // whoever is between must keep it.
             if matches!(body.answer, Answer::Grant { .. }) {
                 self.send(link, Control::Leave { name, sink });
             }
-            let what = "answer";
-            let reason = match branch {
-                None => DropReason::Unknown { what },
-                Some(_) => DropReason::WrongWay { what },
-            };
             return self.drop_frame(link, reason);
         };
-        // Once the name is withdrawn, who owns it is not known here any more; the sink still knows.
-        if let Some(record) = self.names.record(&name)
-            && let Err(why) = verify_answer(&record.owner, &signed)
-        {
-            return self.not_verified(now, link, "answer", why);
+        let down = branch.link;
+        if !self.is_of_owner(now, &name, branch, &signed) {
+            return self.answer_of_unknown_key(link, name, sink);
         }
         match body.answer {
             Answer::Grant { .. } => self.grant_branch(name, sink),
@@ -189,6 +192,35 @@ impl Router {
             }
         }
         self.send(down, Control::Answer { signed });
+    }
+
+    /// Returns `true` if the owner of a name signed an answer: with the key of its advertisement in force, or with the one that
+    /// it had when the request was passed on. Answers and advertisements may cross when an owner has another certificate.
+    fn is_of_owner(&self, now: Now, name: &Name, branch: &Branch, signed: &Signed) -> bool {
+        let signs = |owner: &VerifiedPeer| verify_answer(owner, signed).is_ok();
+        let newest = self.names.record(name).map(|record| &record.owner);
+        if newest.is_some_and(|owner| signs(owner)) {
+            return true;
+        }
+        let before = &branch.owner;
+        let is_another = newest.is_none_or(|owner| owner.cert != before.cert);
+        let holds = now.unix <= before.not_after && !self.is_untrusted(&before.path);
+        is_another && holds && signs(before)
+    }
+
+    /// An answer is not signed with a key that is known here, so it goes no further: it is forged, or the owner has a
+    /// certificate that the neighbour knows and this node does not. So the neighbour is asked for it, and not held for a forger.
+    /// The sink asks again; no branch takes more than two such answers.
+    fn answer_of_unknown_key(&mut self, link: LinkId, name: Name, sink: SinkId) {
+        let Some(branch) = self.branch(&name, &sink) else { return };
+        let (owner, is_granted) = (branch.owner.node_id, branch.stage == Stage::Granted);
+        self.drop_frame(link, DropReason::OwnerKey { owner });
+        self.ask_neighbour(link, name);
+        if is_granted {
+            self.drain(name, sink);
+        } else {
+            self.cut(name, sink, RejectReason::RouteLost);
+        }
     }
 
     pub(crate) fn handle_reject(&mut self, link: LinkId, name: Name, sink: SinkId, reason: RejectReason) {
@@ -244,19 +276,23 @@ impl Router {
                 (Some(_), Stage::Draining { .. }) => {}
             }
         }
-        let until = self.now.instant + self.config.limits.answer_wait;
         for (sink, cut) in moved {
             if cut {
                 self.cut(*name, sink, RejectReason::RouteLost);
-                continue;
+            } else {
+                self.drain(*name, sink);
             }
-            let tree = self.trees.get_mut(name).and_then(|t| t.branches.get_mut(&sink));
-            let Some(branch) = tree else { continue };
-            branch.stage = Stage::Draining { until };
-            let down = branch.link;
-            self.deadlines.insert((until, *name, sink));
-            self.send(down, Control::Reroute { name: *name, sink });
         }
+    }
+
+    /// Lets a granted branch go on while its sink asks again.
+    fn drain(&mut self, name: Name, sink: SinkId) {
+        let until = self.now.instant + self.config.limits.answer_wait;
+        let Some(branch) = self.trees.get_mut(&name).and_then(|t| t.branches.get_mut(&sink)) else { return };
+        branch.stage = Stage::Draining { until };
+        let down = branch.link;
+        self.deadlines.insert((until, name, sink));
+        self.send(down, Control::Reroute { name, sink });
     }
 
     pub(crate) fn branches_timeout(&mut self, now: Now) {

@@ -40,6 +40,8 @@ struct Bench {
     dropped: Vec<&'static str>,
     entry: Option<FibEntry>,
     seq: u64,
+    /// Links that the router closed.
+    closed: Vec<u32>,
     /// Links that the router waits for to take what they were sent.
     flushes: Vec<LinkId>,
     /// True while no link takes anything.
@@ -48,13 +50,18 @@ struct Bench {
 
 impl Bench {
     fn with(mapping: MappingKind, limits: Limits) -> Self {
+        Self::of_kind(mapping, limits, true)
+    }
+
+    /// A router, or a proxy that is linked to the same routers.
+    fn of_kind(mapping: MappingKind, limits: Limits, transit: bool) -> Self {
         let router_identity = |name: &str| identity(&Member { router: true, ..Member::new(name) });
         let own = router_identity("cloud");
         let clock = Clock::default();
         let config = RouterConfig {
             node: own.node_id(),
             identity: own.clone(),
-            transit: true,
+            transit,
             incarnation: 1,
             started: clock.now().unix,
             mapping,
@@ -73,6 +80,7 @@ impl Bench {
             dropped: Vec::new(),
             entry: None,
             seq: 0,
+            closed: Vec::new(),
             flushes: Vec::new(),
             stuck: false,
         };
@@ -104,7 +112,8 @@ impl Bench {
                 }
                 Output::Flush { link } if self.stuck => self.flushes.push(link),
                 Output::Flush { link } => self.router.handle_flushed(self.clock.now(), link),
-                Output::Close { .. } | Output::Trust(_) => {}
+                Output::Close { link, .. } => self.closed.push(link.0),
+                Output::Trust(_) => {}
             }
         }
     }
@@ -236,9 +245,14 @@ impl Bench {
     }
 
     fn grant(&mut self, link: u32, sink: u8, blind: &Blind) {
+        self.grant_by(&self.owner.clone(), link, sink, blind);
+    }
+
+    /// A grant that a node signed, in the owner's place or as the owner under another certificate.
+    fn grant_by(&mut self, signer: &Identity, link: u32, sink: u8, blind: &Blind) {
         let answer = Answer::Grant { enc: Bytes::new(), sealed: Bytes::new() };
         let (name, sink) = (self.name(blind), SinkId([sink; 16]));
-        let signed = self.owner.sign_answer(&AnswerBody { name, sink, serial: 1, answer });
+        let signed = signer.sign_answer(&AnswerBody { name, sink, serial: 1, answer });
         self.frame(link, Control::Answer { signed });
     }
 
@@ -887,6 +901,85 @@ fn a_grant_for_a_sink_that_left_is_given_back() {
     assert_eq!((bench.told(), bench.dropped.last()), (vec![(2, "leave")], Some(&"wrong_way")));
     bench.grant(1, 2, &A);
     assert_eq!(bench.told(), [(3, "answer")]);
+}
+
+/// The owner of the bench with its next certificate, which is for another key.
+fn renewed_owner() -> Arc<Identity> {
+    identity(&Member { renewal: 1, ..Member::new("arm-1") })
+}
+
+#[test]
+fn an_answer_with_a_key_that_is_not_known_yet_goes_no_further_and_its_bringer_is_asked() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    let renewed = renewed_owner();
+    for sink in 1..200 {
+        bench.join(4, sink, &A);
+        assert_eq!(bench.told(), [(1, "join")]);
+        bench.grant_by(&renewed, 1, sink, &A);
+        assert_eq!(bench.told(), [(1, "leave"), (1, "query"), (4, "route lost")]);
+        assert_eq!(bench.entry, None);
+        bench.pass(ms(10));
+    }
+    // Its neighbour may be as honest as the owner.
+    assert_eq!((bench.closed.as_slice(), bench.dropped.last()), ([0; 0].as_slice(), Some(&"owner_key")));
+    bench.frame(1, bench.advert_of(&renewed, 11, false, &[A]));
+    bench.join(4, 200, &A);
+    bench.grant_by(&renewed, 1, 200, &A);
+    assert_eq!(bench.told(), [(4, "answer")]);
+}
+
+#[test]
+fn an_answer_that_crossed_the_owners_renewal_is_verified_with_the_key_of_before() {
+    let mut bench = Bench::new();
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.join(4, 1, &A);
+    bench.frame(2, bench.advert_of(&renewed_owner(), 11, false, &[A]));
+    bench.grant(1, 1, &A);
+    assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![(4, "answer")], [""; 0].as_slice()));
+    // A request that came after it has no such answer.
+    bench.join(4, 2, &A);
+    bench.grant(1, 2, &A);
+    assert!(bench.told().contains(&(4, "route lost")), "{:?}", bench.told());
+    assert_eq!(bench.dropped, ["owner_key"]);
+}
+
+#[test]
+fn a_granted_branch_outlives_an_answer_that_nobody_known_signed_until_its_sink_asked_again() {
+    let mut bench = Bench::with_branch();
+    let mallory = identity(&Member::new("mallory"));
+    bench.grant_by(&mallory, 1, 1, &A);
+    assert_eq!(bench.told(), [(1, "query"), (4, "reroute")]);
+    assert_eq!(bench.egress(1), [4], "what was granted goes on");
+    bench.join(4, 2, &A);
+    bench.grant(1, 2, &A);
+    assert_eq!(bench.told(), [(4, "answer")]);
+    bench.grant_by(&mallory, 1, 1, &A);
+    assert!(bench.told().contains(&(4, "route lost")), "there is no third one: {:?}", bench.told());
+    assert_eq!((bench.egress(1), bench.router.stats().branches), (vec![4], 1));
+}
+
+#[test]
+fn an_answer_is_verified_when_its_name_is_not_known_any_more() {
+    let mut bench = Bench::of_kind(MappingKind::Flood, Limits::default(), false);
+    let names = vec![bench.name(&A)];
+    bench.frame(0, Control::Interest { names: names.clone() });
+    bench.advert(1, 10, &[A]);
+    for sink in [1, 2] {
+        bench.join(0, sink, &A);
+        assert!(bench.told().contains(&(1, "join")), "{:?}", bench.told());
+    }
+    bench.frame(0, Control::Uninterest { names });
+    assert_eq!(bench.route(&A), None);
+    bench.grant_by(&identity(&Member::new("mallory")), 1, 1, &A);
+    assert_eq!(
+        (bench.told(), bench.dropped.as_slice()),
+        (vec![(0, "route lost"), (1, "leave")], ["owner_key"].as_slice())
+    );
+    bench.grant(1, 2, &A);
+    assert_eq!(bench.told(), [(0, "answer")]);
 }
 
 #[test]

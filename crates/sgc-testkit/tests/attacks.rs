@@ -183,7 +183,7 @@ fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> Signed + 'stati
         frame => vec![frame.clone()],
     });
     world.run(ms(5000));
-    assert!(drops(world, desk, "not_verified") > 0);
+    assert!(drops(world, desk, "owner_key") > 0);
     let believed = world.log().iter().any(|l| {
         l.node == desk
             && matches!(
