@@ -17,6 +17,7 @@ mod mapping;
 mod memory;
 mod names;
 mod router;
+mod shares;
 mod spf;
 mod tell;
 mod topology;

@@ -24,8 +24,7 @@ pub struct Limits {
     pub branches_per_peer_max: usize,
     /// Branches of one name.
     pub branches_per_name_max: usize,
-    /// Names that one node may be interested in, over all its links; as many that nobody knows may one link of a router
-    /// have asked for.
+    /// Names that one node may be interested in, over all its links; as many that nobody knows may a router have asked for.
     pub interests_per_peer_max: usize,
     /// Names that nobody knows which all routers are asked for on behalf of one node within 20 s, for the first time and again.
     /// Others wait for their turn. On behalf of a router, sixteen times as many.
@@ -34,8 +33,14 @@ pub struct Limits {
     pub adverts_per_owner_max: usize,
     /// Bytes of them.
     pub advert_bytes_per_owner_max: usize,
-    /// Withdrawn names remembered against replay, and as many that were asked for lately. Beyond it the owner with the most
-    /// loses its oldest withdrawal, and with it whatever it advertised before.
+    /// Names that nobody knows which all routers together may have asked for. Beyond it the router with the most is told of its
+    /// oldest no more.
+    pub asks_max: usize,
+    /// Questions remembered that were passed on. Beyond it the neighbour that brought the most loses its oldest; that
+    /// neighbour itself brings more only when that one is 5 s old.
+    pub questions_max: usize,
+    /// Withdrawn names remembered against replay. Beyond it the owner with the most loses its oldest withdrawal, and with it
+    /// whatever it advertised before.
     pub tombstones_max: usize,
     /// How long an owner may take to answer a join, and a sink to find the better way that it was told of.
     pub answer_wait: Duration,
@@ -76,6 +81,8 @@ impl Default for Limits {
             unknown_per_peer_max: 1024,
             adverts_per_owner_max: 512,
             advert_bytes_per_owner_max: 4 << 20,
+            asks_max: 262_144,
+            questions_max: 100_000,
             tombstones_max: 100_000,
             answer_wait: Duration::from_secs(10),
             lease_max: Duration::from_secs(600),

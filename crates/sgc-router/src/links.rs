@@ -65,8 +65,6 @@ pub(crate) struct LinkState {
     pub(crate) branches: BTreeSet<(Name, SinkId)>,
     /// Names that it wants to hear of, and what it heard.
     pub(crate) interests: BTreeMap<Name, Told>,
-    /// Names that its node asked for and nobody knew, and until when it is to be told. Routers only.
-    pub(crate) asks: BTreeMap<Name, Instant>,
     /// Owners of names that its node asked for, and until when it is to be told of changes. Routers only.
     pub(crate) follows: BTreeMap<NodeId, Instant>,
     /// Names that are known over it.
@@ -110,7 +108,6 @@ impl LinkState {
             cost: Cost::new(Some(0)),
             branches: BTreeSet::new(),
             interests: BTreeMap::new(),
-            asks: BTreeMap::new(),
             follows: BTreeMap::new(),
             names: 0,
             telling: None,

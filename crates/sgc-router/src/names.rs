@@ -17,6 +17,7 @@ use crate::links::{COST_SUSPECT, LinkState};
 use crate::mapping::{Ask, Known};
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
+use crate::shares::Shares;
 use crate::topology::cost_differs;
 
 /// For how long one who asked is told of what becomes known.
@@ -145,8 +146,10 @@ pub(crate) struct Names {
     /// Names that are asked for, and when the next time is.
     asking: BTreeMap<Name, Instant>,
     ask_at: BTreeSet<(Instant, Name)>,
-    /// The question for a name that was passed on last.
-    passed_on: BTreeMap<Name, Question>,
+    /// The question for a name that was passed on last, charged to who brought it.
+    passed_on: Shares<Name, Question>,
+    /// Names that routers asked for over a link and nobody knew, and until when they are to be told.
+    asks: Shares<(LinkId, Name), Instant>,
     /// Questions that began here.
     questions: u64,
     pub(crate) prune_at: Option<Instant>,
@@ -245,6 +248,11 @@ impl Names {
     pub(crate) fn first_waiting(&self, owner: &NodeId) -> Option<(RecordId, LinkId)> {
         let id = self.waiting.get(owner)?.first()?;
         self.records.get(id).map(|record| (*id, record.from))
+    }
+
+    /// Forgets what was asked for over a link.
+    pub(crate) fn forget_asks(&mut self, link: LinkId) {
+        self.asks.remove_range((link, Name([0; 32]))..=(link, Name([0xff; 32])));
     }
 
     fn stop_asking(&mut self, name: &Name) {
@@ -797,7 +805,10 @@ impl Router {
             .links
             .iter()
             .filter(|(l, s)| {
-                let asked = || s.follows.contains_key(owner) || names.iter().any(|n| s.asks.contains_key(n));
+                let asked = || {
+                    s.follows.contains_key(owner)
+                        || names.iter().any(|n| self.names.asks.contains(&(**l, *n)))
+                };
                 **l != ingress && s.is_transit() && (everyone || asked())
             })
             .map(|(l, _)| *l)
@@ -965,13 +976,13 @@ impl Router {
                 }
                 continue;
             }
-            let Some(state) = self.links.get_mut(&link) else { return };
-            if !state.asks.contains_key(name) && state.asks.len() >= self.config.limits.interests_per_peer_max
-            {
+            let (asks, limits) = (&mut self.names.asks, &self.config.limits);
+            let ask = (link, *name);
+            if !asks.contains(&ask) && asks.held_by(&node) >= limits.interests_per_peer_max {
                 is_full = true;
                 continue;
             }
-            state.asks.insert(*name, until);
+            asks.insert(node, ask, until, limits.asks_max, |_| true);
             if before.is_none_or(|q| !q.open || q.at + QUERY_AGAIN <= now.instant) {
                 unknown.push(*name);
             }
@@ -993,16 +1004,17 @@ impl Router {
         if names.is_empty() {
             return;
         }
-        let max = self.config.limits.tombstones_max;
+        let by = asker.and_then(|link| self.links.get(&link)).map_or(self.config.node, |state| state.node);
+        let max = self.config.limits.questions_max;
+        let question = Question { id, at: now, open: true };
+        // Copies of a question that is forgotten while they are under way would go on again.
+        let is_settled = |q: &Question| q.at + QUERY_AGAIN <= now;
         let passed_on = &mut self.names.passed_on;
-        let mut names = names.to_vec();
-        names.retain(|name| {
-            let may = passed_on.len() < max || passed_on.contains_key(name);
-            if may {
-                passed_on.insert(*name, Question { id, at: now, open: true });
-            }
-            may
-        });
+        let (names, refused): (Vec<_>, Vec<_>) =
+            names.iter().partition(|name| passed_on.insert(by, **name, question, max, is_settled));
+        if !refused.is_empty() {
+            self.drop_frame(asker.unwrap_or(LinkId::LOCAL), DropReason::QuestionsFull);
+        }
         if names.is_empty() {
             return;
         }
@@ -1038,10 +1050,10 @@ impl Router {
     /// A router that asked is told where the owner is, and of changes from here on.
     fn answer(&mut self, link: LinkId, owner: &NodeId, names: &[Name]) {
         let until = self.now.instant + QUERY_LEASE;
-        let Some(state) = self.links.get_mut(&link) else { return };
         for name in names {
-            state.asks.remove(name);
+            self.names.asks.remove(&(link, *name));
         }
+        let Some(state) = self.links.get_mut(&link) else { return };
         let new = state.follows.insert(*owner, until).is_none();
         self.names.prune_at.get_or_insert(until);
         // Routers are known to all; and who follows is told of changes.
@@ -1061,12 +1073,13 @@ impl Router {
 
     /// Answers what could not be answered before of the names of these owners.
     fn answer_asks(&mut self, owners: &[NodeId]) {
-        let asking: Vec<_> = self.links.iter().filter(|(_, s)| !s.asks.is_empty()).collect();
+        let waits = |s: &LinkState| self.names.asks.held_by(&s.node) > 0;
+        let waiting: Vec<_> = self.links.iter().filter(|(_, s)| waits(s)).map(|(l, _)| *l).collect();
         let mut open = Vec::new();
-        for owner in owners.iter().filter(|_| !asking.is_empty()) {
+        for owner in owners {
             for name in self.names.names_of(owner) {
-                let by = asking.iter().filter(|(_, s)| s.asks.contains_key(name)).map(|(link, _)| **link);
-                open.extend(by.map(|link| (link, *owner, *name)));
+                let by = waiting.iter().filter(|link| self.names.asks.contains(&(**link, *name)));
+                open.extend(by.map(|link| (*link, *owner, *name)));
             }
         }
         for (link, owner, name) in open {
@@ -1160,12 +1173,13 @@ impl Router {
         self.names.memory.expire(now.instant);
         if self.names.prune_at.is_some_and(|at| at <= now.instant) {
             for state in self.links.values_mut() {
-                state.asks.retain(|_, until| *until > now.instant);
                 state.follows.retain(|_, until| *until > now.instant);
             }
-            self.names.passed_on.retain(|_, q| q.at + QUERY_LEASE > now.instant);
-            let idle = |s: &LinkState| s.asks.is_empty() && s.follows.is_empty();
-            let all_idle = self.names.passed_on.is_empty() && self.links.values().all(idle);
+            self.names.asks.retain(|until| *until > now.instant);
+            self.names.passed_on.retain(|q| q.at + QUERY_LEASE > now.instant);
+            let all_idle = self.names.passed_on.is_empty()
+                && self.names.asks.is_empty()
+                && self.links.values().all(|s| s.follows.is_empty());
             self.names.prune_at = (!all_idle).then(|| now.instant + QUERY_LEASE);
         }
     }

@@ -196,6 +196,10 @@ pub enum DropReason {
         /// Which.
         what: &'static str,
     },
+    /// Its neighbour has brought more questions for names than others, and there is no room for them. It may be as honest as any:
+    /// it brings those of the nodes behind it.
+    #[error("too many questions for names are under way")]
+    QuestionsFull,
     /// The neighbour has brought too many announcements that were no news; not looked at.
     #[error("brings too many announcements that are old")]
     StaleFlood,
@@ -257,6 +261,7 @@ impl DropReason {
             // An honest neighbour passes on what the CA signs.
             Self::ListFlood { .. }
             | Self::OwnerKey { .. }
+            | Self::QuestionsFull
             | Self::Stale { .. }
             | Self::Unknown { .. }
             | Self::WrongWay { .. }
@@ -273,6 +278,7 @@ impl DropReason {
             Self::Stale { .. } => "stale",
             Self::HopLimit => "hop_limit",
             Self::Limit { .. } => "limit",
+            Self::QuestionsFull => "questions_full",
             Self::StaleFlood => "stale_flood",
             Self::Unknown { .. } => "unknown",
             Self::WrongWay { .. } => "wrong_way",
@@ -645,6 +651,7 @@ impl Router {
         for name in state.interests.keys() {
             self.unwatch(link, name);
         }
+        self.names.forget_asks(link);
         self.cut_link(link, state.branches);
         self.unhear(link);
         if state.hello.is_some() {

@@ -1074,7 +1074,7 @@ fn asked_of(bench: &Bench, link: u32) -> Vec<Name> {
 
 #[test]
 fn a_router_may_ask_again_for_what_it_asked_for_when_there_is_no_room_for_more() {
-    let limits = Limits { interests_per_peer_max: 8, tombstones_max: 8, ..Limits::default() };
+    let limits = Limits { interests_per_peer_max: 8, questions_max: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
     let names = unknown_names(&bench, 0, 8);
     bench.frame(1, Control::Query { id: 1, hops: 0, names: names.clone() });
@@ -1087,6 +1087,49 @@ fn a_router_may_ask_again_for_what_it_asked_for_when_there_is_no_room_for_more()
     let more = [unknown_names(&bench, 8, 1), names.clone()].concat();
     bench.frame(1, Control::Query { id: 3, hops: 0, names: more });
     assert_eq!((asked_of(&bench, 2), bench.dropped.as_slice()), (names, ["limit"].as_slice()));
+}
+
+#[test]
+fn one_routers_questions_leave_room_for_those_of_others() {
+    let limits = Limits { questions_max: 64, asks_max: 64, ..Limits::default() };
+    let mut bench = Bench::with(MappingKind::Query, limits);
+    let many = unknown_names(&bench, 0, 200);
+    let (mut id, mut passed_on) = (0, 0);
+    for names in many.chunks(20) {
+        id += 1;
+        bench.frame(1, Control::Query { id, hops: 0, names: names.to_vec() });
+        passed_on += asked_of(&bench, 3).len();
+    }
+    assert_eq!(
+        (passed_on, bench.dropped.last()),
+        (64, Some(&"questions_full")),
+        "those that are under way stay"
+    );
+    bench.dropped.clear();
+    // Another one has all of its questions asked, and its answers come.
+    for (n, blind) in [A, B].into_iter().enumerate() {
+        let names = vec![bench.name(&blind)];
+        bench.frame(2, Control::Query { id: 1000 + n as u64, hops: 0, names: names.clone() });
+        assert_eq!(asked_of(&bench, 3), names);
+    }
+    let own = unknown_names(&bench, 1000, 20);
+    bench.with_proxies();
+    bench.frame(4, Control::Interest { names: own.clone() });
+    assert_eq!((asked_of(&bench, 3).len(), bench.dropped.as_slice()), (own.len(), [""; 0].as_slice()));
+    for names in many.chunks(20) {
+        id += 1;
+        bench.frame(1, Control::Query { id, hops: 0, names: names.to_vec() });
+    }
+    bench.up(6, &bench.owner.clone(), false, 1000);
+    bench.owner_says(6, 0, &[(0, 1000)]);
+    bench.advert(6, 10, &[A, B]);
+    assert!(bench.told().contains(&(2, "advert")), "{:?}", bench.told());
+    // Later, the first one may bring others in place of its own.
+    bench.dropped.clear();
+    bench.pass(Duration::from_secs(5));
+    let more = unknown_names(&bench, 2000, 20);
+    bench.frame(1, Control::Query { id: 2000, hops: 0, names: more.clone() });
+    assert_eq!((asked_of(&bench, 3), bench.dropped.as_slice()), (more, [""; 0].as_slice()));
 }
 
 #[test]
