@@ -356,7 +356,7 @@ static SERDATA: Table<ddsi_serdata_ops> = Table(ddsi_serdata_ops {
     to_untyped: Some(to_untyped),
     untyped_to_sample: None,
     free: Some(free),
-    print: None,
+    print: Some(crate::topic::print),
     get_keyhash: Some(get_keyhash),
     from_loaned_sample: None,
     from_psmx: None,

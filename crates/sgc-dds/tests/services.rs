@@ -20,11 +20,15 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const QUIET: Duration = Duration::from_millis(300);
 
 fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
-    let tag = tag.map(str::to_owned);
+    open_with(domain, tag, None)
+}
+
+fn open_with(domain: u32, tag: Option<&str>, cyclonedds_uri: Option<&str>) -> CycloneNetwork {
     CycloneNetwork::open(&DdsConfig {
         domain,
         discovery: DiscoveryRange::LocalHost,
-        tag,
+        tag: tag.map(str::to_owned),
+        cyclonedds_uri: cyclonedds_uri.map(str::to_owned),
         ..DdsConfig::default()
     })
     .unwrap()
@@ -99,6 +103,18 @@ fn requests_and_replies_find_each_other_in_either_byte_order() {
         quiet(&clients[0].1);
         assert_eq!(clients[1].0.matched_servers(), 1);
     }
+}
+
+#[test]
+fn content_that_is_traced_ends_nobody() {
+    let trace = "<Tracing><Category>trace,content</Category><OutputFile>/dev/null</OutputFile></Tracing>";
+    let (ros, sgc) = (open_with(125, None, Some(trace)), open_with(125, Some("arm-1"), Some(trace)));
+    let (server, requests) = server(&sgc);
+    let (client, replies) = client(&ros);
+    let asked = ask(&client, &[0, 1, 0, 0, 1, 2, 3, 4]);
+    let (id, payload) = next(&requests);
+    server.reply(&id, payload.clone()).unwrap();
+    assert_eq!(next(&replies), (asked, payload));
 }
 
 /// The bytes of rmw_cyclonedds: behind the encapsulation header the client's id and the number, then the body.
