@@ -165,7 +165,7 @@ pub(crate) enum CliError {
         from: &'static str,
         /// Its value.
         value: String,
-        /// What is wrong with it.
+        /// The fault.
         reason: LogFilterError,
     },
     /// Nobody answers at a status socket.

@@ -228,25 +228,25 @@ pub(crate) enum LogFilterError {
          sgc_node=debug,info"
     )]
     Level {
-        /// What stands in its place.
+        /// The text that stands in its place.
         written: String,
     },
     /// No name of a crate or module.
     #[error("{written:?} is no target: write the name of a crate or a module, such as sgc_node=debug,info")]
     Target {
-        /// What stands in its place.
+        /// The text that stands in its place.
         written: String,
     },
     /// A target that looks like a crate of SGC.
     #[error("{written:?} is no part of SGC: write one of {}", LOG_TARGETS.join(", "))]
     UnknownTarget {
-        /// What stands in its place.
+        /// The text that stands in its place.
         written: String,
     },
     /// Something else that the parser refuses.
     #[error("{reason}; write info, debug or sgc_node=debug,info, for example")]
     Other {
-        /// What it said.
+        /// Its message.
         reason: String,
     },
 }

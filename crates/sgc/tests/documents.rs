@@ -1,7 +1,7 @@
 //! The documents cite what exists: each test that `docs/security.md` names is in the repository, and each link and path of
 //! every document leads somewhere.
 //!
-//! How tests are cited stands in that document, before its first table. A citation that cannot be checked is a fault.
+//! That document says before its first table how tests are cited. A citation that cannot be checked is a fault.
 
 #![allow(clippy::unwrap_used)]
 
@@ -79,7 +79,7 @@ fn every_link_and_path_of_a_document_leads_somewhere() {
     assert!(checked > 100, "only {checked} links and paths were recognised");
 }
 
-/// Whether a link of a document names a file that exists, and a heading of it.
+/// Returns `true` if a link of a document names a file that exists, and a heading of it.
 fn leads_somewhere(document: &Path, link: &str) -> bool {
     let (file, heading) = link.split_once('#').map_or((link, None), |(file, heading)| (file, Some(heading)));
     let target = if file.is_empty() { document.to_owned() } else { document.parent().unwrap().join(file) };
@@ -253,7 +253,7 @@ fn tests_in(path: &Path) -> BTreeSet<String> {
     tests
 }
 
-/// How many words two names have in common.
+/// Counts the words that two names have in common.
 fn likeness(a: &str, b: &str) -> usize {
     let words: BTreeSet<_> = a.split('_').collect();
     b.split('_').filter(|word| words.contains(word)).count()

@@ -242,7 +242,7 @@ fn two_copies() -> (Place, Place) {
     (new, old)
 }
 
-/// What a node believes that was told these lists in this order.
+/// Returns the anchors of a node that was told these lists in this order.
 fn told(lists: &[&Place]) -> TrustAnchors {
     let anchors = lists[0].fleet().anchors().clone();
     lists.iter().fold(anchors, |anchors, place| {

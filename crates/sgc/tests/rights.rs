@@ -460,7 +460,7 @@ fn a_process_with_keys_leaves_no_core_and_is_not_traced_unless_its_user_says_so(
         plain.stdin(Stdio::null());
         plain
     };
-    // What another process of the same user sees of its memory.
+    // The memory that another process of the same user sees.
     let sees = |node: &Running| {
         let mut look = Command::new("cat");
         look.arg(format!("/proc/{}/maps", node.child.id()));

@@ -1,6 +1,6 @@
 //! `sgc fleet merge`, and how any command notices that its copy of a fleet's file is not the newest.
 //!
-//! What of two copies counts is the business of `sgc-trust`; here it is found out that there are two, and said.
+//! `sgc-trust` decides which parts of two copies count; this module finds out that there are two, and says so.
 
 use std::path::{Path, PathBuf};
 

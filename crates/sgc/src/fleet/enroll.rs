@@ -110,7 +110,7 @@ impl Made {
     }
 }
 
-/// Who makes certificates: a fleet file here, or the authority.
+/// The maker of certificates: a fleet file here, or the authority.
 enum Keeper {
     File(LockedFleet),
     Authority(Remote),

@@ -19,10 +19,10 @@ use super::WhichFleet;
 use crate::error::CliError;
 use crate::status;
 
-/// How long the node may take: it gives up before.
+/// Longest wait for the node's answer: the node gives up before.
 const ANSWER_MAX: Duration = Duration::from_secs(40);
 
-/// Where the fleet is kept.
+/// The place where the fleet is kept.
 #[derive(Debug, Args)]
 pub(super) struct Keeping {
     #[command(flatten)]
@@ -51,7 +51,7 @@ pub(super) struct Remote {
     socket: PathBuf,
 }
 
-/// What a node says.
+/// An answer of a node.
 #[derive(Deserialize)]
 enum Answer {
     #[serde(rename = "ok")]

@@ -425,7 +425,7 @@ fn routers_know_names() {
     assert!(last(&graph).1.contains("is silent"));
 }
 
-/// What a walk found first that is wrong, or cannot be known.
+/// Returns the first finding of a walk that is wrong, or cannot be known.
 fn found(graph: &Graph, verdict: Verdict) -> Option<String> {
     let steps = diagnose::interface(graph, "/a");
     steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found)

@@ -35,7 +35,7 @@ fn start_twin(lab: &Lab) -> Running {
     Running::start(command, &lab.dir().join("twin.log"))
 }
 
-/// Whether a node shows an alert of this kind about another place that begins so.
+/// Returns `true` if a node shows an alert of this kind about another place that begins so.
 fn alerts(lab: &Lab, socket: &str, kind: &str, place: &str) -> bool {
     let output = lab.sgc(None, &["status", "--json", "--socket", socket]).output().unwrap();
     let status: Value = serde_json::from_slice(&output.stdout).unwrap_or_default();
@@ -101,7 +101,7 @@ fn one_identity_in_two_networks_gives_nothing_twice_and_is_named_on_all_sides() 
     let linked = lab.log(Site::Desk).matches("link is up").count();
     assert!((2..=8).contains(&linked), "{linked} links in ten seconds");
 
-    // What the desk heard until it was displaced.
+    // Messages that the desk heard until it was displaced.
     while let Ok((_, event)) = at_desk.events.try_recv() {
         of_desk.extend(event["seq"].as_u64().filter(|_| event["event"] == "received"));
     }
