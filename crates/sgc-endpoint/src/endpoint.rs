@@ -290,7 +290,7 @@ pub struct Endpoint {
     /// Where members ask this authority.
     pub(crate) renewal_name: Option<(Name, Blind)>,
     pub(crate) renewals: BTreeMap<SinkId, GrantedSink>,
-    /// Where operators ask this authority.
+    /// Name under which operators ask this authority.
     pub(crate) operations_name: Option<(Name, Blind)>,
     pub(crate) operations: BTreeMap<SinkId, GrantedSink>,
     /// Where this owner is asked what its types look like.
@@ -435,7 +435,7 @@ impl Endpoint {
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
         if self.clock.was_set(now) {
-            // What was signed by the old time may be refused, and so may what was asked for.
+            // Messages that were signed by the old time may be refused, and so may requests.
             self.advertise_all();
             self.joins.values_mut().for_each(|join| join.retry_refused_by_time(now.instant));
         }

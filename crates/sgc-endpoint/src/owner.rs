@@ -622,7 +622,7 @@ impl Endpoint {
         }
     }
 
-    /// Whether a request for a share may be granted, and the sink that has to give up its place for it.
+    /// Decides whether a request for a share may be granted, and names the sink that has to give up its place for it.
     fn admit(&self, name: &Name, sink: &SinkId, asked: &GrantedSink) -> Result<Option<SinkId>, RefuseReason> {
         let share = self.shares.shares.get(name).ok_or(RefuseReason::NotShared)?;
         share.spec.policy.permits(&asked.peer, asked.request.role()).map_err(refusal)?;
@@ -777,7 +777,7 @@ impl Endpoint {
     }
 }
 
-/// Whether a request of a node was signed before another one of it, and so is played again.
+/// Returns `true` if a request of a node was signed before another one of it, and so is played again.
 pub(crate) fn is_older(asked: &GrantedSink, known: &GrantedSink) -> bool {
     asked.peer.node_id == known.peer.node_id && asked.issued_at < known.issued_at
 }

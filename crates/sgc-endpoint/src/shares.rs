@@ -64,7 +64,7 @@ pub(crate) struct GrantedSink {
     pub(crate) peer: VerifiedPeer,
     pub(crate) request: Request,
     pub(crate) reply_key: Bytes,
-    /// When the request was signed: of requests that are played again none is newer than the last of their node.
+    /// Time at which the request was signed: of requests that are played again none is newer than the last of their node.
     pub(crate) issued_at: UnixMillis,
     /// Serial of the last answer.
     pub(crate) serial: u64,
