@@ -161,7 +161,7 @@ pub fn run(input: &[u8]) {
             let read = ShareToken::parse(&text);
             assert_eq!(read.is_ok(), text.trim() == *good);
             drop(read.map(|token| (token.name(), token.ca_fingerprint())));
-            // What a check sum cannot tell: fields that were made, not damaged.
+            // A check sum cannot tell fields that were made from good ones, only damaged ones.
             let mut made = cast.token.clone();
             if let Ok(metadata) = Metadata::from_slice(input) {
                 made.metadata = metadata;
