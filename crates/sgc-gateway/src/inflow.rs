@@ -134,7 +134,7 @@ mod tests {
         };
         assert!(matches!(refused, GatewayError::Crowded { pool: Pool::Total, .. }), "{refused}");
         assert_eq!(begun.len(), (2048 << 20) / BEGUN + 1);
-        // What is short needs none, and what is done gives its room back.
+        // Short messages need no room, and finished ones give theirs back.
         let short = Inflow::default();
         short.admit(&quota);
         short.add(UNIT_BYTES).unwrap();

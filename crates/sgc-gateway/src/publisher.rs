@@ -113,7 +113,7 @@ struct Line {
     /// Held by who writes what waits, so that it keeps its order.
     turn: Mutex<()>,
     published: AtomicU64,
-    /// What the writer keeps, where it is counted: until the writer ends.
+    /// The count of the messages that the writer keeps, until the writer ends.
     kept: Option<Kept>,
 }
 
@@ -348,7 +348,7 @@ impl Drop for Publication {
     }
 }
 
-/// How many messages a transient-local writer keeps at most.
+/// Returns the most messages that a transient-local writer keeps.
 fn kept_max(spec: &EndpointSpec) -> usize {
     match &spec.qos.history {
         History::KeepLast(depth) if spec.keyless => *depth as usize,

@@ -4,7 +4,7 @@
 //! other hosts together have [`REMOTE_SHARE`] times as much, and all clients of this gateway [`TOTAL_SHARE`] times. The
 //! difference of the last two is for programs of this host: no client of another host takes that.
 //!
-//! Whether a connection has a place at all is the business of `door`.
+//! `door` decides whether a connection has a place at all.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -426,7 +426,7 @@ mod tests {
         let (local, why) = take_all(&quotas.quota(&client("127.0.0.1:1")));
         assert_eq!(local.len(), 40);
         assert!(matches!(why, GatewayError::Crowded { pool: Pool::Total, .. }), "{why}");
-        // What is refused leaves nothing behind.
+        // A refused request leaves nothing behind.
         held.pop();
         assert_eq!(take_all(&quotas.quota(&client("10.0.0.4:1"))).0.len(), 1);
     }

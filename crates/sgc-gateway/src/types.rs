@@ -156,7 +156,7 @@ impl Types {
         let mut library = Library::empty();
         for part in parts {
             let Ok(part) = format!("{file}{part}").parse() else { continue };
-            // What is known as it was described alone has no files.
+            // A type that is known by its description alone has no files.
             let _ = library.layout(&part, &mut |needed| {
                 files.insert(needed.clone());
                 self.text(&needed.to_string()).ok()

@@ -1,4 +1,4 @@
-//! What one credential has with however many connections, what all other hosts have together, and what stays for programs of
+//! The share of one credential with however many connections, that of all other hosts together, and the rest for programs of
 //! this host.
 #![allow(clippy::unwrap_used)]
 
@@ -195,7 +195,7 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
     };
     assert!(is_of(&refused, Pool::Credential), "{refused}");
     assert_eq!(held.len(), SHARES[0] + 1);
-    // What goes makes room, once its writer has ended.
+    // A publisher that goes makes room, once its writer has ended.
     held.remove(0);
     let (_, last) = held.last().unwrap();
     let until_room = async {
@@ -206,7 +206,7 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
     tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
 }
 
-/// What is told where a credential has no room for more arguments of calls.
+/// The error where a credential has no room for more arguments of calls.
 fn arguments_crowded() -> String {
     let max = SHARES[0] * LIMITS.waiting_bytes_max;
     format!("{max} bytes of arguments that wait at most for {}", Pool::Credential)

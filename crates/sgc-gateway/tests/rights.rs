@@ -274,12 +274,12 @@ async fn a_token_that_is_revoked_ends_sessions_of_all_protocols_at_once() {
         assert_eq!((ended.code(), ended.message()), (Code::Unauthenticated, told));
     }
     assert!(began.elapsed() < AT_ONCE, "{:?}", began.elapsed());
-    // What they had is gone, and so are they, whether they read that or not.
+    // Their subscriptions are gone, and so are they, whether they read that or not.
     let names = || place.server.status().clients.into_iter().map(|client| client.name).collect::<Vec<_>>();
     eventually(|| names() == ["token 3"]).await;
     eventually(|| place.site.hub.readers() == 1).await;
     drop(unread);
-    // Who has become another by another token stays, though the one that it came with was revoked.
+    // A client that has become another by another token stays, though the one that it came with was revoked.
     talk("still here");
     while hear(&mut stays).await["msg"]["data"] != "still here" {}
     assert_eq!(place.server.status().refused["no longer admitted"], 4);
@@ -412,7 +412,7 @@ async fn a_renewed_certificate_is_shown_to_new_connections_and_tokens_go_on() {
     assert!(place.server.show(&another.certified_key()).is_ok());
     let after = place.wss(&connector, Some(&token)).await;
     assert_eq!(shown(&after), another.chain());
-    // Who was there stays.
+    // A client from before stays.
     say(&mut before, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
     assert_eq!(hear(&mut before).await["id"], "1");
 }

@@ -422,7 +422,7 @@ impl Access {
         }
     }
 
-    /// Whether a page of there may connect without a token; a program, which has no origin, may. In the browser of another
+    /// Decides if a page of there may connect without a token; a program, which has no origin, may. In the browser of another
     /// host, `http://localhost` is a page of that host.
     fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denied> {
         let Some(text) = origin else { return Ok(()) };

@@ -34,7 +34,7 @@ pub(super) struct Clients {
     stopping: watch::Receiver<bool>,
 }
 
-/// What was shown: of a token its hash, so that none is kept. Beside a token the origin says nothing, and is not looked at.
+/// The credential that was shown: of a token its hash, so that none is kept. Beside a token the origin is not looked at.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Shown {
     token: Option<[u8; 32]>,

@@ -32,7 +32,7 @@ use crate::types::InterfaceType;
 
 /// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
 const SETTLE_MAX: Duration = Duration::from_millis(500);
-/// How long a call waits for its reply at most, whatever its client says.
+/// Longest time that a call waits for its reply, whatever its client says.
 const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
 /// Errors that a client may make at once, and a second: who makes more is disconnected.
 const ERRORS_BURST: u32 = 200;
