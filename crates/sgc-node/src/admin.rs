@@ -53,7 +53,7 @@ const TOPIC_BYTES_MAX: usize = 254;
 /// First and longest time between two attempts to have the socket.
 const BIND_AGAIN_MIN: Duration = Duration::from_millis(100);
 const BIND_AGAIN_MAX: Duration = Duration::from_secs(5);
-/// How often a socket is looked for whose path somebody may have removed, as programs that tidy `/tmp` do.
+/// Interval of looks for a socket whose path somebody may have removed, as programs that tidy `/tmp` do.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
 /// How long a question that was begun may take, and how long its answer may be in being read.
 const TRANSFER_MAX: Duration = Duration::from_secs(5);
@@ -276,7 +276,7 @@ pub enum AdminError {
     },
 }
 
-/// What answers need.
+/// Everything that answers need.
 #[derive(Clone)]
 pub(crate) struct Desk {
     pub(crate) events: mpsc::Sender<CoreEvent>,

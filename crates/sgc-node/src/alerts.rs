@@ -1,4 +1,4 @@
-//! What an operator has to see to: mistakes outside of this program that look like its faults, or like attacks.
+//! Alerts for an operator: mistakes outside of this program that look like its faults, or like attacks.
 //!
 //! Each is known on every node that it concerns, and `Alerts` remembers those that no state of a machine shows. They
 //! are shown by `sgc status` and `sgc why`; nothing is decided by them.
@@ -14,7 +14,7 @@ use sgc_wire::{NodeId, UnixMillis};
 
 /// Peers that are remembered because two processes use their identity; of more the one seen longest ago goes.
 const PEERS_MAX: usize = 1024;
-/// How long it is shown that an identity was in use at another place. A process that waits tries again sooner than that.
+/// Time for which an identity's use at another place is shown. A process that waits tries again sooner than that.
 const SHOWN_FOR: Duration = Duration::from_secs(660);
 
 /// A mistake of an operator.
@@ -145,7 +145,7 @@ fn duration(ms: i64) -> String {
     }
 }
 
-/// Where another process was seen that uses an identity.
+/// The place at which another process was seen that uses an identity.
 #[derive(Clone, Debug)]
 struct Sighting {
     place: String,
@@ -166,9 +166,9 @@ impl Sighting {
 /// Identities that were seen at two places lately.
 #[derive(Debug, Default)]
 pub(crate) struct Alerts {
-    /// Who has the links of this node.
+    /// The process that has the links of this node.
     displaced: Option<Sighting>,
-    /// Who is kept out for this node.
+    /// The process that is kept out for this node.
     kept_out: Option<Sighting>,
     peers: BTreeMap<NodeId, Sighting>,
 }
@@ -249,7 +249,7 @@ mod tests {
         assert!(text.starts_with("the identity robot is in use at another place: 203.0.113.5:2"), "{text}");
         assert_eq!(shown(&alerts, now + 2 * SHOWN_FOR), []);
         assert!(alerts.displaced("203.0.113.5:1", now + 2 * SHOWN_FOR));
-        // Who has its links again says so in the place of the other.
+        // A node that has its links again says so in the place of the other alert.
         assert!(alerts.kept_out(at(3), now + 2 * SHOWN_FOR));
         assert!(matches!(shown(&alerts, now + 2 * SHOWN_FOR)[..], [Alert::IdentityInUse { .. }]));
     }

@@ -164,14 +164,14 @@ impl DeskQueue {
     }
 }
 
-/// What one job does.
+/// The work of one job.
 #[derive(Debug)]
 struct DeskBatch {
     renewals: Vec<RenewalRequest>,
     operations: Vec<OperationJob>,
 }
 
-/// What came of a job.
+/// The answers of a job.
 pub(crate) struct DeskAnswers {
     pub(crate) renewals: Vec<RenewalAnswer>,
     pub(crate) operations: Vec<OperationDone>,
@@ -181,7 +181,7 @@ pub(crate) struct DeskAnswers {
 pub(crate) struct Authority {
     pub(crate) queue: DeskQueue,
     pub(crate) operators: Operators,
-    /// When members were last given something, in this run; at most as many as a roster has.
+    /// Times at which members were last given something, in this run; at most as many as a roster has.
     seen: BTreeMap<NodeId, UnixMillis>,
     own: NodeId,
     desk: Arc<Mutex<FleetDesk>>,
@@ -250,7 +250,7 @@ struct Answered {
     /// The serial number of the certificate in the answer.
     made: Option<Arc<[u8]>>,
     at: Instant,
-    /// How long it is remembered, and nothing else is done for the node.
+    /// Time for which it is remembered, and nothing else is done for the node.
     interval: Duration,
 }
 

@@ -17,7 +17,7 @@ pub(crate) const INBOX_BYTES_MAX: usize = 32 << 20;
 /// Bytes that a frame takes beside its encoding, about.
 const FRAME_BYTES: usize = 256;
 
-/// What waits for a link.
+/// An item that waits for a link.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
     Frame(Control),
@@ -55,7 +55,7 @@ impl ControlQueue {
 #[derive(Clone, Debug)]
 pub(crate) struct Inbox(Arc<Semaphore>);
 
-/// What a frame takes of that room, until the control task has handled it.
+/// The room that a frame takes, until the control task has handled it.
 #[derive(Debug)]
 pub(crate) struct FrameRoom {
     _of_link: OwnedSemaphorePermit,

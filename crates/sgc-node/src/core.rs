@@ -102,7 +102,7 @@ pub(crate) enum CoreEvent {
         link: LinkId,
         /// What.
         frame: Control,
-        /// What it takes of the inbox.
+        /// Its room in the inbox.
         room: FrameRoom,
     },
     /// A link has taken all control frames before a flush.
@@ -161,7 +161,7 @@ pub(crate) enum CoreEvent {
         /// Told when it is done.
         reply: oneshot::Sender<()>,
     },
-    /// What the fleet's file holds for those who asked this authority, and what came of operations.
+    /// Answers from the fleet's file to those who asked this authority, and results of operations.
     DeskAnswered(DeskAnswers),
     /// A user wants an operation on the fleet to be carried out at its authority.
     Operate {
@@ -169,14 +169,14 @@ pub(crate) enum CoreEvent {
         at: NodeName,
         /// The operation.
         operation: Operation,
-        /// Where to answer.
+        /// The channel for the answer.
         reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
     },
     /// The user brings a revocation list; answered with whether it is news, and with the lists that were in force before.
     Crl {
         /// The list, DER.
         der: bytes::Bytes,
-        /// Where to answer.
+        /// The channel for the answer.
         reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
     },
     /// Keys that messages of these suites are signed with are made.
@@ -199,9 +199,9 @@ pub(crate) enum CoreEvent {
 pub(crate) struct LinkPlace {
     /// Its number.
     pub(crate) id: LinkId,
-    /// Where its packets go.
+    /// The destination of its packets.
     pub(crate) data: Arc<DataPlane>,
-    /// What its control frames may take of the inbox.
+    /// Its control frames' share of the inbox.
     pub(crate) inbox: InboxShare,
 }
 
@@ -267,7 +267,7 @@ pub(crate) struct Core<N: RosNetwork> {
     gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
-    /// What users of this node ask an authority for.
+    /// Operations that users of this node ask an authority for.
     operations: Operations,
     keeper: Keeper,
     /// When to ask for another certificate.

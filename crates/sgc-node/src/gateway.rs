@@ -302,7 +302,7 @@ mod tests {
         assert_eq!(shown(), renewed.chain());
         let reload = |key: ShownKey| gateway.reconfigure(Access::default(), || key).unwrap();
         assert!(!reload(ShownKey::Own(Arc::clone(&renewed))), "it is the same");
-        // Where the configuration names a certificate that of the node is not shown.
+        // The node's certificate is not shown where the configuration names another one.
         assert!(reload(ShownKey::Files(file.certified_key())));
         gateway.set_identity(&first);
         assert_eq!(shown(), file.chain());

@@ -42,7 +42,7 @@ pub struct Graph {
     pub drops: BTreeMap<String, u64>,
     /// What the user was told once.
     pub problems: Vec<String>,
-    /// What an operator has to see to.
+    /// Alerts for an operator.
     pub alerts: Vec<Alert>,
 }
 

@@ -429,7 +429,7 @@ struct ControlRx {
     /// How many frames came.
     count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
-    /// What may wait for the control task.
+    /// Share of the inbox for frames that wait for the control task.
     inbox: InboxShare,
 }
 
@@ -909,7 +909,7 @@ mod tests {
         }
         let of_flooder = held.iter().filter(|(link, _)| *link == LinkId(1)).count();
         assert!(of_flooder * FRAME_BYTES <= LINK_INBOX_BYTES_MAX, "{of_flooder} frames wait");
-        // What is handled makes room for what waits.
+        // Handled frames make room for waiting ones.
         held.clear();
         let CoreEvent::Frame { link, .. } = soon(events.recv()).await.unwrap() else { panic!() };
         assert_eq!(link, LinkId(1));

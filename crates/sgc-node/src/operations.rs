@@ -9,9 +9,9 @@ use tokio::sync::oneshot;
 
 /// Most operations that wait for the one under way.
 const WAITING_MAX: usize = 16;
-/// How long an authority is looked for.
+/// Longest search for an authority.
 const FIND_MAX: Duration = Duration::from_secs(10);
-/// How long an operation may take in all, waiting included.
+/// Longest time of an operation in all, waiting included.
 pub(crate) const OPERATION_MAX: Duration = Duration::from_secs(30);
 
 /// Why an operation was not carried out, or may not have been.
@@ -37,7 +37,7 @@ pub enum OperationError {
     NotFound {
         /// The name.
         at: String,
-        /// What this node knows of it.
+        /// The cause, as far as this node knows it.
         hint: &'static str,
     },
     /// This node is no operator.
@@ -88,7 +88,7 @@ pub(crate) struct OperationWish {
     pub(crate) reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
 }
 
-/// What the node has to do.
+/// An action that the node has to do.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Ask this authority.
@@ -114,7 +114,7 @@ struct Current {
     state: State,
 }
 
-/// What the operation under way waits for.
+/// The event that the operation under way waits for.
 #[derive(Debug)]
 enum State {
     /// A challenge.
@@ -185,7 +185,7 @@ impl Operations {
         self.current.as_ref()?.name
     }
 
-    /// When to call [`Operations::look`].
+    /// Returns the time at which to call [`Operations::look`].
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.current.as_ref().map(|current| match current.state {
             State::ExpectChallenge => current.find_until.min(current.until),

@@ -25,14 +25,14 @@ pub(crate) const OPERATIONS_WAITING_MAX: usize = 16;
 const CHALLENGES_PER_NODE_MAX: usize = 4;
 /// Most challenges that hold.
 const CHALLENGES_MAX: usize = 256;
-/// How long a challenge holds.
+/// Validity of a challenge.
 const CHALLENGE_TIME: Duration = Duration::from_secs(60);
 /// Most operations whose answers are remembered: more than may wait, so that one under way is never forgotten.
 const EXECUTED_MAX: usize = 2 * OPERATIONS_WAITING_MAX;
 /// Most bytes of the rows in one page of a roster.
 const PAGE_BYTES_MAX: usize = 512 * 1024;
 
-/// What is to be done with a request.
+/// The next step for a request.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Asked {
     /// Give this answer at once.

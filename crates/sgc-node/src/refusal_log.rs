@@ -47,7 +47,7 @@ impl RefusalLog {
         for Repeated { source, count, within } in self.repeats.take_due(Instant::now().into_std()) {
             let seconds = within.as_secs();
             match source {
-                // What there is to say of them was said once.
+                // They were named once, which is all there is to say.
                 Some((_, RefusalKind::NotAdmitted)) => {}
                 Some((prefix, kind)) => {
                     let kind = kind.label();

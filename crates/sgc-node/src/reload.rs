@@ -76,7 +76,7 @@ struct Prepared {
     /// Whom to believe; nothing if that is as it was.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
-    /// Who may connect to the gateway, and what it shows them if not the node's own certificate; nothing if there is none.
+    /// The gateway's access rules, and its certificate if that is not the node's own; `None` without a gateway.
     gateway: Option<(Access, Option<Arc<CertifiedKey>>)>,
 }
 

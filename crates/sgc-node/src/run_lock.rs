@@ -17,9 +17,9 @@ use sgc_wire::NodeId;
 use tokio::time::{Instant, sleep};
 use tracing::{info, warn};
 
-/// How long the process before may take to end.
+/// Longest wait for the end of the process before.
 const WAIT_MAX: Duration = Duration::from_secs(6);
-/// How often it is looked whether it has.
+/// Interval of looks at it.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// The identity of this process is in use by another one of this machine.

@@ -27,7 +27,7 @@ pub struct Status {
     pub routers: Vec<RouterStatus>,
     /// Shares and uses, and where each stands.
     pub routes: Vec<RouteLine>,
-    /// What an operator has to see to.
+    /// Alerts for an operator.
     pub alerts: Vec<Alert>,
     /// What is wrong between local endpoints and the other side, with both values and the fix; gone when it is.
     pub problems: Vec<String>,

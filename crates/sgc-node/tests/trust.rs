@@ -423,7 +423,7 @@ fn an_operator_has_operations_carried_out_at_the_authority() {
     let said: Vec<_> = said.iter().map(|r| r.reason.as_deref().unwrap()).collect();
     assert_eq!(said, ["enroll arm: done", "list: done", "list: done", "revoke thief: done"]);
 
-    // What is not possible is said.
+    // Impossible operations are refused with a reason.
     let refused = |done: Result<OperationAnswer, String>| match done {
         Ok(OperationAnswer::Refused { detail, .. }) => detail,
         other => panic!("{other:?}"),

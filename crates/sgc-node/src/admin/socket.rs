@@ -24,7 +24,7 @@ const ROOT: u32 = 0;
 /// Why there is no connection to a status socket, or no status socket.
 #[derive(Debug, thiserror::Error)]
 pub enum SocketError {
-    /// What the system said of the socket.
+    /// The system's error for the socket.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// Another node has the socket.
@@ -35,13 +35,13 @@ pub enum SocketError {
     Directory {
         /// The directory.
         dir: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The directory is a file or a symbolic link.
     #[error("{} is not a directory but a file or a symbolic link: remove it, or set XDG_RUNTIME_DIR or `socket` in [admin]", dir.display())]
     NoDirectory {
-        /// What should be a directory.
+        /// The path that should be a directory.
         dir: PathBuf,
     },
     /// The directory is another user's.
@@ -75,7 +75,7 @@ pub enum SocketError {
     },
 }
 
-/// Where the status socket of a node with this name is unless its configuration says otherwise.
+/// Returns the path of the status socket of a node with this name, unless its configuration names another.
 pub fn default_socket_path(node: &str) -> PathBuf {
     usual_dir(&|name| std::env::var_os(name).map(PathBuf::from)).join(format!("{node}.sock"))
 }
@@ -143,7 +143,7 @@ fn expected_uid(dir: &Path) -> u32 {
     }
 }
 
-/// Whether a process of this user may ask this node.
+/// Returns `true` if a process of this user may ask this node.
 pub(super) fn may_ask(uid: u32) -> bool {
     uid == own_uid() || uid == ROOT
 }
@@ -253,7 +253,7 @@ mod tests {
         assert!(matches!(StatusSocket::bind(&path), Err(SocketError::Taken)));
         drop(first);
         assert!(!path.exists());
-        // What a killed node leaves is replaced; what a node without a lock has is not.
+        // The socket of a killed node is replaced; that of a node without a lock is not.
         drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
         let second = StatusSocket::bind(&path).unwrap();
         assert!(second.is_in_place());

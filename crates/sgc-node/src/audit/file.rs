@@ -29,7 +29,7 @@ pub struct AuditRoom {
     pub files: u32,
 }
 
-/// Where the log is that was put aside as the `n`th, from 1, the newest.
+/// Returns the path of the log that was put aside as the `n`th, from 1, the newest.
 pub fn rotated_path(path: &Path, n: u32) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(format!(".{n}"));
@@ -138,7 +138,7 @@ impl LogFile {
     }
 }
 
-/// What could not be read of a log.
+/// The parts of a log that could not be read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Unread {
     /// Lines that are no records.

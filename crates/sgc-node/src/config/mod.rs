@@ -147,7 +147,7 @@ pub struct TransportConfig {
     pub offload: bool,
     /// Whether the longest packet that a path carries is looked for.
     pub mtu_discovery: bool,
-    /// Whether listeners that speak DTLS 1.2 only are dialled, to whom certificates go in the clear.
+    /// `true` to dial listeners that speak DTLS 1.2 only, to which certificates go in the clear.
     pub dtls12: bool,
     /// What packets are marked with, 0 to 63.
     pub dscp: Option<u8>,

@@ -1,4 +1,4 @@
-//! What an operator has to see to, as this node comes to know it.
+//! Alerts for an operator, as this node comes to know of them.
 
 use std::net::SocketAddr;
 use std::time::Instant;
@@ -104,7 +104,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// What an operator has to see to now.
+    /// Returns the alerts that an operator has to see to now.
     pub(super) fn alerts(&self) -> Vec<Alert> {
         let now = now();
         let mut alerts = Vec::from_iter(clock_alert(&self.identity, now.unix));

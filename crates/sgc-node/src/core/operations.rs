@@ -101,7 +101,7 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.count_from(REPEATED, node);
             }
             Asked::Job(job) => {
-                // Who is here now is shown as that.
+                // Nodes that are here now are shown as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
                 match authority.queue.push_operation(job) {

@@ -23,7 +23,7 @@ pub(crate) const STAND_BACK: Duration = Duration::from_secs(300);
 pub(crate) struct Backoff {
     max: Duration,
     failures: u32,
-    /// How often in a row the links were taken by another process with this node's identity.
+    /// Number of times in a row that another process with this node's identity took the links.
     displaced: u32,
     due: Option<Instant>,
 }
