@@ -56,7 +56,7 @@ pub(crate) struct LinkState {
     may_route: bool,
     /// Last moment at which its certificate holds.
     not_after: UnixMillis,
-    /// When that is by the monotonic clock; a certificate that outlasts the clock never ends.
+    /// The same by the monotonic clock; a certificate that outlasts the clock never ends.
     pub(crate) expires: Option<Instant>,
     /// Its greeting; nothing else is accepted before it.
     pub(crate) hello: Option<Hello>,
@@ -69,11 +69,11 @@ pub(crate) struct LinkState {
     pub(crate) follows: BTreeMap<NodeId, Instant>,
     /// Names that are known over it.
     pub(crate) names: usize,
-    /// How far it has been told what was known when it greeted.
+    /// Progress of telling it the state that was known when it greeted.
     pub(crate) telling: Option<Telling>,
     /// Its wall clock, as it told it.
     pub(crate) told_clock: Option<ToldClock>,
-    /// When it was told everything once more because a clock was set.
+    /// Time at which it was told everything once more because a clock was set.
     pub(crate) told_again: Option<Instant>,
 }
 

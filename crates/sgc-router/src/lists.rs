@@ -1,4 +1,4 @@
-//! How many new revocation lists of one CA are taken from neighbours.
+//! Bounds on the new revocation lists of one CA that are taken from neighbours.
 //!
 //! A list that is news is verified, kept on the disk and passed on to every neighbour, so whoever holds the key of a
 //! partner's CA could have the whole mesh do that without end. This module decides when a list is due; `trust.rs` verifies
@@ -18,7 +18,7 @@ const LISTS_PER_SECOND: u32 = 1;
 /// Shortest time until a list that waits is looked at again.
 const RETRY_MIN: Duration = Duration::from_millis(10);
 
-/// What each CA has left, but for that of the node's own fleet. The caller names trusted CAs only, which bounds it.
+/// The allowance that each CA has left, but for that of the node's own fleet. The caller names trusted CAs only, which bounds it.
 #[derive(Debug, Default)]
 pub(crate) struct ListAllowances {
     cas: BTreeMap<CaFingerprint, ListAllowance>,

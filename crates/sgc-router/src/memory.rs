@@ -13,7 +13,7 @@ use sgc_wire::{NodeId, Signed};
 /// partition ends; they are recognised without verifying them again.
 const DIGESTS_MAX: usize = 8;
 
-/// What is remembered of one signer.
+/// The memory of one signer.
 #[derive(Debug)]
 struct Past {
     /// Announcements with lower numbers are void.
@@ -103,7 +103,7 @@ impl Memory {
         self.signers.get(signer).map_or(0, |past| past.run_floor)
     }
 
-    /// What is remembered of a signer from now on for as long as anything of before may verify.
+    /// Returns the memory of a signer, kept from now on for as long as anything of before may verify.
     fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut Past {
         if !self.signers.contains_key(signer)
             && self.signers.len() >= max

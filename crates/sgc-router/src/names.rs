@@ -25,9 +25,9 @@ const QUERY_LEASE: Duration = Duration::from_secs(60);
 /// The same question goes on at most that often.
 const QUERY_AGAIN: Duration = Duration::from_secs(5);
 
-/// What a record takes beside what was signed, bytes, about.
+/// Approximate memory of a record beside its signed bytes, bytes.
 const RECORD_BYTES: usize = 512;
-/// What each of its names takes.
+/// Memory of each of its names, bytes.
 const NAME_BYTES: usize = 128;
 
 /// Number of a [`Record`]; never used again while the process lives.
@@ -43,9 +43,9 @@ pub(crate) struct Record {
     names: Box<[Name]>,
     signed: Signed,
     digest: [u8; 32],
-    /// When its lease is over; of a withdrawal, when nothing that it withdrew verifies any more.
+    /// End of its lease; of a withdrawal, the time from which nothing that it withdrew verifies.
     expires: Instant,
-    /// When half of its lease is over: owners renew after a third.
+    /// The middle of its lease: owners renew after a third.
     renewal_due: Instant,
     /// Names that no newer one speaks for.
     live: usize,
@@ -56,7 +56,7 @@ pub(crate) struct Record {
 }
 
 impl Record {
-    /// What it takes of its owner's share of memory.
+    /// Returns its part of its owner's share of memory, bytes.
     fn bytes(&self) -> usize {
         RECORD_BYTES + self.signed.body.len() + self.signed.signature.len() + self.names.len() * NAME_BYTES
     }
@@ -81,7 +81,7 @@ struct Heard {
     selected: Option<LinkId>,
 }
 
-/// What one owner advertises and withdrew.
+/// The advertisements and withdrawals of one owner.
 #[derive(Debug, Default)]
 struct OfOwner {
     /// Its advertisements, by sequence number.
@@ -210,7 +210,7 @@ impl Names {
         self.records.get(self.words.get(name)?).map(|record| record.seq)
     }
 
-    /// What an owner said last, in force or not, and its number.
+    /// Returns the last message of an owner, in force or not, and its number.
     fn newest(&self, owner: &NodeId) -> Option<(u64, &Signed)> {
         let in_force = self.owners.get(owner).and_then(OfOwner::newest);
         let in_force = in_force.and_then(|(seq, id)| Some((seq, &self.records.get(&id)?.signed)));
@@ -1116,7 +1116,7 @@ impl Router {
             let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
                 None => Known::No,
                 Some(record) => match record.asked {
-                    // Who answered first may keep back what came after it.
+                    // The first to answer may keep back a later answer.
                     Some(_) if record.renewal_due <= now.instant => Known::No,
                     Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
                     Some(_) => Known::No,

@@ -322,7 +322,7 @@ pub struct Router {
     pub(crate) trees: BTreeMap<Name, Tree>,
     /// Branches that wait for something, and until when.
     pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
-    /// When to pass on what was beyond the allowance of its signer.
+    /// Time at which to pass on announcements beyond the allowance of their signer.
     pub(crate) late_at: Option<Instant>,
     pub(crate) lists: ListAllowances,
     pub(crate) outputs: VecDeque<Output>,
@@ -454,7 +454,7 @@ impl Router {
             }
             Control::Pulse { .. } => self.drop_frame(link, DropReason::Unknown { what: "pulse" }),
             Control::Clock { time } => self.handle_clock(now, link, time),
-            // What it says is for the operator alone.
+            // Its content is for the operator alone.
             Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),
             Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "lane" });

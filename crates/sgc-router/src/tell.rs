@@ -16,10 +16,10 @@ use crate::router::{LinkId, Output, Router};
 const TELL_FRAMES_MAX: usize = 256;
 /// Bytes of them; one frame may exceed it.
 const TELL_BYTES_MAX: usize = 1 << 20;
-/// How often announcements beyond the allowance of their signer are looked at.
+/// Interval of looks at announcements beyond the allowance of their signer.
 const LATE_EVERY: Duration = Duration::from_millis(100);
 
-/// How far a neighbour has been told what was known when it greeted.
+/// Progress of telling a neighbour the state that was known when it greeted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Telling {
     /// Link states, in the order of their nodes.
@@ -28,7 +28,7 @@ pub(crate) enum Telling {
     Adverts { next: RecordId, end: RecordId },
 }
 
-/// What may still be handed out.
+/// The room for frames that may still be handed out.
 struct Room {
     frames: usize,
     bytes: usize,
@@ -48,7 +48,7 @@ impl Room {
 impl Router {
     /// Tells a router that just greeted what is known of the network and of names.
     pub(crate) fn begin_telling(&mut self, link: LinkId) {
-        // Where this node is comes first: ways to it wait for that.
+        // This node's own link state comes first: ways to it wait for that.
         if let Some(record) = self.topology.node(&self.config.node) {
             let signed = record.signed.clone();
             self.send(link, Control::LinkState { signed });

@@ -543,7 +543,7 @@ fn advert_seq(frame: &Control) -> Option<u64> {
     AdvertBody::from_slice(&signed.body).ok().map(|body| body.seq)
 }
 
-/// Whether fresh advertisements and link states of the owner reach link 3, in their order.
+/// Asserts that fresh advertisements and link states of the owner reach link 3, in their order.
 fn assert_news_passes(bench: &mut Bench, from: u64) {
     for seq in from..from + 12 {
         bench.advert(1, seq, &[A]);
@@ -658,7 +658,7 @@ fn what_one_owner_withdraws_displaces_nothing_of_another() {
     bench.dropped.clear();
     bench.frame(2, old);
     assert_eq!((bench.route(&B), bench.dropped.as_slice()), (None, ["stale"].as_slice()));
-    // What it displaced of its own is void all the same.
+    // Its earlier advertisement, which it displaced, is void all the same.
     bench.frame(2, first);
     assert_eq!((bench.told(), bench.dropped.len()), (vec![], 2));
 }
