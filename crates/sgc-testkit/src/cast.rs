@@ -34,7 +34,7 @@ pub struct Member {
     pub valid: Option<Duration>,
     /// Which certificate of the node this is; 0 for the first.
     pub renewal: u32,
-    /// How often it was enrolled again after it had been revoked.
+    /// Number of times that it was enrolled again after a revocation.
     pub incarnation: u32,
 }
 

@@ -300,7 +300,7 @@ impl Running {
             Arrival::LinkDown(link, superseded) => {
                 if superseded {
                     self.router.handle_superseded();
-                    // What the other run gave to local programs is not to be asked for.
+                    // Sinks that the other run gave to local programs are not to be asked for.
                     self.sinks.values_mut().for_each(|local| local.sink = None);
                 }
                 self.link_down(now, link);

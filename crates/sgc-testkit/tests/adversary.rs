@@ -28,22 +28,22 @@ use sgc_wire::{
 const COMMITTED: &[u64] = &[1, 2, 3, 4, 5, 6, 7, 8];
 /// Latency of the adversary's links, one way: more than any honest way.
 const SLOW: Duration = Duration::from_millis(450);
-/// How often the adversary acts and the network is looked at.
+/// Interval of the adversary's actions and of looks at the network.
 const TICK: Duration = Duration::from_millis(500);
 /// Announcements that are replayed in each tick of a siege.
 const SIEGE_FRAMES: usize = 60;
-/// How long a pair may take after an honest node or link went away: the longest wait of any retry, twice.
+/// Longest recovery of a pair after an honest node or link went away: the longest wait of any retry, twice.
 const GRACE: Duration = Duration::from_secs(60);
-/// How long a topic that is new may take to be granted to one who wants it.
+/// Longest time until a new topic is granted to a node that wants it.
 const NEW_MAX: Duration = Duration::from_secs(10);
-/// How long a reliable message may take.
+/// Longest time of a reliable message.
 const MESSAGE_MAX: Duration = Duration::from_secs(20);
 
 const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
 }
 
-/// What honest nodes do.
+/// An action of honest nodes.
 #[derive(Clone, Copy, Debug)]
 enum Honest {
     Nothing(Duration),
@@ -56,7 +56,7 @@ enum Honest {
     Rotate,
 }
 
-/// What the adversary does, over one of its links.
+/// An action of the adversary, over one of its links.
 #[derive(Clone, Copy, Debug)]
 enum Hostile {
     /// Plays recorded frames again, the last ones or any.
@@ -83,7 +83,7 @@ enum Hostile {
     Restart,
 }
 
-/// What the adversary keeps back on its links.
+/// Frames that the adversary keeps back on its links.
 #[derive(Default)]
 struct Hold {
     is_on: bool,
@@ -100,19 +100,19 @@ struct Run {
     rogues: Vec<NodeKey>,
     attached: Vec<(NodeKey, NodeKey)>,
     hold: Rc<RefCell<Hold>>,
-    /// Who wants what of whom.
+    /// Uses: user, owner, topic.
     uses: BTreeSet<(NodeKey, NodeKey, String)>,
     topics: usize,
-    /// Who has to get what, and until when.
+    /// Members that have to get each message, and the time by which they have to.
     expected: BTreeMap<MessageId, (BTreeSet<NodeKey>, Duration)>,
-    /// What each member announced, as far as it was looked for, and the siege under way.
+    /// Announcements of each member, as far as they were looked for, and the siege under way.
     announced: BTreeMap<NodeKey, Vec<Control>>,
     announced_to: usize,
     siege: Option<(NodeKey, NodeKey, NodeKey)>,
     lists: Vec<Bytes>,
     is_revoked: bool,
     seq: u64,
-    /// How much of the log was looked at.
+    /// Number of log entries that were looked at.
     looked_at: usize,
     actions: usize,
 }
@@ -244,7 +244,7 @@ impl Run {
                 self.pass(Duration::from_secs(5), true);
             }
             Honest::RestartMember(node) | Honest::RestartRouter(node) => {
-                // What is under way to one that stops need not arrive.
+                // Messages under way to a node that stops need not arrive.
                 self.pass(MESSAGE_MAX, true);
                 self.world.restart(node);
                 self.pass(GRACE, false);
@@ -619,7 +619,7 @@ impl Run {
                 continue;
             }
             let fine = match &dropped.reason {
-                // What crossed the word of a revocation, or is of a fleet that this node does not know.
+                // The frame crossed the news of a revocation, or is of a fleet that this node does not know.
                 DropReason::NotVerified {
                     why: SignedError::Cert(CertError::Revoked { .. } | CertError::UnknownIssuer),
                     ..

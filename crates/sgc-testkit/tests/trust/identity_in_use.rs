@@ -10,7 +10,7 @@ use sgc_testkit::{MessageId, NodeKey, Sharing, What, World};
 
 use crate::ms;
 
-/// How often a node that lost its link dials again: no patience at all.
+/// Interval at which a node that lost its link dials again: no patience at all.
 const REDIAL: Duration = ms(250);
 
 /// A robot behind `east`, and two processes of `desk`, of which only the first runs and is linked to `east`.
@@ -56,7 +56,7 @@ impl Twins {
         })
     }
 
-    /// How often a router closed a link for another run, by whether the closed one was known to live.
+    /// Counts the links that a router closed for another run, by whether the closed one was known to live.
     fn superseded(&self, router: NodeKey) -> BTreeMap<bool, usize> {
         let mut closed = BTreeMap::new();
         for logged in self.world.log().iter().filter(|logged| logged.node == router) {
@@ -97,7 +97,7 @@ fn the_process_that_was_started_last_keeps_the_link_and_no_message_comes_twice()
     assert!(of_twin.len() >= both.len() - 5 && of_twin.windows(2).all(|two| two[0] < two[1]));
     twins.assert_each_once();
 
-    // When the other is gone it is let in again, and what the other had stays the other's.
+    // It is let in again after the other has gone, and the other keeps its messages.
     twins.world.crash(twin);
     let after = twins.publish(ms(10_000), routers);
     twins.world.run(ms(2000));
