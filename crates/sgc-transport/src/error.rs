@@ -275,7 +275,7 @@ pub enum LinkError {
         "the connection was cut: the peer was stopped or restarted, or something between the two ended it"
     )]
     Cut,
-    /// What came is not what the peer sent.
+    /// The bytes that came are not those that the peer sent.
     #[error("what came was altered on the way: somebody, or a broken device, is between the two nodes")]
     Altered,
     /// The peer is there and has forgotten the link.
@@ -452,7 +452,7 @@ pub enum Refusal {
     TooManyFromAddress {
         /// The address.
         prefix: AddressPrefix,
-        /// How many connect from it.
+        /// Number of connection attempts from it.
         pending: usize,
     },
     /// It refused us, or gave up.

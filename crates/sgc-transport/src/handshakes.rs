@@ -26,7 +26,7 @@ pub(crate) struct Handshakes<T> {
     places: Places<T>,
 }
 
-/// What a listener does with a newcomer.
+/// A listener's decision on a newcomer.
 pub(crate) struct Entry<T> {
     /// The newcomer has a place; else it is to be turned away.
     pub(crate) is_admitted: bool,

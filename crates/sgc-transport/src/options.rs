@@ -22,7 +22,7 @@ pub struct LinkOptions {
     pub receive_window_bytes: u32,
     /// The same for one flow; at most half of what the link has.
     pub flow_window_bytes: u32,
-    /// What the windows of all links come from. Clones of these settings share it.
+    /// The budget for the windows of all links. Clones of these settings share it.
     pub receive_budget: ReceiveBudget,
     /// Most bytes that we may have sent and the peer not acknowledged, all flows of a link together.
     pub send_window_bytes: u32,
@@ -50,7 +50,7 @@ pub struct LinkOptions {
     /// Whether links over UDP look for the longest packet that the path carries; else they stay at 1200 bytes. What DTLS
     /// carries is at most 1340 bytes long.
     pub mtu_discovery: bool,
-    /// Whether DTLS 1.2 is spoken with listeners that have no 1.3. Anyone on the way can then make a dialer fall back to it, and
+    /// `true` to speak DTLS 1.2 with listeners that have no 1.3. Anyone on the way can then make a dialer fall back to it, and
     /// sees the certificates of both ends.
     pub dtls12: bool,
     /// The code point of differentiated services (RFC 2474), 0 to 63, that everything a link sends is marked with.

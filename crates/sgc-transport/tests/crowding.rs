@@ -140,7 +140,7 @@ async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str
     assert!(server.metrics.refused(RefusalKind::TooMany) >= 1, "one of theirs gave way");
 }
 
-/// How long a packet is not taken where the far end takes no more.
+/// Time without progress after which the far end takes no more.
 const STUCK: Duration = Duration::from_millis(500);
 
 /// However many peers send and are not read, the node holds what its budget says.
@@ -152,7 +152,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let receive_budget = ReceiveBudget::new(BUDGET_BYTES);
     let options = LinkOptions { receive_budget: receive_budget.clone(), ..LinkOptions::default() };
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options);
-    // What they have under way counts as received here: so it is little.
+    // Bytes that they have under way count as received here: so they are few.
     let sends = LinkOptions { send_window_bytes: 64 << 10, ..LinkOptions::default() };
     let dialer = Dialer::new(arm, sends, Default::default());
     let (mut links, mut senders) = (Vec::new(), tokio::task::JoinSet::new());
@@ -183,7 +183,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let granted = receive_budget.granted_bytes();
     // 8 + 4 + 2.7 + 2 + 1.6 + 1.3 + 1.1 + 5 · 1 MiB.
     assert!(granted < 27 << 20, "{granted} bytes granted");
-    // What waits at the senders is theirs: as much as is under way, and what is queued for each flow.
+    // Bytes that wait at the senders are theirs: those under way, and the queue of each flow.
     let waiting = LINKS * (1 << 20);
     assert!(taken <= granted + waiting, "{taken} bytes taken of {granted} granted");
     drop((links, dialer));

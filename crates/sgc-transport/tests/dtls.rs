@@ -387,11 +387,11 @@ async fn a_node_that_is_another_inside_gets_no_link() {
 /// A NAT with one address towards the listener, which several dialers may share.
 struct SharedAddress {
     url: LinkUrl,
-    /// Where the listener sees all of them.
+    /// The socket at which the listener sees all of them.
     outside: Arc<tokio::net::UdpSocket>,
-    /// Who gets what the listener sends, latest first.
+    /// Dialers that get the listener's datagrams, latest first.
     dialers: Arc<std::sync::Mutex<Vec<std::net::SocketAddr>>>,
-    /// How many of them get it.
+    /// Number of them that get each datagram.
     copies: Arc<std::sync::atomic::AtomicUsize>,
     task: tokio::task::JoinHandle<()>,
 }

@@ -512,9 +512,9 @@ async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else(
 
 /// A relay between two ends of TCP whose owner decides, piece by piece, what reaches the listener.
 struct Interceptor {
-    /// What the dialer sent.
+    /// The bytes that the dialer sent.
     sent: tokio::sync::mpsc::Receiver<Vec<u8>>,
-    /// What the listener is to get.
+    /// The way to the listener.
     to_listener: tokio::net::tcp::OwnedWriteHalf,
 }
 
@@ -552,7 +552,7 @@ impl Interceptor {
         let url = format!("{scheme}://{addr}").parse().unwrap();
         let near = dial(identity, &url).await.unwrap();
         let far = server.link().await;
-        // What both say of themselves is through.
+        // The greetings of both are through.
         for (from, to) in [(&near, &far), (&far, &near)] {
             from.send_control("ready".into()).await.unwrap();
             assert_eq!(soon(to.recv_control()).await.unwrap(), "ready");
@@ -562,7 +562,7 @@ impl Interceptor {
         (Self { sent, to_listener }, near, far)
     }
 
-    /// What the dialer sends until this is in it.
+    /// Returns the dialer's bytes up to and with this text.
     async fn wait_for(&mut self, text: &[u8]) -> Vec<u8> {
         let mut all = Vec::new();
         while !contains(&all, text) {
@@ -574,7 +574,7 @@ impl Interceptor {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nobody_between_two_ends_of_tcp_alters_injects_or_repeats_anything() {
-    /// What an attacker makes of what the dialer sent, given the position of a control frame in it.
+    /// Alters the dialer's bytes as an attacker does, given the position of a control frame in them.
     type Attack = fn(&[u8], usize) -> Vec<u8>;
     let attacks: [(&str, Attack); 5] = [
         ("alters a control frame", |sent, at| {

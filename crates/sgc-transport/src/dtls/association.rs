@@ -89,7 +89,7 @@ pub(super) struct Sink {
     pub(super) data_lens: Vec<usize>,
     /// The token that a dialer has repeated.
     pub(super) proof: Option<Token>,
-    /// What dimpl writes into, [`OUTPUT_BYTES`] long once it was used.
+    /// The buffer that dimpl writes into, [`OUTPUT_BYTES`] long once it was used.
     output: Vec<u8>,
 }
 
@@ -228,7 +228,7 @@ pub(super) struct Association {
     is_claimed: bool,
     stage: Stage,
     certificate: Option<CertificateDer<'static>>,
-    /// Who a listener is, as its certificate says: a dialer judges it before it shows its own.
+    /// The listener's identity by its certificate: a dialer judges it before it shows its own.
     listener: Option<Box<VerifiedPeer>>,
     /// The beginning of the random of the dialer's hello.
     echo: Option<Echo>,
@@ -354,7 +354,7 @@ impl Association {
         }
         let is_late = now >= self.started + self.handshake_timeout;
         match &mut self.stage {
-            // Who forges the answer of an old listener changes no more than this word.
+            // Forging the answer of an old listener changes no more than this word.
             Stage::Handshake if is_late && self.has_met_dtls12 => self.end(End::OldVersion),
             Stage::Handshake if is_late => self.end(End::TimedOut),
             Stage::Asking { .. } if is_late => self.end(End::NotOurs),
@@ -537,7 +537,7 @@ impl Association {
                 Output::Connected => self.connected(now),
                 Output::PeerCert(leaf) => {
                     if let Err(why) = self.take_certificate(leaf) {
-                        // What dimpl has to send holds our own certificate in DTLS 1.2, and stays there.
+                        // In DTLS 1.2 the pending output of dimpl holds our own certificate, and stays there.
                         self.refuse_early(why, sink);
                         break;
                     }
@@ -650,7 +650,7 @@ impl Association {
     }
 }
 
-/// What the peer is told of a certificate of its own that is refused (RFC 8446, 6.2).
+/// Returns the alert for a refused certificate of the peer (RFC 8446, 6.2).
 fn tls_alert(why: &CertError) -> u8 {
     u8::from(AlertDescription::from(tls::alert(why)))
 }

@@ -26,7 +26,7 @@ const ROUNDS_MAX: usize = 12;
 const RECORD_HEAD_BYTES: usize = 13;
 const HANDSHAKE_HEAD_BYTES: usize = 12;
 
-/// Who meets in a script.
+/// The ends that meet in a script.
 #[derive(Debug)]
 pub struct HandshakeExercise {
     credentials: CredentialStore,
@@ -35,7 +35,7 @@ pub struct HandshakeExercise {
     member: Arc<Identity>,
 }
 
-/// What a script says next; 0 where it is over.
+/// The rest of a script; it reads as 0 once it is over.
 struct Script<'a>(&'a [u8]);
 
 impl<'a> Script<'a> {
@@ -102,7 +102,7 @@ impl Peer {
 struct Meeting<'a> {
     association: Association,
     is_dialer: bool,
-    /// What nobody but a member is to see in the clear.
+    /// Bytes that nobody but a member is to see in the clear.
     secret: &'a [u8],
     is_member: bool,
     peer: Peer,

@@ -1,4 +1,4 @@
-//! Where the peer of one association is, as far as it has proved it: logic without IO.
+//! Addresses of the peer of one association, as far as it has proved them: logic without IO.
 //!
 //! A datagram proves who sent it and not where it comes from, since everybody can write any source address. So a listener
 //! asks the peer of an association to repeat a token that it sends to the new address, inside of the association
@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 
 use super::front::Token;
 
-/// How many addresses one association is reached at: the present one, and those that it may just have left.
+/// Most addresses at which one association is reached: the present one, and those that it may just have left.
 pub(super) const ROUTES_MAX: usize = 3;
-/// How soon a token is sent again; it doubles.
+/// Time until a token is sent again; it doubles.
 const PROBE_INTERVAL: Duration = Duration::from_millis(200);
-/// How often a token is sent. The last one has as long again.
+/// Most times that a token is sent. The last one has as long again.
 const PROBES_MAX: u32 = 4;
-/// How long the owner of an address may take to repeat a token.
+/// Longest time that the owner of an address may take to repeat a token.
 const CONTEST_PATIENCE: Duration = Duration::from_secs(2);
 
 /// A token under way to an address.
@@ -28,7 +28,7 @@ struct Probe {
     token: Token,
     sent: u32,
     next: Instant,
-    /// When it no longer counts.
+    /// Time from which it no longer counts.
     end: Instant,
 }
 
@@ -95,17 +95,17 @@ impl Paths {
         Self { addresses: vec![address], is_displaced: false, moving: None, contest: None }
     }
 
-    /// Where the peer is.
+    /// Returns the present address of the peer.
     pub(super) fn present(&self) -> SocketAddr {
         self.addresses[0]
     }
 
-    /// Where the peer is and where it has been.
+    /// Returns the present address of the peer and its earlier ones.
     pub(super) fn all(&self) -> &[SocketAddr] {
         &self.addresses
     }
 
-    /// Where something goes that is meant for this address of the peer.
+    /// Returns the destination of a datagram that is meant for this address of the peer.
     pub(super) fn forward(&self, address: SocketAddr) -> SocketAddr {
         if self.is_displaced || !self.addresses.contains(&address) { address } else { self.present() }
     }
@@ -178,7 +178,7 @@ impl Paths {
         Some(Loss { address: probe.address, claimant })
     }
 
-    /// When [`Self::poll`] and [`Self::expire`] have something to do.
+    /// Returns the time at which [`Self::poll`] and [`Self::expire`] have something to do.
     pub(super) fn due(&self) -> Option<Instant> {
         let contest = self.contest.as_ref().map(|(probe, _)| probe.due());
         let moving = self.moving.as_ref().map(Probe::due);

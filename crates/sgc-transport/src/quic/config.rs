@@ -56,7 +56,7 @@ const DTLS_MTU: u16 = 1340;
 const RESET_DOMAIN: &[u8] = b"sgc stateless reset v1";
 const CONNECTION_ID_BYTES: usize = 8;
 
-/// What belongs to one connection besides its settings.
+/// The state of one connection besides its settings.
 pub(crate) struct Parts {
     pub(crate) findings: Arc<Findings>,
     pub(crate) gate: Arc<Gate>,

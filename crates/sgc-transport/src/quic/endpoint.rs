@@ -145,7 +145,7 @@ impl QuicListener {
     fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
         let pending = self.places.pending();
-        // Where all places are taken, a peer that cannot be asked for proof displaces nobody.
+        // A peer that cannot be asked for proof displaces nobody once all places are taken.
         if pending >= handshakes_unvalidated_max.min(handshakes_max) && incoming.may_retry() {
             // Cannot fail after `may_retry`.
             let _ = incoming.retry();
@@ -374,7 +374,7 @@ async fn hear_greeting(rx: &mut ControlRx) -> Result<Greeting, LinkError> {
     Ok(Greeting::from_slice(&frame).map_err(ProtocolError::Greeting)?)
 }
 
-/// What a link keeps until it ends.
+/// Resources that a link keeps until it ends.
 struct Held {
     fate: Arc<Fate>,
     places: Arc<Places>,

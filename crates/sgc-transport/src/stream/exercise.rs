@@ -22,14 +22,14 @@ use crate::link::Link;
 use crate::options::LinkOptions;
 use crate::url::{DEFAULT_PATH, LinkUrl, Scheme};
 
-/// How long a handshake may take: what is altered on the way can leave both ends waiting for each other.
+/// Longest handshake: bytes altered on the way can leave both ends waiting for each other.
 const HANDSHAKE_MAX: Duration = Duration::from_millis(200);
 /// Bytes that wait between two ends.
 const PIPE_BYTES: usize = 64 << 10;
 const MTU_BYTES: u16 = 1448;
-/// How long one conversation may take. Longer is a defect: each of its ends is closed.
+/// Longest conversation. Longer is a defect: each of its ends is closed.
 const CONVERSATION_MAX: Duration = Duration::from_secs(30);
-/// How long a listener waits for a peer that says nothing more.
+/// Time that a listener waits for a peer that says nothing more.
 const SILENCE: Duration = Duration::from_millis(3);
 /// Control frames that each honest end sends.
 const FRAMES: u8 = 3;
@@ -41,7 +41,7 @@ pub struct DoorExercise {
     options: LinkOptions,
 }
 
-/// What the first byte of a script chooses.
+/// The mode that the first byte of a script chooses.
 #[derive(Clone, Copy)]
 enum Mode {
     /// The script is what a stranger says.
@@ -206,7 +206,7 @@ async fn converse(link: &super::StreamLink) {
     read_all(link).await;
 }
 
-/// What becomes of the stream, so many bytes behind the step before.
+/// A change of the stream, so many bytes behind the step before.
 #[derive(Clone, Copy)]
 struct Step {
     after: usize,

@@ -27,7 +27,7 @@ const RECORDS_MAX: u64 = 1 << 40;
 const PENDING_BYTES: usize = 64 << 10;
 /// Bytes read at once, at least.
 const READ_BYTES: usize = 32 << 10;
-/// What the keys are exported under (RFC 8446, 7.5); the context says who seals with them.
+/// Label that the keys are exported under (RFC 8446, 7.5); the context says which end seals with them.
 const EXPORTER: &[u8] = b"EXPORTER-SGC-tcp-records";
 const FROM_DIALER: &[u8] = b"dialer";
 const FROM_LISTENER: &[u8] = b"listener";
@@ -127,12 +127,12 @@ pub(super) struct Tagged {
     /// Records that are to be written, and how much of them was.
     out: Vec<u8>,
     written: usize,
-    /// What came: verified content that is to be handed out, then what is not whole yet, up to `filled`.
+    /// Received bytes: verified content that is to be handed out, then an incomplete record, up to `filled`.
     input: Box<[u8]>,
     filled: usize,
-    /// Where the verified content that is left begins and ends.
+    /// Beginning and end of the verified content that is left.
     ready: (usize, usize),
-    /// Where the next record begins.
+    /// Beginning of the next record.
     next: usize,
     /// Nothing is handed on after an error.
     failure: Option<RecordError>,
@@ -239,7 +239,7 @@ impl AsyncRead for Tagged {
                 Ok(false) => {}
                 Err(failure) => {
                     this.failure = Some(failure);
-                    // What came before it is good.
+                    // The content before it is good.
                     return Poll::Ready(if has_some { Ok(()) } else { Err(failure.into()) });
                 }
             }
@@ -277,7 +277,7 @@ impl AsyncWrite for Tagged {
         let taken = this.queue(bufs)?;
         match this.poll_out(cx) {
             Poll::Ready(Err(error)) => Poll::Ready(Err(error)),
-            // What the stream does not take now, flushing writes.
+            // Flushing writes the bytes that the stream does not take now.
             Poll::Ready(Ok(())) | Poll::Pending => Poll::Ready(Ok(taken)),
         }
     }
@@ -327,7 +327,7 @@ mod tests {
         all
     }
 
-    /// What the far end makes of these bytes, all that it hands on first.
+    /// Returns the content that the far end hands on of these bytes, and its last result.
     async fn read(bytes: &[u8]) -> (Vec<u8>, io::Result<usize>) {
         let [_, far] = keys(&AES_128_GCM);
         let mut tagged = Tagged::new(Box::new(io::Cursor::new(bytes.to_vec())), far);
@@ -397,7 +397,7 @@ mod tests {
             assert_eq!(got, b"first", "who {attack}");
             assert!(is_altered(&end), "who {attack}: {end:?}");
         }
-        // What was sent one way is nothing the other way.
+        // A record that was sent one way does not verify the other way.
         let [near, _] = keys(&AES_128_GCM);
         let mut tagged = Tagged::new(Box::new(io::Cursor::new(first)), near);
         assert!(is_altered(&tagged.read_to_end(&mut Vec::new()).await));

@@ -37,7 +37,7 @@ impl LongCertificate {
     }
 }
 
-/// What a stranger met.
+/// A meeting of a stranger with a dialer or listener.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Encounter {
     /// The certificate that it was shown, DER.
@@ -166,7 +166,7 @@ impl FakeListener {
         Self { addr, stop, thread: Some(thread) }
     }
 
-    /// What it met.
+    /// Returns its encounters.
     pub fn stop(mut self) -> Vec<Encounter> {
         self.stop.store(true, Relaxed);
         self.thread.take().unwrap().join().unwrap()
