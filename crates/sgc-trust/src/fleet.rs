@@ -38,7 +38,7 @@ pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
 pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
 /// How long before its making a certificate begins to hold: clocks of machines differ by minutes.
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
-/// How much later a node is seen again before a roster takes note of it: it is written as a whole.
+/// Least time between two sightings of a node that a roster takes note of: it is written as a whole.
 pub const SEEN_STEP: Duration = Duration::from_secs(86_400);
 /// A node that was seen within this time counts as one that may come back.
 pub const SEEN_RECENTLY: Duration = Duration::from_secs(30 * 86_400);
@@ -273,7 +273,7 @@ impl Fleet {
         Ok(absorbed)
     }
 
-    /// What people call the node that certificates call so: its name, if this copy has it, or the beginning of that.
+    /// Returns the name of the node with this pseudonym if this copy has it, or else the beginning of the pseudonym.
     fn name_of(&self, pseudonym: &Pseudonym) -> String {
         self.node_by_pseudonym(pseudonym).map_or_else(|| pseudonym.short(), |n| n.name.to_string())
     }
@@ -570,7 +570,7 @@ impl Fleet {
     }
 }
 
-/// What a copy of a fleet's file gained by a merge.
+/// The gain of a copy of a fleet's file by a merge.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Merged {
     /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
@@ -613,7 +613,7 @@ impl Merged {
     }
 }
 
-/// What revocation lists told a copy of a fleet's file that did not know it.
+/// News that revocation lists brought to a copy of a fleet's file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Absorbed {
     /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.

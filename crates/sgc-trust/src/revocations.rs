@@ -1,4 +1,4 @@
-//! What a CA has taken back: by node and incarnation, which only grows, and by serial number.
+//! Revocations by a CA: by node and incarnation, which only grows, and by serial number.
 //!
 //! It decides what is kept of the lists of a CA and what they revoke together. Reading and checking a list is the
 //! business of `crl.rs`, writing one that of `issue.rs`.
@@ -92,7 +92,7 @@ pub(crate) struct CaLists {
     plain: Option<Arc<RevocationList>>,
     /// Lists of a fleet, by rising number. They count together, and none of them is covered by the others.
     fleet: Vec<Arc<RevocationList>>,
-    /// What those revoke together.
+    /// The union of their revocations.
     nodes: Arc<RevokedNodes>,
 }
 

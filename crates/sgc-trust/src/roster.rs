@@ -33,9 +33,9 @@ const VERSION_1: u8 = 1;
 pub struct RosterNode {
     /// Its name.
     pub name: NodeName,
-    /// How often it was enrolled again after it had been revoked.
+    /// Number of times that it was enrolled again after a revocation.
     pub incarnation: u32,
-    /// When its groups and role were last said.
+    /// Time at which its groups and role were last set.
     pub changed: UnixMillis,
     /// Its groups, sorted.
     pub groups: Vec<GroupName>,
@@ -45,7 +45,7 @@ pub struct RosterNode {
     pub may_route: bool,
     /// The newest generation of the naming secret that it was handed; 0 if that is unknown, or if it has none.
     pub generation: u32,
-    /// When the fleet last handed it something: a certificate, or secrets.
+    /// Time at which the fleet last handed it something: a certificate, or secrets.
     pub seen: Option<UnixMillis>,
     /// Its certificates, those that hold longest last; those that are over are forgotten after a day.
     pub certificates: Vec<IssuedCertificate>,
@@ -130,10 +130,10 @@ pub struct Generation {
     pub(crate) hash: [u8; 32],
 }
 
-/// What nodes are told when they are enrolled or renewed.
+/// Settings that nodes get when they are enrolled or renewed.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Settings {
-    /// When they were last changed.
+    /// Time of their last change.
     pub(crate) changed: UnixMillis,
     pub(crate) authority: Option<NodeName>,
     pub(crate) post_quantum: bool,

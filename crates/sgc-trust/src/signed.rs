@@ -17,7 +17,7 @@ use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, nam
 
 /// How far a signer's clock may be from the verifier's.
 pub const CLOCK_SKEW_MAX: Duration = Duration::from_secs(10 * 60);
-/// How far a sequence number, which counts milliseconds, may be ahead of the time of signing: ten years, more than any clock
+/// Most that a sequence number, which counts milliseconds, may be ahead of the time of signing: ten years, more than any clock
 /// that was once wrong. Without a bound, one number would leave its node no greater one.
 pub const SEQ_AHEAD_MAX: Duration = Duration::from_secs(10 * 365 * 86_400);
 

@@ -289,7 +289,7 @@ pub struct VerifiedPeer {
     pub node_id: NodeId,
     /// What its certificate calls it.
     pub pseudonym: Pseudonym,
-    /// How often it was enrolled again after it had been revoked.
+    /// Number of times that it was enrolled again after a revocation.
     pub incarnation: u32,
     /// Its groups, sorted, each once.
     pub groups: Arc<[GroupTag]>,

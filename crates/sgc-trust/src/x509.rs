@@ -281,7 +281,7 @@ impl<'a> ListFields<'a> {
         Some(Self { tbs, algorithm, signature, issuer, number, is_scoped, revoked_nodes })
     }
 
-    /// What is signed of a list made anew, with this value of the extension that revokes nodes behind its other
+    /// Returns the signed part of a list made anew, with this value of the extension that revokes nodes behind its other
     /// extensions: `list` is one that has extensions and not this one.
     pub(crate) fn tbs_with_revoked_nodes(list: &[u8], value: &[u8]) -> Option<Vec<u8>> {
         let mut fields = Der(list).enter(SEQUENCE)?.enter(SEQUENCE)?;

@@ -457,7 +457,7 @@ fn a_roster_knows_who_was_handed_which_secret() {
     let arm = kept.node(&name("arm-1")).unwrap();
     assert_eq!((arm.generation, arm.seen), (2, Some(now(3))));
     assert_eq!(kept.node(&name("cloud")).unwrap().generation, 0);
-    // Who was not seen for long is not waited for, nor who has no certificate that holds.
+    // A node that was not seen for long is not waited for, nor one without a valid certificate.
     assert_eq!(lacking(&fleet, 30), ["desk"]);
     assert!(lacking(&fleet, 31).is_empty());
     fleet.renew(&name("desk"), Duration::from_secs(86_400), now(40), &mut rng(4)).unwrap();

@@ -308,7 +308,7 @@ fn a_node_whose_certificate_is_a_cas_is_refused_and_so_is_what_it_signs() {
     let node = format!("sgc:node:{}", Pseudonym([0xab; 32]));
     let victim = format!("sgc:node:{}", Pseudonym([1; 32]));
     let top = Issuer::from_params(&ca.params, &ca.key);
-    // What `openssl x509 -req -copy_extensions copyall` makes of a request with CA:TRUE.
+    // The certificate that `openssl x509 -req -copy_extensions copyall` makes of a request with CA:TRUE.
     let key = KeyPair::generate().unwrap();
     let mut params = CertificateParams::default();
     params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);

@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use super::prefix::AddressPrefix;
 
-/// How long an engaged handshake keeps its place against others of sources that hold as many. It is longer than an
+/// Time that an engaged handshake keeps its place against others of sources that hold as many. It is longer than an
 /// honest handshake takes, so that a herd of honest peers does not evict itself.
 pub const PLACE_HELD_MIN: Duration = Duration::from_secs(1);
 
-/// How many handshakes may be under way.
+/// Bounds on the handshakes under way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaceLimits {
     /// From all addresses together.
@@ -25,17 +25,17 @@ pub enum Crowded {
     Prefix {
         /// The address.
         prefix: AddressPrefix,
-        /// How many it holds.
+        /// Number of places that it holds.
         held: usize,
     },
     /// All places are taken.
     All {
-        /// How many there are.
+        /// Number of places in all.
         held: usize,
     },
 }
 
-/// What becomes of a peer that asks for a place.
+/// The decision on a peer that asks for a place.
 #[derive(Debug, PartialEq, Eq)]
 pub enum PlaceDecision<T> {
     /// There is room.

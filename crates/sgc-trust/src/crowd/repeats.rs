@@ -1,4 +1,4 @@
-//! What a log says of events that strangers cause: the first of each kind and address, then a count.
+//! Log entries for events that strangers cause: the first of each kind and address, then a count.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -32,7 +32,7 @@ struct Window {
 pub struct Repeated<K> {
     /// The address and the kind; `None` stands for all addresses that were not told apart.
     pub source: Option<(AddressPrefix, K)>,
-    /// How many events.
+    /// Number of events.
     pub count: u64,
     /// In how long.
     pub within: Duration,
