@@ -33,7 +33,7 @@ pub enum GrantContent {
     Credentials(Credentials),
     /// What the types of interfaces look like, as far as it was asked for and is known.
     Types(Vec<DescribedType>),
-    /// What came of an operation on a fleet; from its authority.
+    /// The result of an operation on a fleet; from its authority.
     Operation(OperationAnswer),
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::ids::{Now, UnixMillis};
 
-/// How far the wall clock moves against the monotonic one until that counts as having been set.
+/// Least move of the wall clock against the monotonic one that counts as having been set.
 const STEP_MIN: Duration = Duration::from_secs(60);
 
 /// Notices that the wall clock was set: by NTP some time after the start, by a user, or while the machine slept.

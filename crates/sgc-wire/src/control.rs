@@ -223,7 +223,7 @@ pub struct Hello {
     pub transit: bool,
     /// True if another run of this node has taken a link of this one over: this run takes over from nobody.
     pub yields: bool,
-    /// When this run began, by its own clock: the floor in its link states.
+    /// Beginning of this run, by its own clock: the floor in its link states.
     pub started: UnixMillis,
 }
 

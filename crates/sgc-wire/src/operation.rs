@@ -72,7 +72,7 @@ pub enum Operation {
         may_route: bool,
         /// True if it may have been revoked before.
         again: bool,
-        /// How long its certificate is to hold, milliseconds.
+        /// Validity asked for its certificate, milliseconds.
         valid_ms: u64,
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
@@ -81,7 +81,7 @@ pub enum Operation {
     Renew {
         /// Its name.
         node: String,
-        /// How long the certificate is to hold, milliseconds.
+        /// Validity asked for the certificate, milliseconds.
         valid_ms: u64,
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
@@ -160,7 +160,7 @@ pub struct RosterRow {
     pub name: String,
     /// Its node id.
     pub id: NodeId,
-    /// How often it was enrolled again after it had been revoked.
+    /// Number of times that it was enrolled again after a revocation.
     pub incarnation: u32,
     /// Its groups.
     pub groups: Vec<String>,
@@ -174,7 +174,7 @@ pub struct RosterRow {
     pub revoked: Option<UnixMillis>,
     /// The newest generation of the naming secret that it was handed; 0 if that is unknown or it has none.
     pub generation: u32,
-    /// When the fleet last heard of it, as far as is known.
+    /// Time at which the fleet last heard of it, as far as is known.
     pub seen: Option<UnixMillis>,
     /// Its certificates.
     pub certificates: Vec<RowCertificate>,
