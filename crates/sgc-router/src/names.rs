@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
-use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed};
+use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::limits::QUERY_EVERY;
@@ -18,7 +18,7 @@ use crate::mapping::{Ask, Known};
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::shares::Shares;
-use crate::topology::cost_differs;
+use crate::topology::{NodeRecord, cost_differs};
 
 /// For how long one who asked is told of what becomes known.
 const QUERY_LEASE: Duration = Duration::from_secs(60);
@@ -42,6 +42,7 @@ pub(crate) struct Record {
     withdraw: bool,
     names: Box<[Name]>,
     signed: Signed,
+    issued_at: UnixMillis,
     digest: [u8; 32],
     /// End of its lease; of a withdrawal, the time from which nothing that it withdrew verifies.
     expires: Instant,
@@ -130,6 +131,8 @@ pub(crate) struct Names {
     words: BTreeMap<Name, RecordId>,
     records: BTreeMap<RecordId, Record>,
     expiries: BTreeSet<(Instant, RecordId)>,
+    /// The middle of the lease of each advertisement.
+    renewals: BTreeSet<(Instant, RecordId)>,
     seen: BTreeMap<[u8; 32], RecordId>,
     owners: BTreeMap<NodeId, OfOwner>,
     next_id: RecordId,
@@ -197,7 +200,8 @@ impl Names {
     pub(crate) fn deadlines(&self) -> impl Iterator<Item = Instant> {
         let expiry = self.expiries.first().map(|(at, _)| *at);
         let ask = self.ask_at.first().map(|(at, _)| *at);
-        [expiry, ask, self.memory.deadline(), self.prune_at].into_iter().flatten()
+        let renewal = self.renewals.first().map(|(at, _)| *at);
+        [expiry, ask, renewal, self.memory.deadline(), self.prune_at].into_iter().flatten()
     }
 
     /// The number of the next record.
@@ -385,6 +389,7 @@ impl Router {
             withdraw,
             names: advert.names.into(),
             signed: signed.clone(),
+            issued_at: advert.body.issued_at,
             digest,
             expires,
             renewal_due: now.instant + expires.saturating_duration_since(now.instant) / 2,
@@ -477,6 +482,9 @@ impl Router {
         self.names.next_id += 1;
         self.names.seen.insert(record.digest, id);
         self.names.expiries.insert((record.expires, id));
+        if self.config.transit && !record.withdraw && record.owner.node_id != self.config.node {
+            self.names.renewals.insert((record.renewal_due, id));
+        }
         let of_owner = self.names.owners.entry(record.owner.node_id).or_default();
         of_owner.of_kind(record.withdraw).0.insert((record.seq, id));
         of_owner.bytes += record.bytes();
@@ -541,6 +549,7 @@ impl Router {
         let Some(record) = self.names.records.remove(&id) else { return };
         self.names.seen.remove(&record.digest);
         self.names.expiries.remove(&(record.expires, id));
+        self.names.renewals.remove(&(record.renewal_due, id));
         self.names.waits_no_more(&owner, id);
         if let Some(of_owner) = self.names.owners.get_mut(&owner) {
             of_owner.of_kind(withdraw).0.remove(&(record.seq, id));
@@ -676,7 +685,9 @@ impl Router {
         if self.config.transit {
             for name in news {
                 let record = self.names.record(&name);
-                let needs = self.way(&name).is_none() || record.is_some_and(|r| r.asked.is_some());
+                let is_late = |r: &Record| r.asked.is_some() || r.renewal_due <= now.instant;
+                let needs = self.way(&name).is_none()
+                    || record.is_some_and(|r| is_late(r) && r.owner.node_id != self.config.node);
                 // Another may have come for it before, and have many before it.
                 let due = self.names.asking.get(&name).copied();
                 if needs && due.is_none_or(|at| at > now.instant + QUERY_EVERY) {
@@ -774,15 +785,19 @@ impl Router {
         self.names.records.range(from..end).find(|(_, record)| told(record)).map(|(id, _)| *id)
     }
 
-    /// An advertisement, and the withdrawals of those of its names that do not hold any more.
+    /// An advertisement, and the withdrawals of those of its names that do not hold any more; nothing if it would not be believed.
     pub(crate) fn record_frames(&self, id: RecordId, cost: u32) -> Vec<Control> {
-        let Some(record) = self.names.records.get(&id) else { return Vec::new() };
+        let record = self.names.records.get(&id).filter(|record| self.verifies_elsewhere(record.issued_at));
+        let Some(record) = record else { return Vec::new() };
         let mut frames = vec![Control::Advert { cost, signed: record.signed.clone() }];
         if record.live < record.names.len() {
             let mut withdrawals = BTreeMap::new();
             for name in &record.names {
                 let word = self.names.words.get(name).and_then(|id| self.names.records.get(id));
-                if let Some(newer) = word.filter(|word| word.withdraw && word.seq > record.seq) {
+                let is_newer = |word: &&Record| {
+                    word.withdraw && word.seq > record.seq && self.verifies_elsewhere(word.issued_at)
+                };
+                if let Some(newer) = word.filter(is_newer) {
                     withdrawals.insert(newer.seq, newer.signed.clone());
                 }
             }
@@ -1057,7 +1072,8 @@ impl Router {
         let new = state.follows.insert(*owner, until).is_none();
         self.names.prune_at.get_or_insert(until);
         // Routers are known to all; and who follows is told of changes.
-        if let Some(record) = self.topology.node(owner).filter(|r| new && !r.transit) {
+        let is_told = |r: &&NodeRecord| new && !r.transit && self.verifies_elsewhere(r.issued_at);
+        if let Some(record) = self.topology.node(owner).filter(is_told) {
             let signed = record.signed.clone();
             self.send(link, Control::LinkState { signed });
         }
@@ -1115,9 +1131,9 @@ impl Router {
             self.names.ask_at.remove(&(at, name));
             let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
                 None => Known::No,
+                // The first to answer, or one that told it unasked, may keep back a later one.
+                Some(record) if record.renewal_due <= now.instant => Known::No,
                 Some(record) => match record.asked {
-                    // The first to answer may keep back a later answer.
-                    Some(_) if record.renewal_due <= now.instant => Known::No,
                     Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
                     Some(_) => Known::No,
                     None => Known::Told,
@@ -1160,7 +1176,26 @@ impl Router {
 
     // ---- Time and trust.
 
+    /// All are asked for the wanted names of advertisements of which half of the lease is over: owners renew after a third, so
+    /// whoever told them may keep the renewal back.
+    fn ask_for_renewals(&mut self, now: Instant) {
+        while let Some((at, id)) = self.names.renewals.first().copied().filter(|(at, _)| *at <= now) {
+            self.names.renewals.remove(&(at, id));
+            let Some(record) = self.names.records.get(&id) else { continue };
+            let is_wanted = |n: &&Name| {
+                self.names.words.get(*n) == Some(&id)
+                    && self.names.watchers.contains_key(*n)
+                    && !self.names.asking.contains_key(*n)
+            };
+            for name in record.names.iter().filter(is_wanted).copied().collect::<Vec<_>>() {
+                let turn = self.turn(&name, false);
+                self.names.ask_again(name, turn);
+            }
+        }
+    }
+
     pub(crate) fn names_timeout(&mut self, now: Now) {
+        self.ask_for_renewals(now.instant);
         while let Some((at, id)) = self.names.expiries.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.expiries.remove(&(at, id));
             let withdraw = self.names.records.get(&id).is_some_and(|record| record.withdraw);

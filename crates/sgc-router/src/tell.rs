@@ -105,7 +105,11 @@ impl Router {
         let unasked = self.mapping.tells_unasked();
         let from = after.map_or(Bound::Unbounded, Bound::Excluded);
         let mut nodes = self.topology.nodes_from(from);
-        let told = nodes.find(|(node, record)| **node != self.config.node && (record.transit || unasked));
+        let told = nodes.find(|(node, record)| {
+            **node != self.config.node
+                && (record.transit || unasked)
+                && self.verifies_elsewhere(record.issued_at)
+        });
         told.map(|(node, record)| (*node, record.signed.clone()))
     }
 

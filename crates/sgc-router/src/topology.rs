@@ -50,6 +50,7 @@ pub(crate) struct NodeRecord {
     attached: Vec<NodeTag>,
     pub(crate) certs: Arc<[CertId]>,
     pub(crate) signed: Signed,
+    pub(crate) issued_at: UnixMillis,
     digest: [u8; 32],
     expires: Instant,
 }
@@ -362,6 +363,7 @@ impl Router {
             attached: body.attached,
             certs: verified.node.path,
             signed,
+            issued_at: body.issued_at,
             digest,
             expires,
         };
@@ -442,6 +444,7 @@ impl Router {
             certs: Arc::new([]),
             digest: signed_digest(&signed),
             signed,
+            issued_at: body.issued_at,
             // Always renewed before.
             expires: now.instant + LEASE,
         };
@@ -451,7 +454,8 @@ impl Router {
 
     /// Passes on what a node said of itself: a router to all routers, others as the mapping says.
     pub(crate) fn tell_link_state(&mut self, ingress: LinkId, node: &NodeId) {
-        let Some(record) = self.topology.node(node) else { return };
+        let is_told = |record: &&NodeRecord| self.verifies_elsewhere(record.issued_at);
+        let Some(record) = self.topology.node(node).filter(is_told) else { return };
         let (everyone, signed) = (record.transit || *node == self.config.node, record.signed.clone());
         let everyone = everyone || self.mapping.tells_unasked();
         let targets: Vec<_> = self

@@ -4,10 +4,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{CertError, CertId, CrlError, CrlNews, SignedError, TrustAnchors, VerifiedPeer};
-use sgc_wire::{Control, Now};
+use sgc_trust::{
+    CLOCK_SKEW_MAX, CertError, CertId, CrlError, CrlNews, SignedError, TrustAnchors, VerifiedPeer,
+};
+use sgc_wire::{Control, Now, UnixMillis};
 
 use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
+
+/// How long a frame may be under way to a neighbour, and the clocks of honest nodes usually differ at most.
+const UNDER_WAY_MAX: Duration = Duration::from_secs(10);
 
 impl Router {
     /// Takes a revocation list from this node's user; true if it is news, which is then told everywhere.
@@ -97,6 +102,13 @@ impl Router {
         let anchors = &self.config.anchors;
         let other_ca = certs.first().is_some_and(|c| anchors.ca_spki(&c.ca).is_none());
         other_ca || anchors.is_path_revoked(certs)
+    }
+
+    /// Returns `true` if neighbours will believe something signed then that they are told now. A lease is reckoned from when an
+    /// announcement came, so one that was played again late outlasts the time in which it verifies.
+    pub(crate) fn verifies_elsewhere(&self, issued_at: UnixMillis) -> bool {
+        let age = self.now.unix.0.saturating_sub(issued_at.0);
+        Duration::from_millis(age) + UNDER_WAY_MAX <= CLOCK_SKEW_MAX
     }
 
     /// Until when something signed holds: for its lease, and not beyond its signer's certificate.

@@ -479,6 +479,63 @@ fn an_answer_that_is_not_renewed_in_time_is_asked_of_everyone() {
 }
 
 #[test]
+fn an_advertisement_told_before_anybody_wanted_it_is_asked_for_if_it_is_not_renewed_in_time() {
+    for mapping in [MappingKind::Flood, MappingKind::Query] {
+        let mut bench = Bench::with(mapping, Limits::default());
+        bench.with_proxies();
+        // Perhaps by one who plays it again and keeps back what comes after it.
+        bench.with_owner_behind(5000, 9000);
+        bench.frame(4, Control::Interest { names: vec![bench.name(&A)] });
+        assert_eq!(asked_of(&bench, 1), [], "it is known");
+        bench.sent.clear();
+        bench.pass(LEASE / 2);
+        assert_eq!([1, 2, 3].map(|link| asked_of(&bench, link).len()), [1; 3], "half of the lease is over");
+        bench.frame(5, Control::Interest { names: vec![bench.name(&A)] });
+        bench.advert(2, 11, &[A]);
+        bench.sent.clear();
+        bench.pass(Duration::from_secs(20));
+        assert_eq!(
+            [1, 2, 3].map(|link| asked_of(&bench, link).len()),
+            [0, 1, 0],
+            "who answered goes on telling"
+        );
+    }
+}
+
+#[test]
+fn an_advertisement_that_came_too_late_to_be_believed_by_others_is_not_told() {
+    let mut bench = Bench::new();
+    let lease_ms = 600_000;
+    let body = AdvertBody {
+        chain: bench.owner.chain_bytes(),
+        seq: 10,
+        issued_at: bench.clock.now().unix,
+        lease_ms,
+        withdraw: false,
+        blinds: vec![A],
+    };
+    let advert = Control::Advert { cost: 0, signed: bench.owner.sign_advert(&body) };
+    let body = LinkStateBody { lease_ms, ..bench.link_state(&bench.routers[3], 1, &[]) };
+    let link_state = Control::LinkState { signed: bench.routers[3].sign_link_state(&body) };
+    let late = bench.routers[4].clone();
+    // Those of router 4, which is not linked, and of the owner.
+    let told = |bench: &Bench| {
+        let all = bench.sent.iter().filter(|(link, _)| *link >= 6);
+        all.filter(|(_, frame)| *frame == advert || *frame == link_state).count()
+    };
+    bench.pass(Duration::from_secs(300));
+    bench.frame(1, advert.clone());
+    bench.frame(1, link_state.clone());
+    bench.up(6, &late, true, 1000);
+    assert_eq!(told(&bench), 2);
+    bench.pass(Duration::from_secs(295));
+    assert_eq!(bench.router.stats().names, 1, "its lease is not over");
+    bench.link_down(6);
+    bench.up(7, &late, true, 1000);
+    assert_eq!(told(&bench), 0);
+}
+
+#[test]
 fn questions_are_bounded() {
     // A router may ask for sixteen times as many.
     let limits = Limits { queries_burst: 1, interests_per_peer_max: 8, ..Limits::default() };
