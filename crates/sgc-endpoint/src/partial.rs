@@ -79,6 +79,11 @@ impl Partials {
         (before - self.0.len()) as u64
     }
 
+    /// Gives up the oldest message; the memory that it took, 0 if there is none.
+    pub(crate) fn give_up_oldest(&mut self) -> usize {
+        self.0.pop_front().map_or(0, |partial| partial.message.len())
+    }
+
     /// Gives up all.
     pub(crate) fn clear(&mut self) {
         self.0.clear();

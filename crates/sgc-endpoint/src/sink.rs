@@ -32,7 +32,7 @@ pub struct SinkLimits {
     pub sources_max: usize,
     /// Messages of one source that may be incomplete at once.
     pub partials_per_source_max: usize,
-    /// Bytes of incomplete messages over all sources.
+    /// Bytes of incomplete messages over all sources. Each source that has some is sure of an equal share.
     pub partial_bytes_max: usize,
 }
 
@@ -119,7 +119,7 @@ pub enum SinkDrop {
     /// What its source was asked for has not arrived yet, and will contain it.
     #[error("awaiting the answer that contains it")]
     AwaitingHistory,
-    /// The bound on incomplete messages is reached.
+    /// The bound on incomplete messages is reached, and its source would have more than its share of them.
     #[error("too many incomplete messages")]
     PartialsFull,
 }
@@ -548,6 +548,34 @@ impl Sink {
         delivery.map(Ok)
     }
 
+    /// Makes room for a message that begins. Of a source that has no more than its share with it, the oldest messages of the
+    /// sources that have most give way.
+    fn make_partial_room(&mut self, header: &PacketHeader) -> Result<(), SinkDrop> {
+        let max = self.limits.partial_bytes_max;
+        let held: BTreeMap<SourceId, usize> =
+            self.sources.iter().map(|(id, source)| (*id, source.partials.bytes())).collect();
+        let mut used: usize = held.values().sum();
+        if used.saturating_add(header.total as usize) <= max {
+            return Ok(());
+        }
+        let sharers = held.iter().filter(|(id, bytes)| **bytes > 0 || **id == header.source).count();
+        let own = held.get(&header.source).copied().unwrap_or(0).saturating_add(header.total as usize);
+        if own > max / sharers.max(1) {
+            return Err(SinkDrop::PartialsFull);
+        }
+        while used.saturating_add(header.total as usize) > max {
+            let others = self.sources.iter_mut().filter(|(id, _)| **id != header.source);
+            let heaviest = others.max_by_key(|(_, source)| source.partials.bytes());
+            let freed = heaviest.map_or(0, |(_, source)| source.partials.give_up_oldest());
+            if freed == 0 {
+                return Err(SinkDrop::PartialsFull);
+            }
+            self.incomplete += 1;
+            used -= freed;
+        }
+        Ok(())
+    }
+
     /// Takes what a packet opened to: fragment, and behind the first one the head.
     fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
         let head = match opened {
@@ -565,12 +593,6 @@ impl Sink {
         };
         let known = self.sources.get(&header.source);
         let begins = header.fragments() > 1 && known.is_some_and(|s| !s.partials.has_begun(header.seq));
-        let room = if begins {
-            let used: usize = self.sources.values().map(|s| s.partials.bytes()).sum();
-            self.limits.partial_bytes_max.saturating_sub(used)
-        } else {
-            0
-        };
         let Some(source) = self.sources.get_mut(&header.source) else { return Err(SinkDrop::UnknownSource) };
         if header.seq == 0 {
             if head.is_none() || header.total > 0 {
@@ -605,9 +627,10 @@ impl Sink {
         let complete = match (opened, head) {
             (Opened::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
             (opened, head) => {
-                if begins && header.total as usize > room {
-                    return Err(SinkDrop::PartialsFull);
+                if begins {
+                    self.make_partial_room(header)?;
                 }
+                let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
                 let fragment = (!matches!(opened, Opened::InPlace)).then(|| opened.text());
                 let max = self.limits.partials_per_source_max;
                 let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
@@ -616,6 +639,7 @@ impl Sink {
             }
         };
         let Some((head, payload)) = complete else { return Ok(Delivery::Incomplete) };
+        let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
         source.done(header.seq);
         if header.reliable {
             // A reliable flow is in order: what is older and incomplete will never be complete.

@@ -117,6 +117,35 @@ fn incomplete_messages_are_bounded_and_counted() {
 }
 
 #[test]
+fn one_source_cannot_take_the_room_for_incomplete_messages_of_others() {
+    let mut sources: Vec<_> = (1..=3).map(|id| unrecovered(Suite::Standard, id)).collect();
+    let limits = SinkLimits { partial_bytes_max: 200_000, ..SinkLimits::default() };
+    let announces: Vec<_> = sources.iter().map(Source::announce).collect();
+    let mut sink = Sink::new(NAME, SINK, grant(Suite::Standard, 1, &announces), false, limits);
+    let greedy: Vec<_> = (0..4).map(|_| published(&mut sources[0], bytes(50_000), false)).collect();
+    for packets in &greedy {
+        assert_eq!(sink.handle_packet(&packets[0]), Ok(Delivery::Incomplete));
+    }
+    // Alone it may have all. Two that come have their shares, and its oldest messages give way.
+    let first = published(&mut sources[1], bytes(60_000), false);
+    assert_eq!(sink.handle_packet(&first[0]), Ok(Delivery::Incomplete));
+    assert_eq!(sink.incomplete(), 2);
+    let second = published(&mut sources[2], bytes(60_000), false);
+    assert_eq!(sink.handle_packet(&second[0]), Ok(Delivery::Incomplete));
+    assert_eq!(sink.incomplete(), 3);
+    // It takes nothing back of them.
+    for packets in &greedy[..3] {
+        assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::PartialsFull));
+    }
+    let more = published(&mut sources[0], bytes(33_000), false);
+    assert_eq!(sink.handle_packet(&more[0]), Err(SinkDrop::PartialsFull));
+    assert_eq!(sink.incomplete(), 3);
+    assert_eq!(delivered(&mut sink, &first[1..]), [bytes(60_000)]);
+    assert_eq!(delivered(&mut sink, &second[1..]), [bytes(60_000)]);
+    assert_eq!(delivered(&mut sink, &greedy[3][1..]), [bytes(50_000)]);
+}
+
+#[test]
 fn a_late_joiner_gets_the_history_first_and_each_message_once() {
     for suite in Suite::ALL {
         let mut source = source(suite, 3);
