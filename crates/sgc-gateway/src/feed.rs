@@ -17,14 +17,14 @@ use crate::error::GatewayError;
 use crate::graph::Graph;
 use crate::hub::Shared;
 use crate::message::Message;
-use crate::queue::{Overflow, Queue};
-use crate::quota::{Charge, Waiting};
+use crate::queue::{Overflow, Queue, cost};
+use crate::quota::{Charge, Held, Payer, Waiting};
 use crate::ros::LocalReader;
 use crate::session::Waits;
 
-/// Messages of one writer that are kept for who subscribes later, of a topic whose writers do so too.
+/// Messages of one writer that are kept for later subscribers, of a topic whose writers do so too.
 pub(crate) const LATCHED_DEPTH_MAX: usize = 100;
-/// Bytes of them, of all writers of a topic.
+/// Bytes of them, of all writers that one reader hears, each message with its cost.
 const LATCHED_BYTES_MAX: usize = 64 << 20;
 
 /// Which reader a subscriber shares.
@@ -42,62 +42,151 @@ pub(crate) struct FeedKey {
 pub(crate) struct Feed {
     pub(crate) key: FeedKey,
     hub: Weak<Shared>,
-    /// The charge of the client for which the reader was made, for as long as the reader is there.
-    _charge: Charge,
     outlets: Mutex<Outlets>,
     /// The reader, and what it requests. Locked by who changes it, which may take a while.
     reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
 }
 
-#[derive(Default)]
 struct Outlets {
-    queues: Vec<Weak<Queue>>,
+    subscribers: Vec<Subscriber>,
+    /// The charge of the reader: of a session that subscribes with it, of the last one if none does.
+    charge: Charge,
+    /// The session that has the charge.
+    payer: Payer,
     latched: Latched,
 }
 
-/// What is kept for who subscribes later.
+/// A subscription that shares a reader.
+struct Subscriber {
+    queue: Weak<Queue>,
+    payer: Payer,
+}
+
+impl Outlets {
+    fn queues(&self) -> impl Iterator<Item = Arc<Queue>> {
+        self.subscribers.iter().filter_map(|subscriber| subscriber.queue.upgrade())
+    }
+
+    /// Has those pay who subscribe, if anybody does. The number is that of messages for which none of them has room.
+    fn pass_charges(&mut self) -> u64 {
+        let payers = || self.subscribers.iter().map(|subscriber| &subscriber.payer);
+        let Some(first) = payers().next() else { return 0 };
+        if !payers().any(|payer| payer.is_same(&self.payer)) {
+            let taken = payers().find_map(|payer| Some((payer.take_reader_if_room()?, payer)));
+            // Each of them has a subscription with this reader, and would have a reader for it if it were alone.
+            let (charge, payer) = taken.unwrap_or_else(|| (first.take_reader_anyway(), first));
+            (self.charge, self.payer) = (charge, payer.clone());
+        }
+        self.latched.pass_charges(&self.subscribers)
+    }
+}
+
+/// Messages that are kept for later subscribers.
 #[derive(Default)]
 struct Latched {
     is_on: bool,
     /// Messages of each writer, the newest last.
-    writers: BTreeMap<Option<Guid>, VecDeque<Arc<Message>>>,
-    bytes: usize,
+    writers: BTreeMap<Option<Guid>, VecDeque<Kept>>,
     depth: usize,
+    /// True if a message was left out since no subscriber had room for it.
+    is_short: bool,
+}
+
+/// A message that is kept.
+struct Kept {
+    message: Message,
+    /// Room of the subscriber to which it is charged.
+    room: Held,
 }
 
 impl Latched {
-    fn add(&mut self, message: &Arc<Message>) {
-        if !self.is_on {
-            return;
-        }
-        let kept = self.writers.entry(message.writer).or_default();
-        kept.push_back(Arc::clone(message));
-        self.bytes += message.payload.len();
-        let mut gone = 0;
-        while kept.len() > self.depth || (self.bytes - gone > LATCHED_BYTES_MAX && kept.len() > 1) {
-            gone += kept.pop_front().map_or(0, |old| old.payload.len());
-        }
-        self.bytes -= gone;
+    fn bytes(&self) -> usize {
+        self.writers.values().map(bytes_of).sum()
     }
 
-    /// Whether it was heard before: a reader that is made anew hears again what writers kept. By time and content, since
-    /// clocks are set back.
+    fn messages(&self) -> impl Iterator<Item = &Message> {
+        self.writers.values().flatten().map(|kept| &kept.message)
+    }
+
+    /// Hands out each message once more. Forms in which it is written last no longer than it waits.
+    fn replay(&self, queue: &Queue) {
+        self.messages().for_each(|message| queue.push(&Arc::new(message.unwritten())));
+    }
+
+    /// Keeps a message in room of one of the sessions. The number is that of messages that were left out for want of it:
+    /// the oldest ones of the writer that has most bytes, or the message itself.
+    fn add<'p, P: Iterator<Item = &'p Payer>>(
+        &mut self,
+        message: &Arc<Message>,
+        payers: impl Fn() -> P,
+    ) -> u64 {
+        if !self.is_on {
+            return 0;
+        }
+        let bytes = cost(message);
+        let own = self.writers.entry(message.writer).or_default();
+        let beyond = (own.len() + 1).saturating_sub(self.depth);
+        own.drain(..beyond);
+        let mut dropped = 0;
+        loop {
+            let is_within = self.bytes() + bytes <= LATCHED_BYTES_MAX;
+            if is_within && let Some(room) = payers().find_map(|payer| payer.take_history(bytes)) {
+                let kept = Kept { message: message.unwritten(), room };
+                self.writers.entry(message.writer).or_default().push_back(kept);
+                return dropped;
+            }
+            self.is_short |= is_within;
+            dropped += 1;
+            let with_new = |(writer, kept): &(&Option<Guid>, &mut VecDeque<Kept>)| {
+                bytes_of(kept) + if **writer == message.writer { bytes } else { 0 }
+            };
+            let heaviest = self.writers.iter_mut().max_by_key(with_new);
+            if heaviest.and_then(|(_, kept)| kept.pop_front()).is_none() {
+                return dropped;
+            }
+        }
+    }
+
+    /// Charges what is charged to sessions that do not subscribe any more to others that do, the newest messages first. The
+    /// number is that of messages for which none of them has room: these go, and the older ones of the same writer.
+    fn pass_charges(&mut self, subscribers: &[Subscriber]) -> u64 {
+        let mut dropped = 0;
+        for kept in self.writers.values_mut() {
+            let has_room = |kept: &mut Kept| {
+                if !subscribers.iter().any(|subscriber| subscriber.payer.has_room(&kept.room)) {
+                    let bytes = kept.room.bytes();
+                    let room = subscribers.iter().find_map(|subscriber| subscriber.payer.take_history(bytes));
+                    let Some(room) = room else { return false };
+                    kept.room = room;
+                }
+                true
+            };
+            let newest = kept.iter_mut().rev().map(has_room).take_while(|has_room| *has_room).count();
+            let gone = kept.len() - newest;
+            kept.drain(..gone);
+            dropped += gone as u64;
+        }
+        self.is_short |= dropped > 0;
+        dropped
+    }
+
+    /// Returns `true` if it was heard before: a reader that is made anew hears again what writers kept. By time and content,
+    /// since clocks are set back.
     fn has(&self, sample: &Sample) -> bool {
-        let is_it = |message: &Arc<Message>| {
-            message.source_timestamp_ns == sample.source_timestamp_ns && message.payload == sample.payload
+        let is_it = |kept: &Kept| {
+            kept.message.source_timestamp_ns == sample.source_timestamp_ns
+                && kept.message.payload == sample.payload
         };
         self.is_on && self.writers.get(&sample.writer).is_some_and(|kept| kept.iter().any(is_it))
     }
 
-    fn clear(&mut self) {
-        self.writers.clear();
-        self.bytes = 0;
-    }
-
     fn retain(&mut self, is_there: impl Fn(&Guid) -> bool) {
         self.writers.retain(|writer, _| writer.as_ref().is_none_or(&is_there));
-        self.bytes = self.writers.values().flatten().map(|message| message.payload.len()).sum();
     }
+}
+
+fn bytes_of(kept: &VecDeque<Kept>) -> usize {
+    kept.iter().map(|kept| kept.room.bytes()).sum()
 }
 
 impl std::fmt::Debug for Feed {
@@ -115,11 +204,8 @@ impl HandleSamples for Intake {
     }
 
     fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
-        let would_wait = {
-            let outlets = self.0.outlets();
-            let bytes = sample.payload.len();
-            outlets.queues.iter().filter_map(Weak::upgrade).any(|queue| queue.would_wait(bytes))
-        };
+        let bytes = sample.payload.len();
+        let would_wait = self.0.outlets().queues().any(|queue| queue.would_wait(bytes));
         if would_wait {
             return Err(sample);
         }
@@ -128,14 +214,15 @@ impl HandleSamples for Intake {
     }
 
     fn overrun(&mut self, samples: u64) {
-        self.0.outlets().queues.iter().filter_map(Weak::upgrade).for_each(|q| q.add_dropped(samples));
+        self.0.outlets().queues().for_each(|queue| queue.add_dropped(samples));
     }
 }
 
 impl Feed {
-    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>, charge: Charge) -> Arc<Self> {
-        let (outlets, reader) = (Mutex::default(), Mutex::new(None));
-        Arc::new(Self { key, hub: Arc::downgrade(hub), _charge: charge, outlets, reader })
+    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>, charge: Charge, payer: Payer) -> Arc<Self> {
+        let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: Latched::default() };
+        let (outlets, reader) = (Mutex::new(outlets), Mutex::new(None));
+        Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
     }
 
     fn outlets(&self) -> MutexGuard<'_, Outlets> {
@@ -151,26 +238,51 @@ impl Feed {
             return;
         }
         let message = Arc::new(Message::new(sample.payload, sample.writer, sample.source_timestamp_ns));
-        outlets.latched.add(&message);
-        let queues: Vec<_> = outlets.queues.iter().filter_map(Weak::upgrade).collect();
+        let Outlets { subscribers, payer, latched, .. } = &mut *outlets;
+        let last = subscribers.is_empty().then_some(&*payer);
+        let dropped = latched.add(&message, || subscribers.iter().map(|other| &other.payer).chain(last));
+        let queues: Vec<_> = outlets.queues().collect();
         drop(outlets);
+        self.count_dropped(dropped);
         queues.iter().for_each(|queue| queue.push(&message));
     }
 
-    /// Adds a subscriber, who hears first what is kept.
-    pub(crate) fn join(&self, queue: &Arc<Queue>) {
-        let mut outlets = self.outlets();
-        outlets.latched.writers.values().flatten().for_each(|message| queue.push(message));
-        outlets.queues.push(Arc::downgrade(queue));
+    /// Counts messages that were not kept for later subscribers.
+    fn count_dropped(&self, messages: u64) {
+        if messages > 0
+            && let Some(hub) = self.hub.upgrade()
+        {
+            hub.quotas.count_history_dropped(messages);
+        }
     }
 
-    /// What is kept, once more.
+    /// Adds a subscriber, who hears first what is kept.
+    fn join(&self, queue: &Arc<Queue>, payer: Payer) {
+        let mut outlets = self.outlets();
+        outlets.latched.replay(queue);
+        outlets.subscribers.push(Subscriber { queue: Arc::downgrade(queue), payer });
+        let dropped = outlets.pass_charges();
+        drop(outlets);
+        self.count_dropped(dropped);
+    }
+
+    /// Hands out what is kept, once more.
     fn replay(&self, queue: &Queue) {
-        self.outlets().latched.writers.values().flatten().for_each(|message| queue.push(message));
+        self.outlets().latched.replay(queue);
     }
 
     fn leave(&self, queue: &Arc<Queue>) {
-        self.outlets().queues.retain(|other| !std::ptr::eq(other.as_ptr(), Arc::as_ptr(queue)));
+        let mut outlets = self.outlets();
+        outlets.subscribers.retain(|other| !std::ptr::eq(other.queue.as_ptr(), Arc::as_ptr(queue)));
+        let dropped = outlets.pass_charges();
+        drop(outlets);
+        self.count_dropped(dropped);
+    }
+
+    /// Returns `true` if nothing of its history was left out for want of subscribers' room, or if that session is one of them.
+    pub(crate) fn has_history_for(&self, payer: &Payer) -> bool {
+        let outlets = self.outlets();
+        !outlets.latched.is_short || outlets.subscribers.iter().any(|other| other.payer.is_same(payer))
     }
 
     /// What its reader is to request, as the graph is.
@@ -217,7 +329,7 @@ impl Feed {
             latched.retain(|writer| hub.is_there(writer));
             latched.is_on = wanted.qos.durability >= Durability::TransientLocal;
             if !latched.is_on {
-                latched.clear();
+                latched.writers.clear();
             }
             latched.depth = match wanted.qos.history {
                 History::KeepLast(depth) => (depth as usize).clamp(1, LATCHED_DEPTH_MAX),
@@ -233,11 +345,13 @@ impl Feed {
         if let Some((old, _)) = reader.take() {
             hub.forget(&[old.guid()]);
             // Its end waits for its thread, which may wait for a subscriber.
-            let queues: Vec<_> = self.outlets().queues.iter().filter_map(Weak::upgrade).collect();
+            let queues: Vec<_> = self.outlets().queues().collect();
             queues.iter().for_each(|queue| queue.let_pass(true));
             drop(old);
             queues.iter().for_each(|queue| queue.let_pass(false));
         }
+        // Writers say again what they keep.
+        self.outlets().latched.is_short = false;
         let made = hub.ros.reader(&wanted, Box::new(Intake(Arc::clone(self))))?;
         hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
         *reader = Some((made, wanted));
@@ -247,7 +361,8 @@ impl Feed {
     /// Ends the reader, which holds the feed. May block.
     pub(crate) fn end(&self) {
         // Who waits for room would be waited for.
-        self.outlets().queues.drain(..).filter_map(|q| q.upgrade()).for_each(|queue| queue.close());
+        let subscribers = std::mem::take(&mut self.outlets().subscribers);
+        subscribers.iter().filter_map(|other| other.queue.upgrade()).for_each(|queue| queue.close());
         let reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
         if let Some(((reader, _), hub)) = reader.zip(self.hub.upgrade()) {
             hub.forget(&[reader.guid()]);
@@ -255,7 +370,7 @@ impl Feed {
     }
 
     pub(crate) fn is_unused(&self) -> bool {
-        self.outlets().queues.iter().all(|queue| queue.strong_count() == 0)
+        self.outlets().subscribers.iter().all(|subscriber| subscriber.queue.strong_count() == 0)
     }
 }
 
@@ -295,6 +410,8 @@ pub(crate) struct Intaking {
     pub(crate) waits: Option<Waits>,
     /// Its place among the subscriptions of its client's credential.
     pub(crate) charge: Charge,
+    /// To whom the reader can be charged.
+    pub(crate) payer: Payer,
 }
 
 /// What one client hears of a topic; ends when dropped.
@@ -311,7 +428,7 @@ pub struct Subscription {
 impl Subscription {
     pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
         let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.waiting, taking.overflow));
-        feed.join(&queue);
+        feed.join(&queue, taking.payer);
         Self {
             feed,
             queue,
@@ -417,5 +534,209 @@ impl Drop for Subscription {
         if let Some(hub) = self.feed.hub.upgrade() {
             hub.sweep();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sgc_testkit::FakeDomain;
+    use sgc_wire::UnixMillis;
+
+    use super::*;
+    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::hub::{Hub, HubOptions};
+    use crate::quota::{Quota, Resource};
+    use crate::session::SessionLimits;
+    use crate::types::{Shipped, Types};
+
+    const MESSAGE_BYTES: usize = 1000;
+    const COST: usize = MESSAGE_BYTES + crate::queue::MESSAGE_COST_BYTES;
+    /// Messages for which one session has room.
+    const ROOM: usize = 10;
+    const LIMITS: SessionLimits = SessionLimits {
+        waiting_bytes_max: ROOM * COST,
+        subscriptions_max: 2,
+        publications_max: 2,
+        servings_max: 2,
+        calls_max: 2,
+        waits_max: 2,
+    };
+
+    /// One session of a client, with what it has.
+    struct Viewer {
+        quota: Quota,
+        history: Arc<Waiting>,
+        payer: Payer,
+    }
+
+    impl Viewer {
+        fn new(hub: &Hub, peer: &str) -> Self {
+            let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
+            let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
+            let admission =
+                Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            let client: Client = access.admit(&admission).unwrap();
+            let quota = hub.shared.quotas.quota(&client);
+            let history = Arc::new(Waiting::new(LIMITS.waiting_bytes_max, quota.clone()));
+            let payer = Payer::new(quota.clone(), LIMITS, Arc::clone(&history));
+            Self { quota, history, payer }
+        }
+
+        /// Returns the number of messages that are kept in its room.
+        fn keeps(&self) -> usize {
+            assert_eq!(self.history.bytes() % COST, 0);
+            self.history.bytes() / COST
+        }
+
+        fn feed(&self, hub: &Hub) -> Arc<Feed> {
+            let (topic, type_name) = ("/map".to_owned(), "std_msgs/msg/String".to_owned());
+            let key = FeedKey { topic, type_name, qos: None, waits: false };
+            let feed = Feed::new(key, &hub.shared, self.payer.take_reader().unwrap(), self.payer.clone());
+            {
+                let latched = &mut feed.outlets().latched;
+                (latched.is_on, latched.depth) = (true, LATCHED_DEPTH_MAX);
+            }
+            feed
+        }
+
+        /// Returns the number of readers that it may still have made for it.
+        fn readers_left(&self) -> usize {
+            let mut held = Vec::new();
+            while let Some(charge) = self.payer.take_reader_if_room() {
+                held.push(charge);
+                assert!(held.len() < 100, "nothing stops it");
+            }
+            held.len()
+        }
+    }
+
+    /// One whose messages count for nobody here.
+    fn queue() -> Arc<Queue> {
+        Arc::new(Queue::new(1000, 1 << 20, Waiting::of_own(1 << 20), Overflow::DropOldest))
+    }
+
+    async fn hub() -> Hub {
+        let own = Arc::new(FakeDomain::default().join(false));
+        Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap()
+    }
+
+    fn say(feed: &Feed, writer: u8, numbers: std::ops::Range<i64>) {
+        for number in numbers {
+            feed.hand_out(Sample {
+                kind: SampleKind::Write,
+                source_timestamp_ns: number,
+                payload: vec![0; MESSAGE_BYTES].into(),
+                writer: Some(Guid([writer; 16])),
+                more: false,
+            });
+        }
+    }
+
+    /// Returns the numbers that a later subscriber hears first.
+    fn heard(feed: &Feed) -> Vec<i64> {
+        feed.outlets().latched.messages().map(|message| message.source_timestamp_ns).collect()
+    }
+
+    #[tokio::test]
+    async fn messages_that_are_kept_take_room_of_a_subscriber_and_the_oldest_go() {
+        let hub = hub().await;
+        let sessions: Vec<_> = (0..5).map(|_| Viewer::new(&hub, "10.0.0.1:1")).collect();
+        // Many topics, one session.
+        let queues: Vec<_> = sessions.iter().map(|_| queue()).collect();
+        let feeds: Vec<_> = (0..3).map(|_| sessions[0].feed(&hub)).collect();
+        for feed in &feeds {
+            feed.join(&queues[0], sessions[0].payer.clone());
+        }
+        say(&feeds[0], 1, 0..6);
+        say(&feeds[1], 1, 0..6);
+        assert_eq!((sessions[0].keeps(), heard(&feeds[1])), (ROOM, vec![2, 3, 4, 5]));
+        assert_eq!(hub.shared.quotas.history_dropped(), 2);
+        // Another topic has no room left, and takes none from others.
+        say(&feeds[2], 1, 0..3);
+        assert_eq!((heard(&feeds[2]), heard(&feeds[0]).len()), (vec![], 6));
+        assert_eq!(hub.shared.quotas.history_dropped(), 5);
+        // Of one topic the writer that has most gives way.
+        say(&feeds[0], 2, 10..11);
+        assert_eq!(heard(&feeds[0]), [1, 2, 3, 4, 5, 10]);
+        // Many sessions of one credential have no more than a few.
+        let more: Vec<_> = sessions[1..].iter().map(|session| session.feed(&hub)).collect();
+        for ((feed, session), queue) in more.iter().zip(&sessions[1..]).zip(&queues[1..]) {
+            feed.join(queue, session.payer.clone());
+            say(feed, 1, 0..20);
+        }
+        let kept: Vec<_> = sessions.iter().map(Viewer::keeps).collect();
+        assert_eq!(kept, [ROOM, ROOM, ROOM, ROOM, 0]);
+        drop((feeds, more));
+        assert!(sessions.iter().all(|session| session.keeps() == 0));
+    }
+
+    #[tokio::test]
+    async fn charges_of_a_reader_pass_to_those_who_remain() {
+        let hub = hub().await;
+        let [first, second] = ["10.0.0.1:1", "10.0.0.2:1"].map(|peer| Viewer::new(&hub, peer));
+        let all = first.readers_left();
+        let feed = first.feed(&hub);
+        let queues = [queue(), queue()];
+        feed.join(&queues[0], first.payer.clone());
+        feed.join(&queues[1], second.payer.clone());
+        say(&feed, 1, 0..4);
+        assert_eq!([first.keeps(), second.keeps()], [4, 0]);
+        feed.leave(&queues[0]);
+        assert_eq!([first.keeps(), second.keeps()], [0, 4]);
+        assert_eq!([first.readers_left(), second.readers_left()], [all, all - 1]);
+        // The last one keeps them until the reader ends, or somebody comes.
+        feed.leave(&queues[1]);
+        say(&feed, 1, 4..5);
+        assert_eq!((second.keeps(), second.readers_left()), (5, all - 1));
+        feed.join(&queues[0], first.payer.clone());
+        assert_eq!([first.keeps(), second.keeps()], [5, 0]);
+        assert_eq!([first.readers_left(), second.readers_left()], [all - 1, all]);
+        assert_eq!((heard(&feed).len(), hub.shared.quotas.history_dropped()), (5, 0));
+        drop(feed);
+        assert_eq!((first.keeps(), first.readers_left()), (0, all));
+    }
+
+    #[tokio::test]
+    async fn a_subscriber_that_leaves_pushes_nobody_beyond_its_room_for_history() {
+        let hub = hub().await;
+        let [leaver, victim, third] =
+            ["10.0.0.1:1", "10.0.0.2:1", "10.0.0.3:1"].map(|peer| Viewer::new(&hub, peer));
+        let (own, shared) = (victim.feed(&hub), leaver.feed(&hub));
+        let queues = [queue(), queue(), queue()];
+        own.join(&queues[1], victim.payer.clone());
+        say(&own, 1, 0..7);
+        shared.join(&queues[0], leaver.payer.clone());
+        shared.join(&queues[2], victim.payer.clone());
+        say(&shared, 1, 0..9);
+        assert_eq!([leaver.keeps(), victim.keeps()], [9, 7]);
+        shared.leave(&queues[0]);
+        // The newest have room, and what the victim had stays.
+        assert_eq!((leaver.keeps(), victim.keeps()), (0, ROOM));
+        assert_eq!((heard(&shared), heard(&own).len()), (vec![6, 7, 8], 7));
+        assert_eq!(hub.shared.quotas.history_dropped(), 6);
+        // Others do not suffer by it: they have readers of their own.
+        assert!(shared.has_history_for(&victim.payer) && !shared.has_history_for(&third.payer));
+        assert!(own.has_history_for(&third.payer));
+    }
+
+    #[tokio::test]
+    async fn nobody_stays_charged_with_a_reader_that_it_has_left() {
+        let hub = hub().await;
+        let [victim, other] = ["10.0.0.1:1", "10.0.0.2:1"].map(|peer| Viewer::new(&hub, peer));
+        let all = victim.readers_left();
+        let feed = victim.feed(&hub);
+        let queues = [queue(), queue()];
+        feed.join(&queues[0], victim.payer.clone());
+        feed.join(&queues[1], other.payer.clone());
+        // Readers that it has left a moment ago take all of the other's places.
+        let mut lingering = Vec::new();
+        while let Some(charge) = other.payer.take_reader_if_room() {
+            lingering.push(charge);
+        }
+        feed.leave(&queues[0]);
+        assert_eq!([victim.readers_left(), other.readers_left()], [all, 0]);
+        lingering.truncate(1);
+        assert_eq!(other.readers_left(), all - 2);
+        assert!(other.quota.take(Resource::Subscriptions, &LIMITS).is_ok());
     }
 }

@@ -14,7 +14,7 @@ use tokio::task::JoinHandle;
 use crate::error::GatewayError;
 use crate::feed::{Feed, FeedKey, Intaking, Subscription};
 use crate::graph::{Graph, GraphState};
-use crate::quota::{Charge, Quotas};
+use crate::quota::Quotas;
 use crate::ros::LocalRos;
 use crate::service::Caller;
 use crate::types::Types;
@@ -290,12 +290,12 @@ impl Shared {
         done.unwrap_or(Err(GatewayError::Stopping))
     }
 
-    /// Subscribes, with the reader that others have if there is one; `charge` pays for a new one.
+    /// Subscribes, with the reader that others have if there is one. A reader whose history was cut short for want of its
+    /// subscribers' room is not shared with another client that has room for a reader of its own.
     pub(crate) async fn subscribe(
         self: &Arc<Self>,
         key: FeedKey,
         taking: Intaking,
-        charge: impl FnOnce() -> Result<Charge, GatewayError> + Send + 'static,
     ) -> Result<Subscription, GatewayError> {
         self.run(move |shared| {
             let layout = shared.layout_of(&key)?;
@@ -305,13 +305,24 @@ impl Shared {
                     return Err(GatewayError::Stopping);
                 }
                 // A subscriber that is waited for has a reader of its own.
-                let known = feeds.all.iter().find(|feed| !key.waits && feed.key == key).map(Arc::clone);
-                let feed = match known {
-                    Some(feed) => feed,
-                    None => {
-                        let feed = Feed::new(key, shared, charge()?);
-                        feeds.all.push(Arc::clone(&feed));
-                        feed
+                let payer = &taking.payer;
+                let known = || feeds.all.iter().filter(|feed| !key.waits && feed.key == key);
+                let whole = known().find(|feed| feed.has_history_for(payer)).map(Arc::clone);
+                let feed = match (whole, known().next().map(Arc::clone)) {
+                    (Some(feed), _) => feed,
+                    (None, short) => {
+                        let charge = match short {
+                            Some(feed) => payer.take_reader_if_room().ok_or(feed),
+                            None => Ok(payer.take_reader()?),
+                        };
+                        match charge {
+                            Ok(charge) => {
+                                let feed = Feed::new(key, shared, charge, payer.clone());
+                                feeds.all.push(Arc::clone(&feed));
+                                feed
+                            }
+                            Err(short) => short,
+                        }
                     }
                 };
                 // Before anybody finds it unused, and before a new reader hears what is for who made it.

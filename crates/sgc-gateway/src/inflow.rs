@@ -48,6 +48,14 @@ impl Inflow {
         Ok(())
     }
 
+    /// Gives back the room of so many bytes that were kept.
+    pub(crate) fn give_back(&self, bytes: usize) {
+        let mut held = lock(&self.held);
+        held.bytes = held.bytes.saturating_sub(bytes);
+        let places = held.bytes.saturating_sub(1) / UNIT_BYTES;
+        held.room.truncate(places);
+    }
+
     /// Gives back the room of a message that is done, but for so many bytes that are still kept.
     pub(crate) fn done_but(&self, kept: usize) {
         let mut held = lock(&self.held);

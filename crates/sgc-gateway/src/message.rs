@@ -35,6 +35,15 @@ impl Message {
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
+    /// Returns the message without the forms in which it was written.
+    pub(crate) fn unwritten(&self) -> Self {
+        let (json, cbor) = (Written::new(), Written::new());
+        let payload = self.payload.clone();
+        let (source_timestamp_ns, received_ns, writer) =
+            (self.source_timestamp_ns, self.received_ns, self.writer);
+        Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
+    }
+
     /// The message in a form; `layout` is of its topic's type.
     pub fn written(&self, form: Form, layout: &Layout) -> Result<Bytes, GatewayError> {
         let written = match form {

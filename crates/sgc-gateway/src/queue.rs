@@ -175,7 +175,8 @@ impl Drop for Queue {
     }
 }
 
-fn cost(message: &Message) -> usize {
+/// Returns the bytes for which a message counts.
+pub(crate) fn cost(message: &Message) -> usize {
     message.payload.len() + MESSAGE_COST_BYTES
 }
 

@@ -8,10 +8,10 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, Weak};
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 
 use crate::access::{Client, Credential};
 use crate::error::GatewayError;
@@ -46,6 +46,9 @@ pub(crate) enum Resource {
 const RESOURCES: usize = 6;
 
 impl Resource {
+    const ALL: [Self; RESOURCES] =
+        [Self::Subscriptions, Self::Waits, Self::Readers, Self::Publications, Self::Servings, Self::Calls];
+
     fn what(self) -> &'static str {
         match self {
             Self::Subscriptions => "subscriptions",
@@ -97,26 +100,13 @@ struct Counts {
     resources: [AtomicUsize; RESOURCES],
     /// Bytes of messages that wait.
     bytes: AtomicUsize,
-    threads: Arc<Semaphore>,
-    long_bytes: Arc<Semaphore>,
+    permits: [Arc<Semaphore>; PERMITS],
 }
 
 impl Counts {
     fn new(pool: Pool) -> Arc<Self> {
-        let at = pool as usize;
-        Arc::new(Self {
-            pool,
-            resources: Default::default(),
-            bytes: AtomicUsize::new(0),
-            threads: Arc::new(Semaphore::new(THREADS[at])),
-            long_bytes: Arc::new(Semaphore::new(LONG_BYTES[at] / crate::budget::UNIT_BYTES)),
-        })
-    }
-
-    /// Limits units of room for long messages to those that there are: a longer message takes all.
-    fn units(&self, wanted: u32) -> u32 {
-        let all = LONG_BYTES[self.pool as usize] / crate::budget::UNIT_BYTES;
-        wanted.min(u32::try_from(all).unwrap_or(u32::MAX))
+        let permits = PermitKind::ALL.map(|kind| Arc::new(Semaphore::new(kind.max(pool))));
+        Arc::new(Self { pool, resources: Default::default(), bytes: AtomicUsize::new(0), permits })
     }
 
     fn share(&self) -> usize {
@@ -126,6 +116,62 @@ impl Counts {
             Pool::Total => TOTAL_SHARE,
         }
     }
+
+    /// Takes all that a session has, or nothing of it: an error names the bound that it is beyond.
+    fn take_all(&self, holdings: &Holdings, limits: &SessionLimits) -> Result<(), (&'static str, usize)> {
+        let mut taken = Holdings::default();
+        let refused = self.take_each(holdings, limits, &mut taken);
+        if refused.is_err() {
+            self.give_back_all(&taken);
+        }
+        refused
+    }
+
+    /// Takes one sort after the other, and notes in `taken` which it has.
+    fn take_each(
+        &self,
+        holdings: &Holdings,
+        limits: &SessionLimits,
+        taken: &mut Holdings,
+    ) -> Result<(), (&'static str, usize)> {
+        for resource in Resource::ALL {
+            let (at, max) = (resource as usize, resource.session_max(limits).saturating_mul(self.share()));
+            if !add_within(&self.resources[at], holdings.resources[at], max) {
+                return Err((resource.what(), max));
+            }
+            taken.resources[at] = holdings.resources[at];
+        }
+        let max = limits.waiting_bytes_max.saturating_mul(self.share());
+        if !add_within(&self.bytes, holdings.bytes, max) {
+            return Err(("bytes of messages that wait or are kept", max));
+        }
+        taken.bytes = holdings.bytes;
+        for kind in PermitKind::ALL {
+            let units = holdings.permits[kind as usize];
+            let permits =
+                self.permits[kind as usize].try_acquire_many(u32::try_from(units).unwrap_or(u32::MAX));
+            let permits = permits.map_err(|_| (kind.what(), kind.max(self.pool) * kind.unit()))?;
+            permits.forget();
+            taken.permits[kind as usize] = units;
+        }
+        Ok(())
+    }
+
+    fn give_back_all(&self, holdings: &Holdings) {
+        for (counted, given) in self.resources.iter().zip(holdings.resources) {
+            counted.fetch_sub(given, Ordering::Relaxed);
+        }
+        self.bytes.fetch_sub(holdings.bytes, Ordering::Relaxed);
+        for (semaphore, units) in self.permits.iter().zip(holdings.permits) {
+            semaphore.add_permits(units);
+        }
+    }
+}
+
+/// Adds to a count, unless it would be more than `max` then. Nothing more is always within it.
+fn add_within(count: &AtomicUsize, more: usize, max: usize) -> bool {
+    let fits = |now: usize| now.checked_add(more).filter(|sum| more == 0 || *sum <= max);
+    count.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
 }
 
 /// Counts of all that the clients of a hub have.
@@ -136,18 +182,38 @@ pub(crate) struct Quotas {
     of: Mutex<BTreeMap<Credential, Weak<Counts>>>,
     /// Refusals, by the pool whose bound it was.
     refused: Mutex<BTreeMap<Pool, u64>>,
+    /// Messages that were not kept for later subscribers.
+    history_dropped: AtomicU64,
 }
 
 impl Default for Quotas {
     fn default() -> Self {
         let (total, remote) = (Counts::new(Pool::Total), Counts::new(Pool::Remote));
-        Self { total, remote, of: Mutex::default(), refused: Mutex::default() }
+        Self {
+            total,
+            remote,
+            of: Mutex::default(),
+            refused: Mutex::default(),
+            history_dropped: AtomicU64::new(0),
+        }
     }
 }
 
 impl Quotas {
-    /// Returns the quota that a client shares with all that have its credential.
+    /// Returns the quota of a session, which shares its bounds with all that have its client's credential.
     pub(crate) fn quota(self: &Arc<Self>, client: &Client) -> Quota {
+        Quota(Arc::new(Ledger {
+            quotas: Arc::clone(self),
+            pools: RwLock::new(self.pools(client)),
+            moved: Notify::new(),
+            resources: Default::default(),
+            bytes: AtomicUsize::new(0),
+            permits: Default::default(),
+        }))
+    }
+
+    /// Returns the pools of a client, the smallest first.
+    fn pools(&self, client: &Client) -> Pools {
         let own =
             client.credential().filter(|credential| *credential != Credential::Local).map(|credential| {
                 let mut of = lock(&self.of);
@@ -160,8 +226,7 @@ impl Quotas {
                 })
             });
         let remote = (!client.is_local()).then(|| Arc::clone(&self.remote));
-        let pools = [own, remote, Some(Arc::clone(&self.total))].into_iter().flatten().collect();
-        Quota { quotas: Arc::clone(self), pools }
+        [own, remote, Some(Arc::clone(&self.total))].into_iter().flatten().collect()
     }
 
     /// Returns the number of refusals for the bound of each pool.
@@ -172,15 +237,59 @@ impl Quotas {
     fn count(&self, pool: Pool) {
         *lock(&self.refused).entry(pool).or_default() += 1;
     }
+
+    /// Returns the number of messages that were not kept for later subscribers.
+    pub(crate) fn history_dropped(&self) -> u64 {
+        self.history_dropped.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn count_history_dropped(&self, messages: u64) {
+        self.history_dropped.fetch_add(messages, Ordering::Relaxed);
+    }
 }
 
-/// The quota of a client's credential. Clones are the same one.
-#[derive(Clone, Debug)]
-pub(crate) struct Quota {
-    quotas: Arc<Quotas>,
-    /// The pools of the client, the smallest first.
-    pools: Arc<[Arc<Counts>]>,
+/// The pools of a client, the smallest first.
+type Pools = Arc<[Arc<Counts>]>;
+
+/// Units that a session has of each sort.
+#[derive(Debug, Default)]
+struct Holdings {
+    resources: [usize; RESOURCES],
+    bytes: usize,
+    permits: [usize; PERMITS],
 }
+
+/// All that one session has of its pools. It moves as a whole when the session shows another credential.
+#[derive(Debug)]
+struct Ledger {
+    quotas: Arc<Quotas>,
+    /// Locked for writing while what the session has moves, for reading while that changes.
+    pools: RwLock<Pools>,
+    /// Wakes those who wait for permits of the pools before.
+    moved: Notify,
+    resources: [AtomicUsize; RESOURCES],
+    bytes: AtomicUsize,
+    permits: [AtomicUsize; PERMITS],
+}
+
+impl Ledger {
+    fn pools(&self) -> RwLockReadGuard<'_, Pools> {
+        self.pools.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn holdings(&self) -> Holdings {
+        let load = |count: &AtomicUsize| count.load(Ordering::Relaxed);
+        Holdings {
+            resources: self.resources.each_ref().map(load),
+            bytes: load(&self.bytes),
+            permits: self.permits.each_ref().map(load),
+        }
+    }
+}
+
+/// The quota of one session, which shares the bounds of its credential with other sessions. Clones are the same one.
+#[derive(Clone, Debug)]
+pub(crate) struct Quota(Arc<Ledger>);
 
 /// One unit of a resource, until dropped.
 #[derive(Debug)]
@@ -191,72 +300,194 @@ pub(crate) struct Charge {
 
 impl Drop for Charge {
     fn drop(&mut self) {
-        self.quota.give_back(self.resource, self.quota.pools.len());
+        let pools = self.quota.0.pools();
+        self.quota.0.resources[self.resource as usize].fetch_sub(1, Ordering::Relaxed);
+        give_back(self.resource, &pools);
+    }
+}
+
+fn give_back(resource: Resource, pools: &[Arc<Counts>]) {
+    for counts in pools {
+        counts.resources[resource as usize].fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 impl Quota {
+    /// Returns `true` if it is the quota of the same session.
+    fn is_same(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.0, &other.0)
+    }
+
     /// Takes one unit of a resource, of which one session may have as many as `limits` say.
     pub(crate) fn take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, GatewayError> {
-        for (at, counts) in self.pools.iter().enumerate() {
+        self.try_take(resource, limits).map_err(|(pool, max)| self.refuse(resource.what(), pool, max))
+    }
+
+    /// The same; a refusal is not counted, and names the bound.
+    fn try_take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, (Pool, usize)> {
+        let pools = self.0.pools();
+        for (at, counts) in pools.iter().enumerate() {
             let max = resource.session_max(limits).saturating_mul(counts.share());
-            if counts.resources[resource as usize].fetch_add(1, Ordering::Relaxed) >= max {
-                self.give_back(resource, at + 1);
-                return Err(self.refuse(resource.what(), counts.pool, max));
+            if !add_within(&counts.resources[resource as usize], 1, max) {
+                give_back(resource, &pools[..at]);
+                return Err((counts.pool, max));
             }
         }
+        self.0.resources[resource as usize].fetch_add(1, Ordering::Relaxed);
         Ok(Charge { quota: self.clone(), resource })
     }
 
-    fn give_back(&self, resource: Resource, pools: usize) {
-        for counts in self.pools.iter().take(pools) {
-            counts.resources[resource as usize].fetch_sub(1, Ordering::Relaxed);
+    /// Takes one unit of a resource, also beyond the bounds.
+    fn take_anyway(&self, resource: Resource) -> Charge {
+        let pools = self.0.pools();
+        for count in pools.iter().map(|counts| &counts.resources).chain([&self.0.resources]) {
+            count[resource as usize].fetch_add(1, Ordering::Relaxed);
         }
+        Charge { quota: self.clone(), resource }
+    }
+
+    /// Moves all that the session has to the credential of another client. An error leaves everything as it was.
+    pub(crate) fn move_to(&self, client: &Client, limits: &SessionLimits) -> Result<(), GatewayError> {
+        let mut pools = self.0.pools.write().unwrap_or_else(PoisonError::into_inner);
+        let wanted = self.0.quotas.pools(client);
+        let holdings = self.0.holdings();
+        let is_in = |counts: &Arc<Counts>, of: &Pools| of.iter().any(|other| Arc::ptr_eq(counts, other));
+        let joined: Vec<_> = wanted.iter().filter(|counts| !is_in(counts, &pools)).collect();
+        for (at, counts) in joined.iter().enumerate() {
+            if let Err((what, max)) = counts.take_all(&holdings, limits) {
+                joined[..at].iter().for_each(|taken| taken.give_back_all(&holdings));
+                return Err(self.refuse(what, counts.pool, max));
+            }
+        }
+        pools.iter().filter(|counts| !is_in(counts, &wanted)).for_each(|left| left.give_back_all(&holdings));
+        *pools = wanted;
+        drop(pools);
+        self.0.moved.notify_waiters();
+        Ok(())
     }
 
     fn refuse(&self, what: &'static str, pool: Pool, max: usize) -> GatewayError {
-        self.quotas.count(pool);
+        self.0.quotas.count(pool);
         GatewayError::Crowded { what, max, pool }
     }
 
     /// Waits for a thread that may wait for local programs.
     pub(crate) async fn thread(&self) -> Result<Permits, GatewayError> {
-        let semaphores = self.pools.iter().map(|counts| (&counts.threads, 1));
-        acquire(semaphores).await.ok_or(GatewayError::Stopping)
+        self.acquire(PermitKind::Threads, 1).await.ok_or(GatewayError::Stopping)
     }
 
     /// Waits for so many units of room for long messages.
     pub(crate) async fn room(&self, units: u32) -> Option<Permits> {
-        acquire(self.pools.iter().map(|counts| (&counts.long_bytes, counts.units(units)))).await
+        self.acquire(PermitKind::LongBytes, units).await
     }
 
     /// Takes so many units of room for long messages, unless a pool has less.
     pub(crate) fn room_at_once(&self, units: u32) -> Result<Permits, GatewayError> {
-        let mut permits = Vec::with_capacity(self.pools.len());
-        for counts in &*self.pools {
-            match Arc::clone(&counts.long_bytes).try_acquire_many_owned(counts.units(units)) {
-                Ok(permit) => permits.push(permit),
+        let (kind, pools) = (PermitKind::LongBytes, self.0.pools());
+        let units = kind.limited(units, &pools);
+        let mut held = Vec::with_capacity(pools.len());
+        for counts in pools.iter() {
+            match Arc::clone(&counts.permits[kind as usize]).try_acquire_many_owned(units) {
+                Ok(permits) => held.push(permits),
                 Err(_) => {
-                    let max = LONG_BYTES[counts.pool as usize];
-                    return Err(self.refuse("bytes of long messages under way", counts.pool, max));
+                    let max = kind.max(counts.pool) * kind.unit();
+                    return Err(self.refuse(kind.what(), counts.pool, max));
                 }
             }
         }
-        Ok(Permits(permits))
+        Ok(self.keep(kind, units, held))
+    }
+
+    /// Takes permits of all pools, the smallest first: a client that waits for its own pool holds nothing of a larger one.
+    async fn acquire(&self, kind: PermitKind, units: u32) -> Option<Permits> {
+        loop {
+            let moved = self.0.moved.notified();
+            let pools = Arc::clone(&*self.0.pools());
+            let units = kind.limited(units, &pools);
+            let all = async {
+                let mut held = Vec::with_capacity(pools.len());
+                for counts in pools.iter() {
+                    let semaphore = Arc::clone(&counts.permits[kind as usize]);
+                    held.push(semaphore.acquire_many_owned(units).await.ok()?);
+                }
+                Some(held)
+            };
+            let held = tokio::select! {
+                held = all => held?,
+                () = moved => continue,
+            };
+            let now = self.0.pools();
+            if Arc::ptr_eq(&now, &pools) {
+                return Some(self.keep(kind, units, held));
+            }
+        }
+    }
+
+    /// Counts permits as the session's. The caller holds the lock of its pools.
+    fn keep(&self, kind: PermitKind, units: u32, held: Vec<OwnedSemaphorePermit>) -> Permits {
+        held.into_iter().for_each(OwnedSemaphorePermit::forget);
+        let units = units as usize;
+        self.0.permits[kind as usize].fetch_add(units, Ordering::Relaxed);
+        Permits { quota: self.clone(), kind, units }
     }
 }
 
-/// Places in each pool of a client, until dropped.
-#[derive(Debug)]
-pub(crate) struct Permits(#[expect(dead_code, reason = "they are for their end")] Vec<OwnedSemaphorePermit>);
+/// Something that a client waits for if there is none.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum PermitKind {
+    Threads,
+    LongBytes,
+}
 
-/// Takes permits of all pools, the smallest first: a client that waits for its own pool holds nothing of a larger one.
-async fn acquire<'a>(pools: impl Iterator<Item = (&'a Arc<Semaphore>, u32)>) -> Option<Permits> {
-    let mut held = Vec::new();
-    for (semaphore, permits) in pools {
-        held.push(Arc::clone(semaphore).acquire_many_owned(permits).await.ok()?);
+const PERMITS: usize = 2;
+
+impl PermitKind {
+    const ALL: [Self; PERMITS] = [Self::Threads, Self::LongBytes];
+
+    fn what(self) -> &'static str {
+        match self {
+            Self::Threads => "threads that wait for local programs",
+            Self::LongBytes => "bytes of long messages under way",
+        }
     }
-    Some(Permits(held))
+
+    /// Returns how many of what it is called by one permit stands for.
+    fn unit(self) -> usize {
+        match self {
+            Self::Threads => 1,
+            Self::LongBytes => crate::budget::UNIT_BYTES,
+        }
+    }
+
+    /// Returns the number of permits that a pool has.
+    fn max(self, pool: Pool) -> usize {
+        match self {
+            Self::Threads => THREADS[pool as usize],
+            Self::LongBytes => LONG_BYTES[pool as usize] / self.unit(),
+        }
+    }
+
+    /// Limits permits to those that the smallest pool has: a longer message takes all.
+    fn limited(self, wanted: u32, pools: &Pools) -> u32 {
+        let all = pools.iter().map(|counts| self.max(counts.pool)).min().unwrap_or(0);
+        wanted.min(u32::try_from(all).unwrap_or(u32::MAX))
+    }
+}
+
+/// Permits of each pool of a session, until dropped.
+#[derive(Debug)]
+pub(crate) struct Permits {
+    quota: Quota,
+    kind: PermitKind,
+    units: usize,
+}
+
+impl Drop for Permits {
+    fn drop(&mut self) {
+        let pools = self.quota.0.pools();
+        self.quota.0.permits[self.kind as usize].fetch_sub(self.units, Ordering::Relaxed);
+        pools.iter().for_each(|counts| counts.permits[self.kind as usize].add_permits(self.units));
+    }
 }
 
 /// Bytes that wait, until dropped.
@@ -278,9 +509,66 @@ impl Held {
     }
 }
 
+impl Held {
+    /// Takes room for so many bytes, unless there is less; a refusal is not counted.
+    pub(crate) fn if_room(waiting: &Arc<Waiting>, bytes: usize) -> Option<Self> {
+        waiting.try_take(bytes).ok()?;
+        Some(Self { waiting: Arc::clone(waiting), bytes })
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
+        self.bytes
+    }
+}
+
 impl Drop for Held {
     fn drop(&mut self) {
         self.waiting.sub(self.bytes);
+    }
+}
+
+/// A session to which the shared reader of a subscription can be charged, and the messages that are kept with it.
+#[derive(Clone, Debug)]
+pub(crate) struct Payer {
+    quota: Quota,
+    limits: SessionLimits,
+    /// Bytes of messages that are kept for later subscribers.
+    history: Arc<Waiting>,
+}
+
+impl Payer {
+    pub(crate) fn new(quota: Quota, limits: SessionLimits, history: Arc<Waiting>) -> Self {
+        Self { quota, limits, history }
+    }
+
+    /// Takes the charge of a reader.
+    pub(crate) fn take_reader(&self) -> Result<Charge, GatewayError> {
+        self.quota.take(Resource::Readers, &self.limits)
+    }
+
+    /// The same; a refusal is not counted.
+    pub(crate) fn take_reader_if_room(&self) -> Option<Charge> {
+        self.quota.try_take(Resource::Readers, &self.limits).ok()
+    }
+
+    /// Takes the charge of a reader that is there already, also beyond the bounds.
+    pub(crate) fn take_reader_anyway(&self) -> Charge {
+        self.quota.take_anyway(Resource::Readers)
+    }
+
+    /// Takes room for a message that is kept; a refusal is not counted.
+    pub(crate) fn take_history(&self, bytes: usize) -> Option<Held> {
+        Held::if_room(&self.history, bytes)
+    }
+
+    /// Returns `true` if it is the same session.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        self.quota.is_same(&other.quota)
+    }
+
+    /// Returns `true` if the room is this session's.
+    pub(crate) fn has_room(&self, held: &Held) -> bool {
+        Arc::ptr_eq(&held.waiting, &self.history)
     }
 }
 
@@ -304,13 +592,12 @@ impl Waiting {
 
     /// Returns `true` if there is room for so many more.
     pub(crate) fn has_room(&self, bytes: usize) -> bool {
-        let fits = |now: &AtomicUsize, max| now.load(Ordering::Relaxed).saturating_add(bytes) <= max;
-        fits(&self.bytes, self.bytes_max) && self.pools_have_room(bytes)
+        self.bytes().saturating_add(bytes) <= self.bytes_max && self.pools_have_room(bytes)
     }
 
     /// Returns `true` if the pools have room for so many more.
     pub(crate) fn pools_have_room(&self, bytes: usize) -> bool {
-        self.quota.pools.iter().all(|counts| {
+        self.quota.0.pools().iter().all(|counts| {
             let max = self.bytes_max.saturating_mul(counts.share());
             counts.bytes.load(Ordering::Relaxed).saturating_add(bytes) <= max
         })
@@ -318,37 +605,46 @@ impl Waiting {
 
     /// Takes room for so many bytes, unless the client or one of its pools has less.
     pub(crate) fn take(&self, what: &'static str, bytes: usize) -> Result<(), GatewayError> {
-        let add = |to: &AtomicUsize, max: usize| {
-            let fits = |now: usize| now.checked_add(bytes).filter(|sum| *sum <= max);
-            to.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
-        };
-        if !add(&self.bytes, self.bytes_max) {
-            return Err(GatewayError::TooMany { what, max: self.bytes_max });
+        self.try_take(bytes).map_err(|(pool, max)| match pool {
+            None => GatewayError::TooMany { what, max },
+            Some(pool) => self.quota.refuse(what, pool, max),
+        })
+    }
+
+    /// The same; a refusal is not counted. It names the pool, none if the bound is the client's own, and the bound.
+    fn try_take(&self, bytes: usize) -> Result<(), (Option<Pool>, usize)> {
+        if !add_within(&self.bytes, bytes, self.bytes_max) {
+            return Err((None, self.bytes_max));
         }
-        for (at, counts) in self.quota.pools.iter().enumerate() {
+        let ledger = &self.quota.0;
+        let pools = ledger.pools();
+        for (at, counts) in pools.iter().enumerate() {
             let max = self.bytes_max.saturating_mul(counts.share());
-            if !add(&counts.bytes, max) {
-                self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-                for taken in self.quota.pools.iter().take(at) {
-                    taken.bytes.fetch_sub(bytes, Ordering::Relaxed);
-                }
-                return Err(self.quota.refuse(what, counts.pool, max));
+            if !add_within(&counts.bytes, bytes, max) {
+                let taken = pools.iter().take(at).map(|counts| &counts.bytes).chain([&self.bytes]);
+                taken.for_each(|count| {
+                    count.fetch_sub(bytes, Ordering::Relaxed);
+                });
+                return Err((Some(counts.pool), max));
             }
         }
+        ledger.bytes.fetch_add(bytes, Ordering::Relaxed);
         Ok(())
     }
 
     pub(crate) fn add(&self, bytes: usize) {
-        self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        for counts in &*self.quota.pools {
-            counts.bytes.fetch_add(bytes, Ordering::Relaxed);
-        }
+        self.change(|count| count.fetch_add(bytes, Ordering::Relaxed));
     }
 
     pub(crate) fn sub(&self, bytes: usize) {
-        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-        for counts in &*self.quota.pools {
-            counts.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        self.change(|count| count.fetch_sub(bytes, Ordering::Relaxed));
+    }
+
+    fn change(&self, change: impl Fn(&AtomicUsize) -> usize) {
+        let ledger = &self.quota.0;
+        let pools = ledger.pools();
+        for count in pools.iter().map(|counts| &counts.bytes).chain([&ledger.bytes, &self.bytes]) {
+            change(count);
         }
     }
 }
@@ -463,6 +759,84 @@ mod tests {
         assert!(Held::new(&first, "bytes", 1).is_err());
         drop(held);
         assert_eq!(first.bytes(), 0);
+    }
+
+    #[tokio::test]
+    async fn all_that_a_session_has_moves_to_the_credential_that_it_shows() {
+        let quotas: Arc<Quotas> = Arc::default();
+        let [before, after] = ["10.0.0.1:1", "10.0.0.2:1"].map(client);
+        let moving = quotas.quota(&before);
+        let waiting = Arc::new(Waiting::new(100, moving.clone()));
+        let charge = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
+        let held = Held::new(&waiting, "bytes", 30).unwrap();
+        let permits = (moving.thread().await.unwrap(), moving.room(2).await.unwrap());
+        moving.move_to(&after, &LIMITS).unwrap();
+        let counts = |client: &Client| {
+            let pools = quotas.pools(client);
+            let free = pools[0].permits.each_ref().map(|semaphore| semaphore.available_permits());
+            let load = |count: &AtomicUsize| count.load(Ordering::Relaxed);
+            (load(&pools[0].resources[Resource::Subscriptions as usize]), load(&pools[0].bytes), free)
+        };
+        let all = PermitKind::ALL.map(|kind| kind.max(Pool::Credential));
+        assert_eq!(counts(&before), (0, 0, all));
+        assert_eq!(counts(&after), (1, 30, [all[0] - 1, all[1] - 2]));
+        assert_eq!(counts(&client("10.0.0.1:2")).0, 0);
+        // The pool of all other hosts has it once.
+        assert_eq!(quotas.remote.bytes.load(Ordering::Relaxed), 30);
+        // What it takes from now on is the other's, too, and the other gets everything back.
+        let more = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
+        assert_eq!(counts(&after).0, 2);
+        drop((charge, held, permits, more));
+        assert_eq!(counts(&after), (0, 0, all));
+        assert_eq!((quotas.remote.bytes.load(Ordering::Relaxed), waiting.bytes()), (0, 0));
+    }
+
+    #[tokio::test]
+    async fn a_credential_without_room_is_refused_and_nothing_moves() {
+        let quotas: Arc<Quotas> = Arc::default();
+        let [before, after] = ["10.0.0.1:1", "10.0.0.2:1"].map(client);
+        let moving = quotas.quota(&before);
+        let _charge = moving.take(Resource::Calls, &LIMITS).unwrap();
+        let _thread = moving.thread().await.unwrap();
+        let other = quotas.quota(&after);
+        let calls: Vec<_> = (0..40).map(|_| other.take(Resource::Calls, &LIMITS).unwrap()).collect();
+        let crowded = |what, max| GatewayError::Crowded { what, max, pool: Pool::Credential };
+        let refused = moving.move_to(&after, &LIMITS).unwrap_err();
+        assert_eq!(refused, crowded("calls under way", 40));
+        drop(calls);
+        let mut threads = Vec::new();
+        for _ in 0..THREADS[0] {
+            threads.push(other.thread().await.unwrap());
+        }
+        let refused = moving.move_to(&after, &LIMITS).unwrap_err();
+        assert_eq!(refused, crowded("threads that wait for local programs", THREADS[0]));
+        assert_eq!(quotas.refused(), [(Pool::Credential, 2)].into());
+        let load = |client: &Client| {
+            quotas.pools(client)[0].resources[Resource::Calls as usize].load(Ordering::Relaxed)
+        };
+        assert_eq!((load(&before), load(&after)), (1, 0));
+        threads.pop();
+        moving.move_to(&after, &LIMITS).unwrap();
+        assert_eq!((load(&before), load(&after)), (0, 1));
+    }
+
+    #[tokio::test]
+    async fn a_session_that_waits_for_a_crowded_credential_goes_on_with_another() {
+        let quotas: Arc<Quotas> = Arc::default();
+        let [before, after] = ["10.0.0.1:1", "10.0.0.2:1"].map(client);
+        let other = quotas.quota(&before);
+        let mut threads = Vec::new();
+        for _ in 0..THREADS[0] {
+            threads.push(other.thread().await.unwrap());
+        }
+        let moving = quotas.quota(&before);
+        let waits = moving.thread();
+        tokio::pin!(waits);
+        let within = std::time::Duration::from_millis(20);
+        assert!(tokio::time::timeout(within, &mut waits).await.is_err());
+        moving.move_to(&after, &LIMITS).unwrap();
+        let held = tokio::time::timeout(std::time::Duration::from_secs(10), waits).await;
+        assert!(held.unwrap().is_ok());
     }
 
     #[tokio::test]

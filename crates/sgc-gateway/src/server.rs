@@ -39,6 +39,8 @@ const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
 /// Connections that wait to be served by gRPC.
 const GRPC_WAITING_MAX: usize = 64;
+/// How the status calls messages that were not kept for later subscribers.
+const HISTORY_DROPPED: &str = "messages not kept for later subscribers";
 
 /// What is spoken at an address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -346,6 +348,8 @@ impl Server {
         let mut refused = self.shared.door.refused();
         let crowded = self.shared.hub.shared.quotas.refused();
         refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
+        let not_kept = self.shared.hub.shared.quotas.history_dropped();
+        refused.extend((not_kept > 0).then(|| (HISTORY_DROPPED.to_owned(), not_kept)));
         refused
     }
 

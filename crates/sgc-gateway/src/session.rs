@@ -20,7 +20,7 @@ use crate::hub::Hub;
 use crate::inflow::Inflow;
 use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
-use crate::quota::{Charge, Held, Quota, Resource, Waiting};
+use crate::quota::{Charge, Held, Payer, Quota, Resource, Waiting};
 use crate::service::Serving;
 use crate::types::InterfaceType;
 
@@ -33,7 +33,8 @@ const DEPTH_MAX: usize = 10_000;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
     /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case. Its
-    /// transient-local writers keep so many, too, and the arguments of its calls and goals have so many.
+    /// transient-local writers keep so many, too, the arguments of its calls and goals have so many, and so have the messages
+    /// that are kept for later subscribers and charged to it.
     pub waiting_bytes_max: usize,
     /// Subscriptions.
     pub subscriptions_max: usize,
@@ -102,6 +103,8 @@ pub struct Session {
     kept: Arc<Waiting>,
     /// Bytes of arguments of its calls and goals, until these are done or sent.
     arguments: Arc<Waiting>,
+    /// Bytes of messages of its topics that are kept for later subscribers and charged to it.
+    history: Arc<Waiting>,
     waits: Arc<AtomicUsize>,
     /// The quota of its credential.
     quota: Quota,
@@ -145,6 +148,7 @@ impl Session {
             waiting: waiting(),
             kept: waiting(),
             arguments: waiting(),
+            history: waiting(),
             waits: Arc::default(),
             quota,
             inflow: Arc::default(),
@@ -184,14 +188,37 @@ impl Session {
         }
     }
 
-    /// The same program's, now that it is another client: what it has already counts against its bounds.
-    pub fn again(&self, client: Client) -> Self {
+    /// Gives back the room of so many bytes that were kept beyond the message that they came with.
+    pub(crate) fn forget_kept(&self, bytes: usize) {
+        self.inflow.give_back(bytes);
+    }
+
+    /// Returns the session of the same program, now that it is another client. All that it has counts against the bounds of
+    /// that client's credential from now on.
+    ///
+    /// # Errors
+    /// The bound of the other credential that has no room for what the session has. Nothing has changed then.
+    pub fn again(&self, client: Client) -> Result<Self, GatewayError> {
+        self.quota.move_to(&client, &self.limits)?;
         let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
         let [calls, waits] = [&self.calls, &self.waits].map(Arc::clone);
-        let [waiting, kept, arguments] = [&self.waiting, &self.kept, &self.arguments].map(Arc::clone);
-        let quota = self.hub.shared.quotas.quota(&client);
-        let inflow = Arc::clone(&self.inflow);
-        Self { hub, client, access, limits, calls, waiting, kept, arguments, waits, quota, inflow }
+        let [waiting, kept, arguments, history] =
+            [&self.waiting, &self.kept, &self.arguments, &self.history].map(Arc::clone);
+        let (quota, inflow) = (self.quota.clone(), Arc::clone(&self.inflow));
+        Ok(Self {
+            hub,
+            client,
+            access,
+            limits,
+            calls,
+            waiting,
+            kept,
+            arguments,
+            history,
+            waits,
+            quota,
+            inflow,
+        })
     }
 
     /// Who it is.
@@ -355,10 +382,9 @@ impl Session {
             overflow: if wanted.waits { Overflow::Wait } else { Overflow::DropOldest },
             waits,
             charge,
+            payer: Payer::new(self.quota.clone(), self.limits, Arc::clone(&self.history)),
         };
-        let (quota, limits) = (self.quota.clone(), self.limits);
-        let reader = move || quota.take(Resource::Readers, &limits);
-        self.hub.shared.subscribe(key, taking, reader).await
+        self.hub.shared.subscribe(key, taking).await
     }
 
     /// A place for one more subscription that is waited for.

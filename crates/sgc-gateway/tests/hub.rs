@@ -260,7 +260,7 @@ async fn subscriptions_that_are_waited_for_are_few_and_what_ends_makes_room() {
     assert_eq!(refused, Some(told));
     let _other = session.subscribe(wanted(false)).await.unwrap();
     // It is the same program's, whoever it says it is.
-    let again = session.again(Client::own("again"));
+    let again = session.again(Client::own("again")).unwrap();
     assert!(again.subscribe(wanted(true)).await.is_err());
     drop(first);
     let _third = again.subscribe(wanted(true)).await.unwrap();

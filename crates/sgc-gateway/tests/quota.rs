@@ -14,16 +14,17 @@ use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{self, RosbridgeOptions};
 use sgc_gateway::{
-    Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Session,
-    SessionLimits, Subscribe,
+    Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Server,
+    ServerOptions, Session, SessionLimits, Subscribe,
 };
+use sgc_ros::{RosWriter as _, SampleKind};
 use sgc_wire::{Durability, History, Qos, UnixMillis};
 
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
 
-use support::{STRING, Site, eventually};
+use support::{STRING, Site, eventually, string};
 use viewer::Viewer;
 
 const LIMITS: SessionLimits = SessionLimits {
@@ -301,4 +302,119 @@ async fn requests_of_viewers_that_wait_are_bounded_over_connections() {
     };
     assert_eq!(viewers.len(), SHARES[0] + 1);
     assert_eq!(refused["message"], arguments_crowded());
+}
+
+/// A page of one host that can become one of another: its token says the address.
+async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io::DuplexStream> {
+    let (here, there) = tokio::io::duplex(1 << 20);
+    let hub = site.hub.clone();
+    let admit = move |peer: &str| {
+        let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
+        let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
+        let admission =
+            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+        access.admit(&admission).unwrap()
+    };
+    let session = Session::new(&hub, admit(peer), LIMITS);
+    let authenticate: rosbridge::Authenticate = Arc::new(move |token| Ok(admit(token)));
+    let options = RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
+    let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
+    tokio::spawn(rosbridge::serve(there, Arc::new(session), options));
+    let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
+    page.send(Message::text(r#"{"op": "set_level", "level": "info"}"#)).await.unwrap();
+    page
+}
+
+/// Shows a token within the session, and has what is told.
+async fn auth(page: &mut WebSocketStream<tokio::io::DuplexStream>, token: &str) -> String {
+    page.send(Message::text(format!(r#"{{"op": "auth", "token": "{token}"}}"#))).await.unwrap();
+    page.next().await.unwrap().unwrap().into_text().unwrap().to_string()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_session_has_counts_for_the_credential_that_it_shows_last() {
+    let site = Site::new().await;
+    let subscribe = |n: usize| format!(r#"{{"op": "subscribe", "topic": "/p{n}", "type": "{STRING}"}}"#);
+    let share = SHARES[0] * LIMITS.subscriptions_max;
+    let mut first = page_that_changes(&site, "10.0.0.1:1").await;
+    for n in 0..LIMITS.subscriptions_max {
+        first.send(Message::text(subscribe(n))).await.unwrap();
+    }
+    eventually(|| site.hub.readers() == LIMITS.subscriptions_max).await;
+    let told = auth(&mut first, "10.0.0.2:1").await;
+    assert!(told.contains("you are"), "{told}");
+    // The first host has everything again, and the second one has what the session has.
+    let (own, why) = flood(&site, "10.0.0.1:1").await;
+    assert_eq!(own.len(), share);
+    assert!(is_of(&why, Pool::Credential), "{why}");
+    let (others, why) = flood(&site, "10.0.0.2:1").await;
+    assert_eq!(others.len(), share - LIMITS.subscriptions_max);
+    assert!(is_of(&why, Pool::Credential), "{why}");
+    // Whose credential has no room does not become another.
+    let told = auth(&mut first, "10.0.0.1:1").await;
+    let max = format!("{share} subscriptions at most for {}", Pool::Credential);
+    assert!(told.contains(&max), "{told}");
+    let end = first.next().await.unwrap().unwrap();
+    assert!(matches!(&end, Message::Close(Some(why)) if u16::from(why.code) == 1013), "{end:?}");
+    drop((own, first));
+    // What the session had is gone with it.
+    let until_room = async {
+        while flood(&site, "10.0.0.2:1").await.0.len() < LIMITS.subscriptions_max {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_without_room_for_history_does_not_cut_that_of_others() {
+    const MESSAGES: usize = 3;
+    const MESSAGE_BYTES: usize = 300 << 10;
+    let site = Site::new().await;
+    let latched = Qos {
+        durability: Durability::TransientLocal,
+        history: History::KeepLast(MESSAGES as u32),
+        ..Qos::default()
+    };
+    let writers: Vec<_> = (0..2).map(|n| site.writer(&format!("/kept{n}"), latched.clone())).collect();
+    for (n, writer) in writers.iter().enumerate() {
+        site.knows(&format!("/kept{n}")).await;
+        for number in 0..MESSAGES {
+            let text = format!("{number}{}", "x".repeat(MESSAGE_BYTES));
+            writer.write(SampleKind::Write, number as i64, string(&text)).unwrap();
+        }
+    }
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: Vec::new(),
+        access: Access::new(AccessRules::default()),
+        key: None,
+        clients_max: 64,
+        limits: LIMITS,
+    };
+    let server = Server::start(site.hub.clone(), options).await.unwrap();
+    let wanted = |n: usize| Subscribe { topic: format!("/kept{n}"), depth: 10, ..Subscribe::default() };
+    // Its room is taken by the history of the first topic.
+    let poor = session(&site, "10.0.0.1:1");
+    let mut held = Vec::new();
+    for n in 0..writers.len() {
+        let mut subscription = poor.subscribe(wanted(n)).await.unwrap();
+        for _ in 0..MESSAGES {
+            tokio::time::timeout(Duration::from_secs(20), subscription.next()).await.unwrap().unwrap();
+        }
+        held.push(subscription);
+    }
+    let not_kept = server.status().refused["messages not kept for later subscribers"];
+    assert_eq!(not_kept, MESSAGES as u64);
+    assert_eq!(site.hub.readers(), 2);
+    let mut later = session(&site, "10.0.0.2:1").subscribe(wanted(1)).await.unwrap();
+    for number in 0..MESSAGES {
+        let delivery = tokio::time::timeout(Duration::from_secs(20), later.next()).await.unwrap().unwrap();
+        assert_eq!(delivery.message.source_timestamp_ns, number as i64);
+    }
+    assert_eq!(site.hub.readers(), 3);
+    // The next one shares the reader that has it all.
+    let mut next = session(&site, "10.0.0.3:1").subscribe(wanted(1)).await.unwrap();
+    tokio::time::timeout(Duration::from_secs(20), next.next()).await.unwrap().unwrap();
+    assert_eq!(site.hub.readers(), 3);
 }

@@ -37,6 +37,8 @@ const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
 /// Errors that a client may make at once, and a second: who makes more is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
+/// What a client is told of a message whose pieces have not come in time.
+const PIECES_LATE: &str = "pieces of the message did not come in time, and it is given up";
 /// Things that a client which has become another may not have any more, each said for itself; further ones are counted.
 const ENDED_SHOWN_MAX: usize = 16;
 
@@ -270,7 +272,15 @@ impl Connection {
             Ok(client) => {
                 let who = format!("you are {}", client.name);
                 let is_as_before = client.scope == self.session.client().scope;
-                self.session = Arc::new(self.session.again(client));
+                let session = match self.session.again(client) {
+                    Ok(session) => session,
+                    Err(why) => {
+                        let error = op.gateway(why.clone());
+                        self.outbox.status(Level::Error, &told(&error), op.id.as_ref()).await?;
+                        return Err(Failure::End(RosbridgeError::NoRoom(why)));
+                    }
+                };
+                self.session = Arc::new(session);
                 self.sessions.send_replace(Arc::clone(&self.session));
                 self.is_admitted = true;
                 self.outbox.status(Level::Info, &who, op.id.as_ref()).await?;
@@ -343,7 +353,25 @@ impl Connection {
         let number = op.count("num")?.ok_or_else(|| op.refused("\"num\" is missing"))?;
         let total = op.count("total")?.ok_or_else(|| op.refused("\"total\" is missing"))?;
         let data = op.needed_text("data")?;
-        self.fragments.take(id, number, total, data).map_err(|error| op.refused(error.to_string()))
+        let taken = self.fragments.take(id, number, total, data, Instant::now());
+        taken.map_err(|error| op.refused(error.to_string()))
+    }
+
+    /// Returns when the next message of which pieces are missing is given up.
+    pub(super) fn fragments_end(&self) -> Option<Instant> {
+        self.fragments.next_end()
+    }
+
+    /// Gives up messages whose pieces have not come in time, and says so.
+    pub(super) async fn give_up_fragments(&mut self) -> Result<(), RosbridgeError> {
+        let before = self.fragments.bytes();
+        let given_up: Vec<_> = std::iter::from_fn(|| self.fragments.give_up(Instant::now())).collect();
+        self.session.forget_kept(before - self.fragments.bytes());
+        for id in given_up {
+            let late = OpError::Refused { op: "fragment".to_owned(), why: PIECES_LATE.to_owned() };
+            self.fail(&late, Some(&id)).await?;
+        }
+        Ok(())
     }
 
     async fn advertise(&mut self, op: &Op<'_>) -> Done {
@@ -749,14 +777,18 @@ fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
 mod tests {
     use std::net::SocketAddr;
 
+    use futures_util::{SinkExt as _, StreamExt as _};
     use sgc_testkit::FakeDomain;
     use sgc_wire::UnixMillis;
+    use tokio_tungstenite::WebSocketStream;
+    use tokio_tungstenite::tungstenite::Message;
+    use tokio_tungstenite::tungstenite::protocol::Role;
 
     use super::*;
     use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
     use crate::budget::UNIT_BYTES;
     use crate::hub::{Hub, HubOptions};
-    use crate::inflow::Inflow;
+    use crate::inflow::{Inflow, Metered};
     use crate::session::SessionLimits;
     use crate::types::{Shipped, Types};
 
@@ -814,6 +846,49 @@ mod tests {
         connection.take(&text).await.unwrap();
         assert_eq!(connection.fragments.bytes(), 0);
         assert!(quota.room_at_once(units(LEFT_BYTES)).is_ok());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn pieces_that_do_not_come_in_time_are_given_up_with_their_room() {
+        const PIECE_BYTES: usize = 4 << 20;
+        let own = Arc::new(FakeDomain::default().join(false));
+        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let client = remote_client();
+        let inflow: Arc<Inflow> = Arc::default();
+        let session = Session::new(&hub, client.clone(), SessionLimits::default());
+        let session = Arc::new(session.metered_by(Arc::clone(&inflow)));
+        let (here, there) = tokio::io::duplex(1 << 20);
+        let options = RosbridgeOptions::default();
+        let there = Metered::new(there, inflow);
+        let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
+        let _served = tokio::spawn(super::super::serve(there, session, options));
+        let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
+        let piece =
+            format!(r#"{{"op":"fragment","id":"a","num":0,"total":2,"data":"{}"}}"#, "x".repeat(PIECE_BYTES));
+        let began = Instant::now();
+        page.send(Message::text(piece)).await.unwrap();
+        let free = |hub: &Hub| {
+            let quota = hub.shared.quotas.quota(&client);
+            let mut held = Vec::new();
+            while let Ok(room) = quota.room_at_once(1) {
+                held.push(room);
+            }
+            held.len() * UNIT_BYTES
+        };
+        // Whoever reads answers pings.
+        let mut kept = 0;
+        let told = loop {
+            match page.next().await.unwrap().unwrap() {
+                Message::Text(text) => break text,
+                _ => kept = ((512 << 20) - free(&hub)).max(kept),
+            }
+        };
+        assert_eq!(kept / PIECE_BYTES, 1);
+        assert!(told.contains(PIECES_LATE) && told.contains(r#""id":"a""#), "{told}");
+        let waited = began.elapsed();
+        assert!(waited >= super::super::fragments::PIECE_WAIT_MAX, "{waited:?}");
+        assert!(waited < super::super::fragments::PIECE_WAIT_MAX + Duration::from_secs(1), "{waited:?}");
+        assert_eq!(free(&hub), 512 << 20);
     }
 
     #[tokio::test(start_paused = true)]

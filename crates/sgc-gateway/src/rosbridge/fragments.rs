@@ -1,6 +1,9 @@
 //! [`Fragments`]: messages that clients send in pieces (op `fragment`), put together within bounds.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use super::op::OpId;
 
@@ -8,6 +11,10 @@ use super::op::OpId;
 const MESSAGES_MAX: usize = 16;
 /// Pieces of one message.
 const PIECES_MAX: usize = 65_536;
+/// How long a message may lack pieces after the last new one (`fragment_timeout` of `rosbridge_suite`).
+pub(super) const PIECE_WAIT_MAX: Duration = Duration::from_secs(600);
+/// How long a message may lack pieces after the first one, however many come.
+pub(super) const MESSAGE_WAIT_MAX: Duration = Duration::from_secs(3600);
 /// What a piece is counted for beyond its bytes.
 const PIECE_OVERHEAD_BYTES: usize = 64;
 
@@ -39,6 +46,16 @@ struct Partial {
     total: usize,
     bytes: usize,
     pieces: BTreeMap<usize, String>,
+    began: Instant,
+    /// When the last new piece came.
+    grew: Instant,
+}
+
+impl Partial {
+    /// Returns when it is given up.
+    fn ends(&self) -> Instant {
+        (self.grew + PIECE_WAIT_MAX).min(self.began + MESSAGE_WAIT_MAX)
+    }
 }
 
 impl Fragments {
@@ -59,6 +76,7 @@ impl Fragments {
         number: usize,
         total: usize,
         data: String,
+        now: Instant,
     ) -> Result<Option<String>, FragmentError> {
         if total == 0 || total > PIECES_MAX {
             return Err(FragmentError::Total(total));
@@ -70,13 +88,21 @@ impl Fragments {
             Some(at) => self.remove(at),
             None => None,
         }
-        .unwrap_or_else(|| Partial { id: id.clone(), total, bytes: 0, pieces: BTreeMap::new() });
+        .unwrap_or_else(|| Partial {
+            id: id.clone(),
+            total,
+            bytes: 0,
+            pieces: BTreeMap::new(),
+            began: now,
+            grew: now,
+        });
         if partial.total != total {
             return Err(FragmentError::Differ);
         }
         if let std::collections::btree_map::Entry::Vacant(place) = partial.pieces.entry(number) {
             partial.bytes += data.len() + PIECE_OVERHEAD_BYTES;
             place.insert(data);
+            partial.grew = now;
         }
         if partial.pieces.len() == total {
             let texts = partial.pieces.into_values();
@@ -93,6 +119,17 @@ impl Fragments {
         self.bytes += partial.bytes;
         self.messages.push_back(partial);
         Ok(None)
+    }
+
+    /// Returns when the next message is given up.
+    pub(super) fn next_end(&self) -> Option<Instant> {
+        self.messages.iter().map(Partial::ends).min()
+    }
+
+    /// Gives up a message whose pieces have not come in time, and returns its id.
+    pub(super) fn give_up(&mut self, now: Instant) -> Option<OpId> {
+        let at = self.messages.iter().position(|partial| partial.ends() <= now)?;
+        self.remove(at).map(|partial| partial.id)
     }
 
     fn remove(&mut self, at: usize) -> Option<Partial> {
@@ -113,7 +150,8 @@ mod tests {
     #[test]
     fn pieces_in_any_order_are_put_together_once() {
         let mut fragments = Fragments::new(1000);
-        let mut take = |number, data: &str| fragments.take(&id(1), number, 3, data.into()).unwrap();
+        let now = Instant::now();
+        let mut take = |number, data: &str| fragments.take(&id(1), number, 3, data.into(), now).unwrap();
         assert_eq!(take(2, "c"), None);
         assert_eq!(take(0, "a"), None);
         assert_eq!(take(0, "other"), None);
@@ -123,19 +161,46 @@ mod tests {
 
     #[test]
     fn what_is_kept_is_bounded() {
-        let mut fragments = Fragments::new(1000);
+        let (mut fragments, now) = (Fragments::new(1000), Instant::now());
         for number in 0..100 {
-            assert_eq!(fragments.take(&id(number), 0, 2, "x".repeat(200)), Ok(None));
+            assert_eq!(fragments.take(&id(number), 0, 2, "x".repeat(200), now), Ok(None));
             assert!(fragments.bytes <= 1000 && fragments.messages.len() <= MESSAGES_MAX);
         }
         let long = "x".repeat(1000);
-        assert_eq!(fragments.take(&id(7), 0, 2, long), Err(FragmentError::TooLong(1000)));
-        assert_eq!(fragments.take(&id(7), 2, 2, String::new()).unwrap_err().to_string(), {
+        assert_eq!(fragments.take(&id(7), 0, 2, long, now), Err(FragmentError::TooLong(1000)));
+        assert_eq!(fragments.take(&id(7), 2, 2, String::new(), now).unwrap_err().to_string(), {
             "piece 2 of 2: they count from 0"
         });
-        assert!(fragments.take(&id(7), 0, 1 << 40, String::new()).is_err());
-        fragments.take(&id(8), 0, 2, String::new()).unwrap();
-        assert_eq!(fragments.take(&id(8), 1, 3, String::new()), Err(FragmentError::Differ));
-        assert_eq!(fragments.take(&id(8), 1, 2, String::new()), Ok(None));
+        assert!(fragments.take(&id(7), 0, 1 << 40, String::new(), now).is_err());
+        fragments.take(&id(8), 0, 2, String::new(), now).unwrap();
+        assert_eq!(fragments.take(&id(8), 1, 3, String::new(), now), Err(FragmentError::Differ));
+        assert_eq!(fragments.take(&id(8), 1, 2, String::new(), now), Ok(None));
+    }
+    #[test]
+    fn a_message_whose_pieces_do_not_come_in_time_is_given_up() {
+        let (mut fragments, began) = (Fragments::new(1000), Instant::now());
+        let second = Duration::from_secs(1);
+        let data = || "x".repeat(10);
+        assert_eq!(fragments.next_end(), None);
+        fragments.take(&id(1), 0, 100, data(), began).unwrap();
+        // A piece that came before is no news, a new one is.
+        fragments.take(&id(1), 0, 100, data(), began + 500 * second).unwrap();
+        assert_eq!(fragments.next_end(), Some(began + PIECE_WAIT_MAX));
+        fragments.take(&id(2), 0, 2, data(), began + 500 * second).unwrap();
+        assert_eq!(fragments.give_up(began + PIECE_WAIT_MAX - second), None);
+        assert_eq!(fragments.give_up(began + PIECE_WAIT_MAX), Some(id(1)));
+        assert_eq!(fragments.give_up(began + PIECE_WAIT_MAX), None);
+        assert_eq!(fragments.bytes(), data().len() + PIECE_OVERHEAD_BYTES);
+        assert_eq!(fragments.give_up(began + 500 * second + PIECE_WAIT_MAX), Some(id(2)));
+        assert_eq!((fragments.bytes(), fragments.next_end()), (0, None));
+        // Pieces that trickle do not keep a message for good.
+        let mut now = began;
+        let pieces = (0..100).take_while(|number| {
+            fragments.take(&id(3), *number, 100, data(), now).unwrap();
+            now += 500 * second;
+            fragments.give_up(now).is_none()
+        });
+        assert_eq!(pieces.count(), 7);
+        assert_eq!(fragments.bytes(), 0);
     }
 }

@@ -143,6 +143,10 @@ where
                         look(pulse, options)?;
                         continue;
                     }
+                    () = sleep_until(connection.fragments_end()) => {
+                        connection.give_up_fragments().await?;
+                        continue;
+                    }
                     () = tokio::time::sleep_until(begun + ROSBRIDGE_ADMISSION_MAX), if !connection.is_admitted() => {
                         return Err(RosbridgeError::NotAdmitted("no token was shown in time".to_owned()));
                     }
@@ -162,6 +166,14 @@ where
             Message::Close(_) => return Ok(()),
             Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
         }
+    }
+}
+
+/// Waits until then; for ever without a time.
+async fn sleep_until(end: Option<Instant>) {
+    match end {
+        Some(end) => tokio::time::sleep_until(end).await,
+        None => std::future::pending().await,
     }
 }
 

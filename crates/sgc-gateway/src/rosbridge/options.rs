@@ -8,6 +8,7 @@ use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
 use crate::access::{Client, Denied};
+use crate::error::GatewayError;
 
 /// Longest message that a client may send, bytes, in one frame or in fragments.
 pub const ROSBRIDGE_MESSAGE_BYTES_MAX: usize = 64 << 20;
@@ -91,6 +92,9 @@ pub enum RosbridgeError {
     /// It has not said who it is, not in time or not rightly.
     #[error("the client was not admitted: {0}")]
     NotAdmitted(String),
+    /// The credential that it showed in the session has no room for what the session has.
+    #[error("the client's new credential has no room for what it has")]
+    NoRoom(#[source] GatewayError),
     /// Its right has ended.
     #[error("the client's right has ended: {0}")]
     Denied(#[source] Denied),
@@ -104,6 +108,7 @@ impl RosbridgeError {
             Self::TooLong { max } => (1009, format!("messages of {max} bytes at most")),
             Self::TooManyErrors => (1008, "too many errors".to_owned()),
             Self::NotAdmitted(why) => (1008, why.clone()),
+            Self::NoRoom(why) => (1013, why.to_string()),
             Self::Denied(why) => (1008, why.told().to_owned()),
         })
     }
