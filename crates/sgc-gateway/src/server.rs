@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use rustls::ServerConfig;
 use rustls::sign::CertifiedKey;
+use rustls_pki_types::CertificateDer;
 use sgc_trust::{TrustAnchors, VerifiedPeer};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
@@ -114,6 +115,8 @@ pub enum ServerError {
 struct Tls {
     ws: Arc<ServerConfig>,
     grpc: Arc<ServerConfig>,
+    /// The certificates that both show, the gateway's own first.
+    chain: Vec<CertificateDer<'static>>,
 }
 
 struct Shared {
@@ -255,7 +258,7 @@ fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls
     let asks = access.takes_certificates();
     key.map(|key| {
         let ws = server_config(key, asks, &[b"http/1.1"])?;
-        Ok(Tls { ws, grpc: server_config(key, asks, &[b"h2"])? })
+        Ok(Tls { ws, grpc: server_config(key, asks, &[b"h2"])?, chain: key.cert.clone() })
     })
     .transpose()
 }
@@ -321,6 +324,11 @@ impl Server {
         let tls = tls_of(Some(key), &self.shared.door.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
+    }
+
+    /// Returns the certificates that new connections are shown, the gateway's own first; none without TLS.
+    pub fn shown(&self) -> Vec<CertificateDer<'static>> {
+        self.shared.tls.borrow().as_ref().map(|tls| tls.chain.clone()).unwrap_or_default()
     }
 
     /// Verifies tokens with this certificate of the gateway from now on.

@@ -11,7 +11,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, MutexGuard, PoisonError};
 
 use rustls::sign::CertifiedKey;
-use rustls_pki_types::CertificateDer;
 use sgc_cdr::{Layout, TypeName};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
@@ -67,8 +66,8 @@ pub(crate) struct Gateway {
     node: String,
     hub: OnceCell<Hub>,
     server: std::sync::Mutex<Option<Arc<Server>>>,
-    /// The certificates that are shown. Held by whoever changes them, so that a reload does not undo a renewal.
-    shown: std::sync::Mutex<Vec<CertificateDer<'static>>>,
+    /// Held by whoever changes the certificates that are shown, so that a reload does not undo a renewal.
+    showing: std::sync::Mutex<()>,
     /// `true` if these are the node's own, and not those of files that the configuration names.
     shows_own: AtomicBool,
 }
@@ -83,9 +82,9 @@ impl Gateway {
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
         let (types, hub, server) =
             (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
-        let (name, shown, shows_own) =
+        let (name, showing, shows_own) =
             (node_name.to_owned(), std::sync::Mutex::default(), AtomicBool::default());
-        Arc::new(Self { open, types, name, node, hub, server, shown, shows_own })
+        Arc::new(Self { open, types, name, node, hub, server, showing, shows_own })
     }
 
     /// The hub, which joins the local network if it has not yet.
@@ -116,11 +115,9 @@ impl Gateway {
         let Sockets { listen, access, key, clients_max, .. } = sockets;
         let name = format!("sgc {}", self.name);
         let key = {
-            let mut shown = self.lock_shown();
+            let _showing = self.lock_showing();
             self.shows_own.store(matches!(key, ShownKey::Own(_)), Ordering::Relaxed);
-            let key = key.certified();
-            shown.clone_from(&key.cert);
-            key
+            key.certified()
         };
         let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
@@ -136,34 +133,31 @@ impl Gateway {
         key: impl FnOnce() -> ShownKey,
     ) -> Result<bool, ServerError> {
         let Some(server) = self.server() else { return Ok(false) };
-        let mut shown = self.lock_shown();
+        let _showing = self.lock_showing();
+        let before = server.shown();
         let key = key();
         let shows_own = matches!(key, ShownKey::Own(_));
         let key = key.certified();
         server.reconfigure(access, Some(&key))?;
         self.shows_own.store(shows_own, Ordering::Relaxed);
-        let is_other = *shown != key.cert;
-        shown.clone_from(&key.cert);
-        Ok(is_other)
+        Ok(server.shown() != before)
     }
 
     /// Takes a renewed certificate of the node: new connections are shown it, unless the configuration names another.
     pub(crate) fn set_identity(&self, identity: &Identity) {
         let Some(server) = self.server() else { return };
-        let mut shown = self.lock_shown();
+        let _showing = self.lock_showing();
         server.set_gateway(identity.as_peer().clone());
         if !self.shows_own.load(Ordering::Relaxed) {
             return;
         }
-        let key = identity.certified_key();
-        match server.show(&key) {
-            Ok(()) => shown.clone_from(&key.cert),
-            Err(error) => tracing::warn!(%error, "the gateway cannot show the renewed certificate"),
+        if let Err(error) = server.show(&identity.certified_key()) {
+            tracing::warn!(%error, "the gateway cannot show the renewed certificate");
         }
     }
 
-    fn lock_shown(&self) -> MutexGuard<'_, Vec<CertificateDer<'static>>> {
-        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock_showing(&self) -> MutexGuard<'_, ()> {
+        self.showing.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What goes on, if there are sockets.
@@ -296,7 +290,7 @@ mod tests {
             client_bytes_max: 1 << 20,
         };
         gateway.listen(sockets).await.unwrap();
-        let shown = || gateway.lock_shown().clone();
+        let shown = || gateway.server().unwrap().shown();
         assert_eq!(shown(), first.chain());
         gateway.set_identity(&renewed);
         assert_eq!(shown(), renewed.chain());
