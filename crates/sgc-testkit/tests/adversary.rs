@@ -7,7 +7,6 @@
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 use std::time::Duration;
 
@@ -16,7 +15,7 @@ use sgc_endpoint::JoinStatus;
 use sgc_router::{DropReason, MappingKind};
 use sgc_testkit::{
     CapturedPacket, Dice, Member, MessageId, NodeKey, Sharing, What, World, WorldConfig, identity,
-    revocation_list, serial_list,
+    revocation_list, run_seeds, serial_list,
 };
 use sgc_trust::{CertError, Kem, ReplyKey, SignedError};
 use sgc_wire::{
@@ -682,42 +681,16 @@ fn spoilt(frame: Control) -> Control {
     }
 }
 
-/// Runs one seed; on failure says why, with the way there.
-fn run(seed: u64) -> Result<usize, String> {
-    let mut run = Run::new(seed);
-    catch_unwind(AssertUnwindSafe(|| run.all())).map(|()| run.actions).map_err(|panic| {
-        let text = panic.downcast_ref::<String>().cloned();
-        let text = text.or_else(|| panic.downcast_ref::<&str>().map(|s| (*s).to_owned()));
-        format!("{}\nseed {seed}: {}", run.world.trace(), text.unwrap_or_default())
-    })
-}
-
-fn seeds() -> Vec<u64> {
-    let Ok(text) = std::env::var("SGC_SEEDS") else { return COMMITTED.to_vec() };
-    let range = text.split_once("..").and_then(|(a, b)| Some(a.parse().ok()?..b.parse().ok()?));
-    match (range, text.parse()) {
-        (Some(range), _) => range.collect(),
-        (None, Ok(one)) => vec![one],
-        (None, Err(_)) => panic!("SGC_SEEDS is {text:?}, not one seed or a range like 100..200"),
-    }
-}
-
 #[test]
 fn an_adversary_takes_nothing_from_honest_nodes_with_an_honest_way() {
-    // A failing seed is told once, with its trace; not a second time with a stack.
-    std::panic::set_hook(Box::new(|_| {}));
-    let mut failed = Vec::new();
-    let mut actions = 0;
-    for seed in seeds() {
-        match run(seed) {
-            Ok(done) => actions += done,
-            Err(why) => {
-                eprintln!("{why}\n");
-                failed.push(seed);
-            }
-        }
-    }
-    let _ = std::panic::take_hook();
-    assert!(failed.is_empty(), "{} seeds fail: {failed:?}", failed.len());
-    eprintln!("{actions} hostile actions");
+    let actions = run_seeds(
+        COMMITTED,
+        Run::new,
+        |run| {
+            run.all();
+            run.actions
+        },
+        |run| run.world.trace(),
+    );
+    eprintln!("{} hostile actions", actions.iter().sum::<usize>());
 }
