@@ -43,6 +43,8 @@ enum Command {
     Teleop(RunArgs),
     /// Links by every transport beside TCP and TLS; needs root for the part with losses
     Transports(RunArgs),
+    /// Memory of a router with 256 links, by every transport
+    RouterMemory(RunArgs),
     /// Programs without ROS: gRPC and the rosbridge protocol
     Gateway(gateway::GatewayArgs),
     /// The pages and plots of a run of `compare`, once more from its figures
@@ -95,7 +97,7 @@ struct RunArgs {
     /// Names in the router, for `rib`
     #[arg(long, value_name = "N,N,…", value_delimiter = ',', default_values_t = [10_000, 1_000_000, 10_000_000])]
     names: Vec<usize>,
-    /// Transports, for `teleop` and `transports`; those that this build does not know are left out
+    /// Transports, for `teleop`, `transports` and `router-memory`; those that this build does not know are left out
     #[arg(long, value_name = "SCHEME,…", value_delimiter = ',', default_values = uplink::SCHEMES)]
     schemes: Vec<String>,
     /// The state and the commands of `teleop` are reliable topics
@@ -121,6 +123,7 @@ fn main() -> Result<()> {
         Command::FirstMessage(args) => part(&args, "first-message", first_message::run),
         Command::Teleop(args) => part(&args, "teleop", teleop::run),
         Command::Transports(args) => part(&args, "transports", transports::run),
+        Command::RouterMemory(args) => part(&args, "router-memory", transports::router::run),
         Command::Gateway(args) => gateway::run(&args),
         Command::Report(args) => compare::Run::read(&args.run)?.render(&args.out),
         Command::Compare(args) => compare::run(args),

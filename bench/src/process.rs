@@ -91,10 +91,15 @@ pub(crate) struct SgcRouter {
 impl SgcRouter {
     /// Starts it in `dir`, with the identity in `router.identity` there.
     pub(crate) fn start(sgc: &Path, dir: &Path) -> Result<Self> {
+        Self::start_on("quic", sgc, dir)
+    }
+
+    /// The same, with a listener of this scheme.
+    pub(crate) fn start_on(scheme: &str, sgc: &Path, dir: &Path) -> Result<Self> {
         let (config, socket) = (dir.join("router.toml"), dir.join("router.sock"));
         let text = format!(
             "identity = \"router.identity\"\n[node]\nstate = \"router.state\"\n\
-             [router]\nlisten = [\"quic://127.0.0.1:0\"]\n[admin]\nsocket = {:?}\n",
+             [router]\nlisten = [\"{scheme}://127.0.0.1:0\"]\n[admin]\nsocket = {:?}\n",
             socket.display().to_string()
         );
         fs::write(&config, text)?;

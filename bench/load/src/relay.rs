@@ -159,7 +159,8 @@ fn publish(stream: &mut TcpStream, writer: &Writer) -> Result<()> {
         let mut head = [0; HEAD_BYTES];
         reader.read_exact(&mut head)?;
         let bytes = u32::from_le_bytes(*head.first_chunk().context("a head")?) as usize;
-        let number = |at: usize| head[at..at + 8].iter().rev().fold(0, |all, &byte| all << 8 | u64::from(byte));
+        let number =
+            |at: usize| head[at..at + 8].iter().rev().fold(0, |all, &byte| all << 8 | u64::from(byte));
         let (seq, stamp_ns) = (number(4), number(12));
         ensure!(bytes <= MESSAGE_BYTES_MAX, "a message of {bytes} bytes");
         if reader.buffer().len() >= bytes {

@@ -6,6 +6,7 @@
 
 mod links;
 mod raw;
+pub(crate) mod router;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
