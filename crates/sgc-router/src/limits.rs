@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 /// Longest way, in links, that data can take.
 pub(crate) const HOPS_MAX: u8 = sgc_wire::HOP_LIMIT - 3;
-/// How often a name that somebody waits for is asked for again.
+/// Interval at which a name that somebody waits for is asked for again.
 pub(crate) const QUERY_EVERY: Duration = Duration::from_secs(20);
 /// How many times as many requests a router may bring as a proxy.
 const ROUTER_FACTOR: u32 = 16;
@@ -177,7 +177,7 @@ impl Allowance {
 #[derive(Debug)]
 pub(crate) struct Turns {
     max: u32,
-    /// When all that were given out are paid for.
+    /// Time at which all that were given out are paid for.
     next: Option<Instant>,
 }
 
@@ -190,7 +190,7 @@ impl Turns {
         QUERY_EVERY / self.max.saturating_mul(if is_router { ROUTER_FACTOR } else { 1 })
     }
 
-    /// When the next one is.
+    /// Returns the time of the next one.
     pub(crate) fn next(&self, now: Instant, is_router: bool) -> Instant {
         let ahead = QUERY_EVERY - self.interval(is_router);
         self.next.and_then(|next| next.checked_sub(ahead)).map_or(now, |at| at.max(now))

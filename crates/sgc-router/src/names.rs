@@ -698,7 +698,7 @@ impl Router {
         }
     }
 
-    /// When all may be asked for a name on behalf of those who wait for it: of the one whose turn comes first. This node's
+    /// Returns the time at which all may be asked for a name on behalf of those who wait for it: the first turn of any of them. This node's
     /// own endpoint need not wait.
     fn turn(&mut self, name: &Name, again: bool) -> Instant {
         let now = self.now.instant;

@@ -17,7 +17,7 @@ pub(crate) struct Shares<K, V> {
     entries: BTreeMap<K, Entry<V>>,
     /// The entries of each node, the oldest first.
     of_node: BTreeMap<NodeId, BTreeSet<(u64, K)>>,
-    /// How many each node holds, the one with the most last.
+    /// Number that each node holds, the one with the most last.
     held: BTreeSet<(usize, NodeId)>,
     /// Number of the next entry.
     next: u64,
