@@ -517,7 +517,8 @@ async fn carry_out(
         AdminRequest::Graph(name) => {
             let (reply, graph) = oneshot::channel();
             events.send(CoreEvent::Graph(name, reply)).await.map_err(|_| stopping())?;
-            let graph = graph.await.map_err(|_| stopping())?;
+            let mut graph = graph.await.map_err(|_| stopping())?;
+            graph.gateway_refused = gateway.status().map(|status| status.refused).unwrap_or_default();
             serde_json::to_string(&graph).map_err(|error| error.to_string())
         }
         // They are not answered in one line.

@@ -733,14 +733,6 @@ impl<N: RosNetwork> Core<N> {
             }
         });
         let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
-        let mut drops = self.control_drops.snapshot();
-        drops.extend(self.data.drops().snapshot());
-        drops.extend(self.data.rates().drops());
-        drops.extend(self.ros_failures.snapshot());
-        drops.extend(self.board.drops().snapshot());
-        let audit =
-            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
-        drops.extend(audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n)));
         let router = self.router.stats();
         Status {
             node: self.identity.node_name().to_string(),
@@ -766,12 +758,8 @@ impl<N: RosNetwork> Core<N> {
             alerts: self.alerts(),
             problems: self.problems(),
             names: names.collect(),
-            drops,
-            refused: sgc_transport::RefusalKind::ALL
-                .into_iter()
-                .map(|kind| (kind.label().to_owned(), self.transport.refused(kind)))
-                .filter(|(_, n)| *n > 0)
-                .collect(),
+            drops: self.all_drops(),
+            refused: self.all_refused(),
             router: RouterLine {
                 nodes: router.nodes,
                 names: router.names,
@@ -781,6 +769,31 @@ impl<N: RosNetwork> Core<N> {
             // The core knows nothing of it.
             gateway: None,
         }
+    }
+
+    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
+    fn all_drops(&self) -> BTreeMap<String, u64> {
+        let audit =
+            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
+        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n));
+        let mut all: BTreeMap<String, u64> = audit.collect();
+        for counts in [
+            self.control_drops.snapshot(),
+            self.data.drops().snapshot(),
+            self.data.rates().drops(),
+            self.ros_failures.snapshot(),
+            self.board.drops().snapshot(),
+        ] {
+            counts.into_iter().for_each(|(key, n)| *all.entry(key).or_default() += n);
+        }
+        all
+    }
+
+    /// Returns the peers that were refused a link, by kind.
+    fn all_refused(&self) -> BTreeMap<String, u64> {
+        let all = sgc_transport::RefusalKind::ALL.into_iter();
+        let all = all.map(|kind| (kind.label().to_owned(), self.transport.refused(kind)));
+        all.filter(|(_, n)| *n > 0).collect()
     }
 }
 

@@ -38,8 +38,12 @@ pub struct Graph {
     pub routers: Vec<Search>,
     /// Names that are shared, used, carried or asked for here.
     pub names: BTreeMap<String, NameLine>,
-    /// Drops by kind.
+    /// Drops by kind, and by kind and culprit.
     pub drops: BTreeMap<String, u64>,
+    /// Peers refused a link, by kind.
+    pub refused: BTreeMap<String, u64>,
+    /// Programs refused at the gateway, by kind.
+    pub gateway_refused: BTreeMap<String, u64>,
     /// What the user was told once.
     pub problems: Vec<String>,
     /// Alerts for an operator.

@@ -20,6 +20,7 @@ use sgc_node::config::{self, Config};
 
 use crate::error::CliError;
 use crate::topic::NodeArgs;
+use crate::why::refusals;
 use crate::{files, output, run};
 
 /// How long a node may take to answer.
@@ -320,11 +321,12 @@ impl Status {
             &["name", "packets", "bytes", "dropped"],
             self.names.iter().map(NameTraffic::row).collect(),
         );
-        let counts = |counts: &BTreeMap<String, u64>| {
-            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string()]).collect()
+        let counts = |counts: &BTreeMap<String, u64>, meaning: fn(&str) -> String| {
+            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string(), meaning(key)]).collect()
         };
-        section("Drops", &["reason", "count"], counts(&self.drops));
-        section("Refused peers", &["reason", "count"], counts(&self.refused));
+        let head = ["reason", "count", "meaning"];
+        section("Drops", &head, counts(&self.drops, refusals::drop_meaning));
+        section("Refused peers", &head, counts(&self.refused, refusals::door_meaning));
         if let Some(gateway) = &self.gateway {
             section(
                 "Programs without ROS",
@@ -332,7 +334,7 @@ impl Status {
                 gateway.clients.iter().map(GatewayClient::row).collect(),
             );
             if !gateway.refused.is_empty() {
-                section("Refused there", &["reason", "count"], counts(&gateway.refused));
+                section("Refused there", &head, counts(&gateway.refused, refusals::gateway_meaning));
             }
             lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers));
         }

@@ -54,12 +54,11 @@ impl<N: RosNetwork> Core<N> {
             node: self.identity.node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             has_ros: self.network.is_some(),
-            drops: self.data.drops().snapshot(),
+            drops: self.all_drops(),
+            refused: self.all_refused(),
             alerts: self.alerts(),
             ..Graph::default()
         };
-        graph.drops.extend(self.control_drops.snapshot());
-        graph.drops.extend(self.ros_failures.snapshot());
         let links = self.links.iter().map(|(id, entry)| {
             let peer = entry.link.peer().node_id;
             let (_, silent) = self.router.link_cost(*id).unwrap_or_default();

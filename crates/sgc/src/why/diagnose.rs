@@ -9,6 +9,7 @@ use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Share, ShareRoute, U
 use sgc_ros::{is_pattern, matches};
 
 use super::near::{hint, near};
+use super::refusals;
 use super::{Step, Verdict};
 
 /// Steps, of which one that is wrong is the last.
@@ -23,6 +24,7 @@ fn begin(graph: &Graph) -> (Walk, bool) {
     let stops = |alert: &Alert| (alert.stops_all() || is_clock(&alert)) && believed == 0;
     let (stopping, others): (Vec<_>, Vec<_>) = graph.alerts.iter().partition(|alert| stops(alert));
     steps.extend(others.into_iter().map(|alert| Step::unknown(alert.to_string()).with_fix(alert.fix())));
+    steps.extend(refusals::steps(graph));
     steps.extend(stopping.first().map(|alert| Step::wrong(alert.to_string(), alert.fix())));
     (steps, !stopping.is_empty())
 }
@@ -301,9 +303,14 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
         if let Some((who, why)) = route.refused.iter().next() {
             steps.push(Step::wrong(
                 format!("{who} asked for it and was refused: {why}"),
-                format!(
-                    "if {who} may have it, add it to `to` of this [[share]] (`publish`, if it is to publish), then `sgc \
-                     reload`; `sgc policy test` says who may"
+                refusals::fix_at_owner(why).map_or_else(
+                    || {
+                        format!(
+                            "if {who} may have it, add it to `to` of this [[share]] (`publish`, if it is to publish), then \
+                             `sgc reload`; `sgc policy test` says who may"
+                        )
+                    },
+                    str::to_owned,
                 ),
             ));
         } else {
@@ -413,10 +420,11 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
                 "nobody in reach knows it: is its node running, and linked to the same routers? Is its name spelt right?"
             }
         };
-        steps.push(Step::wrong(
-            format!("{owner} {state}: {why}"),
-            format!("run `sgc status` on {owner}; its name in `from` has to be that of its identity"),
-        ));
+        let refused = state.strip_prefix("refuses its catalogue: ").and_then(refusals::fix_at_asker);
+        let look =
+            || format!("run `sgc status` on {owner}; its name in `from` has to be that of its identity");
+        let fix = refused.map_or_else(look, str::to_owned);
+        steps.push(Step::wrong(format!("{owner} {state}: {why}"), fix));
         return;
     }
     let routes: Vec<_> = used.routes.iter().filter(|route| route.topic == topic).collect();
@@ -441,7 +449,10 @@ fn unlisted(graph: &Graph, used: &Use, topic: &str) -> Step {
         return match &used.refused {
             Some(why) => Step::wrong(
                 format!("{owner} refuses the token: {why}"),
-                format!("ask {owner} for a new token (`sgc share-token`)"),
+                refusals::fix_at_asker(why).map_or_else(
+                    || format!("ask {owner} for a new token (`sgc share-token`)"),
+                    str::to_owned,
+                ),
             ),
             None => Step::wrong(
                 format!(
@@ -508,9 +519,12 @@ fn walk_use_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk)
         steps.push(match (&route.refused, route.join.as_deref()) {
             (Some(why), _) => Step::wrong(
                 format!("{owner} refuses it: {why}"),
-                format!(
-                    "on {owner}: `sgc why {}` names the entry that is missing; it is asked again by itself",
-                    used.topic
+                refusals::fix_at_asker(why).map_or_else(
+                    || {
+                        let topic = &used.topic;
+                        format!("on {owner}: `sgc why {topic}` names the entry that is missing; it is asked again by itself")
+                    },
+                    str::to_owned,
                 ),
             ),
             (None, Some("waiting")) => Step::wrong(
@@ -754,7 +768,9 @@ fn traffic(line: &NameLine, what: &str, steps: &mut Walk) {
     let lost: BTreeMap<_, _> = line.dropped.iter().filter(|(reason, _)| *reason != "no_subscriber").collect();
     let Some((worst, _)) = lost.iter().max_by_key(|(_, count)| **count) else { return };
     let all: Vec<_> = lost.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
-    let (means, fix) = drop_reason(worst);
+    let (means, fix) = refusals::of_packets(worst)
+        .map_or(("for another reason", ""), |refusal| (refusal.means, refusal.fix));
+    let fix = if fix.is_empty() { "`sgc status` shows all drops" } else { fix };
     let found = format!("dropped here: {} ({means})", all.join(", "));
     let total: u64 = lost.values().copied().sum();
     steps.push(if total > line.packets {
@@ -772,53 +788,6 @@ fn no_definition(type_name: &str) -> Step {
         "name a directory with packages that define it with `definitions` in [ros], or start the node where ROS 2 is sourced; \
          or take `encoding = \"json\"` out of the [[share]]",
     )
-}
-
-fn drop_reason(reason: &str) -> (&'static str, &'static str) {
-    match reason {
-        "wrong_way" => {
-            ("it came over a link that the tree does not use", "a few when a way changes are no fault")
-        }
-        "hop_limit" => {
-            ("it went in a circle, or over too many routers", "look at the links between the routers")
-        }
-        "stalled" => (
-            "a reliable consumer took nothing for seconds",
-            "is a subscriber stopped? A best-effort one would hold nothing up",
-        ),
-        "stale" => (
-            "newer messages took the place of what could not be sent in time",
-            "the link is thinner than the topic: set max_rate, max_bandwidth or a `priority` in the [[share]]",
-        ),
-        "link_closed" => {
-            ("a link ended with something under way", "reliable topics ask for it again by themselves")
-        }
-        "malformed" | "unknown_label" => ("it could not be read", "do both nodes have one version of sgc?"),
-        "not_granted" => ("there was no key for it yet", "a few when a topic begins are no fault"),
-        "sink" => (
-            "it was refused when it was opened: a replay, a broken seal or signature, or lost for good",
-            "`sgc status` counts the kinds under Drops",
-        ),
-        "no_writer" => ("no local writer was there for it", "look into the node's log for what DDS said"),
-        "too_large" => ("larger than 64 MiB", "publish smaller messages"),
-        "thinned" => {
-            ("more came than max_rate or max_bandwidth let on", "raise the limit if that is not meant")
-        }
-        "overrun" => (
-            "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
-            "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
-        ),
-        "no_definition" => (
-            "its messages travel as JSON, and what its type looks like was not known",
-            "name a directory that defines it with `definitions` in [ros]; a few when a topic begins are no fault",
-        ),
-        "not_converted" => (
-            "a publisher wrote something else than its type says, so that it could not become JSON",
-            "build the publisher and the definitions that this node finds from one version of the package",
-        ),
-        "too_old" => ("older than max_age", "raise max_age, or compare the clocks of the hosts"),
-        _ => ("for another reason", "`sgc status` shows all drops"),
-    }
 }
 
 fn far_half(who: &str, topic: &str, steps: &mut Walk) {
@@ -844,7 +813,7 @@ fn whom([nodes, groups, fleets]: [usize; 3]) -> String {
     if all.is_empty() { "nobody".to_owned() } else { all.join(", ") }
 }
 
-fn link_of(graph: &Graph, link: u32) -> String {
+pub(super) fn link_of(graph: &Graph, link: u32) -> String {
     match graph.links.iter().find(|l| l.id == link) {
         _ if link == 0 => "this node".to_owned(),
         Some(l) => {

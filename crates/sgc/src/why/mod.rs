@@ -5,6 +5,7 @@
 
 mod diagnose;
 mod near;
+pub(crate) mod refusals;
 #[cfg(test)]
 mod tests;
 

@@ -7,6 +7,8 @@ use sgc_node::graph::{
     Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use, UseRoute,
 };
 
+use sgc_wire::{RefuseReason, RejectReason};
+
 use super::{Verdict, diagnose};
 
 const STRING: &str = "std_msgs/msg/String";
@@ -306,6 +308,72 @@ fn each_fault_of_a_user_is_named() {
         let wrong = wrong(&graph, "/a");
         assert!(wrong.contains(found), "{wrong:?} is not {found:?}");
     }
+}
+
+/// The remedy of the step that is wrong.
+fn fix(graph: &Graph) -> String {
+    let steps = diagnose::interface(graph, "/a");
+    let step = steps.into_iter().find(|step| step.verdict == Verdict::Wrong);
+    step.and_then(|step| step.fix).unwrap_or_default()
+}
+
+#[test]
+fn a_refused_topic_has_the_remedy_of_its_reason_at_both_ends() {
+    for (why, at_owner, at_asker) in [
+        (RefuseReason::NotPermitted.to_string(), "add it to `to`", "names the entry that is missing"),
+        (RefuseReason::Revoked.to_string(), "`sgc fleet enroll` it again", "`sgc fleet enroll` it again"),
+        (RefuseReason::Limit.to_string(), "has room for 4096", "no place for another subscriber"),
+        (RefuseReason::Clock.to_string(), "compare `date -u`", "compare `date -u`"),
+    ] {
+        let mut graph = owner();
+        graph.shares[0].routes[0].granted.clear();
+        graph.shares[0].routes[0].refused = [("desk".to_owned(), why.clone())].into();
+        assert!(fix(&graph).contains(at_owner), "{why}: {}", fix(&graph));
+        let mut graph = user();
+        graph.uses[0].routes[0].is_granted = false;
+        graph.uses[0].routes[0].refused = Some(why.clone());
+        assert!(fix(&graph).contains(at_asker), "{why}: {}", fix(&graph));
+    }
+    let mut graph = user();
+    graph.uses[0].has_catalogue = false;
+    graph.uses[0].owner_state = Some(format!("refuses its catalogue: {}", RejectReason::Limit));
+    assert!(fix(&graph).contains("no place for more branches or requests"), "{}", fix(&graph));
+}
+
+#[test]
+fn refusals_are_named_before_the_way_with_the_peers_that_cause_them() {
+    let mut graph = user();
+    graph.drops = [
+        ("crl_flood".to_owned(), 9),
+        ("crl_flood from link 1".to_owned(), 7),
+        ("crl_flood from link 2".to_owned(), 2),
+        ("unknown".to_owned(), 30),
+    ]
+    .into();
+    graph.refused = [("too_many_from_address".to_owned(), 400), ("revoked".to_owned(), 3)].into();
+    graph.gateway_refused = [("too many clients of one credential".to_owned(), 5)].into();
+    let steps = diagnose::interface(&graph, "/a");
+    let said = steps.iter().filter(|step| step.verdict == Verdict::Unknown && step.fix.is_some());
+    let said: Vec<_> = said.map(|step| step.found.as_str()).take(4).collect();
+    assert!(
+        said[0].starts_with("peers refused a link: too_many_from_address 400 (too many were"),
+        "{said:?}"
+    );
+    assert!(said[1].starts_with("refused here: crl_flood 9, of these 7 over link 1 to cloudclo"), "{said:?}");
+    assert!(
+        said[2].starts_with("programs refused at the gateway: too many clients of one credential 5"),
+        "{said:?}"
+    );
+    assert!(said[3].starts_with("peers refused a link: revoked 3"), "{said:?}");
+    // What happens in a sound network is no news.
+    assert!(!steps.iter().any(|step| step.found.contains("unknown 30")));
+    // The same at a router, which knows names alone.
+    assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
+    // Of very many the worst are named.
+    let all = crate::why::refusals::tests::every_named_refusal();
+    graph.drops.extend(all.into_iter().map(|key| (key.to_owned(), 1)));
+    let steps = diagnose::interface(&graph, "/a");
+    assert_eq!(steps.iter().filter(|step| step.found.starts_with("refused here: ")).count(), 8 - 3);
 }
 
 #[test]

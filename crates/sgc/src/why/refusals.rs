@@ -1,0 +1,663 @@
+//! What each refusal means and what to do about it: the one table that `sgc why` and `sgc status` explain counters by.
+//!
+//! The counters themselves are listed in `docs/spec/routing.md`, drops, and kept by the node.
+
+use std::collections::BTreeMap;
+
+use sgc_node::graph::Graph;
+use sgc_wire::{RefuseReason, RejectReason};
+
+use super::{Step, diagnose};
+
+/// Most refusals that `sgc why` names before it walks: those that were counted most.
+const NAMED_MAX: usize = 8;
+
+/// A counter's explanation.
+#[derive(Debug)]
+pub(crate) struct Refusal {
+    /// The counter, as the node spells it.
+    pub(super) key: &'static str,
+    pub(super) means: &'static str,
+    /// What the user can do; empty where nothing has to be done.
+    pub(super) fix: &'static str,
+    /// True if an honest network never causes it, or somebody has to see to it: `sgc why` names it for any topic.
+    pub(super) is_named: bool,
+}
+
+/// A refusal that somebody has to see to.
+const fn named(key: &'static str, means: &'static str, fix: &'static str) -> Refusal {
+    Refusal { key, means, fix, is_named: true }
+}
+
+/// A refusal that happens where nothing is wrong, or that the walk of a topic names.
+const fn counted(key: &'static str, means: &'static str, fix: &'static str) -> Refusal {
+    Refusal { key, means, fix, is_named: false }
+}
+
+const SAME_VERSION: &str = "do both nodes have one version of sgc?";
+const SET_CLOCK: &str =
+    "compare `date -u` on both machines and set the clock that is wrong, for instance by NTP (`timedatectl`)";
+const ENROLL_AGAIN: &str = "if the node is to come back, `sgc fleet enroll` it again, which gives it the next incarnation, and \
+                            install the new identity there";
+const DDS_LOG: &str = "look into the node's log for what DDS said";
+const DEFINITIONS: &str =
+    "name a directory that defines it with `definitions` in [ros]; a few when a topic begins are no fault";
+const FLEET_FILE: &str =
+    "look into the node's log: is the fleet's file there, and may the node's user write it?";
+const RAISE_CLIENTS: &str = "close clients that are not needed, or raise `clients_max` in [gateway]; of one token, certificate or \
+                             address a quarter of the places at most: make several tokens for many viewers";
+const FEWER: &str = "subscribe to and publish less in one client, or spread it over several tokens (docs/gateway.md, how much one \
+                     may have)";
+const SLOW_CLIENTS: &str = "if it is somebody who connects again and again, keep the address out by a firewall; programs of this \
+                            host have places of their own";
+
+/// Control frames, the machines, the authority and the local network.
+const CONTROL: &[Refusal] = &[
+    named(
+        "not_verified",
+        "a neighbour brought what is not signed as it says, or under a certificate that does not hold here: over, revoked with \
+         its node's incarnation, or of another CA",
+        "the log names the neighbour and the cause; a node that was revoked by mistake has to be enrolled again",
+    ),
+    named(
+        "not_owner",
+        "a node that carries nobody else's names announced names of another node",
+        "if it is a router, enroll it with --router or --may-route; else find out what runs there",
+    ),
+    counted("stale", "older than what is known; a few when announcements cross are no fault", ""),
+    named(
+        "hop_limit",
+        "it went in a circle, or over too many routers",
+        "look at the links between the routers",
+    ),
+    named(
+        "limit",
+        "a neighbour, or a node behind it, has no place left here for more names, branches, interests or requests a second",
+        "the log says which limit; have that node share or use fewer topics, or use them over several nodes",
+    ),
+    counted(
+        "unknown",
+        "a frame for what is not here any more; a few when things end are no fault",
+        SAME_VERSION,
+    ),
+    counted(
+        "wrong_way",
+        "it came from a neighbour that is not on the way; a few when a way changes are no fault",
+        "",
+    ),
+    counted("no_link", "a frame of a link that had ended", ""),
+    named(
+        "crl",
+        "a revocation list is not believed: altered, of a CA that is not trusted here, or more than there is room for",
+        "the log says which; where copies of a fleet's file went their own ways, `sgc fleet merge` them and hand out the new list",
+    ),
+    named(
+        "crl_flood",
+        "a partner's CA signs new revocation lists faster than one a second; of those beyond it the newest waits",
+        "ask the partner whether somebody else has the key of its CA; until that is known, take the CA out of its [[partner]]",
+    ),
+    counted("clock", "signed by a clock that is not near the one here", SET_CLOCK),
+    named(
+        "not_router",
+        "a neighbour says that it carries others' names, and its certificate does not let it: nothing goes through it",
+        "enroll it with --router or --may-route",
+    ),
+    named(
+        "stale_flood",
+        "a neighbour brings too many announcements that are old; more of them are not looked at for a while",
+        "look at that neighbour: somebody behind it replays, or signs anew all the time; end the link to it if it goes on",
+    ),
+    named("malformed_control", "a neighbour sends control frames that cannot be read", SAME_VERSION),
+    named(
+        "control_queue_full",
+        "a peer does not take control frames, so its link was closed",
+        "is it stopped, or the link far too thin? It is dialled again by itself",
+    ),
+    counted(
+        "identity_in_use",
+        "two processes use one identity",
+        "`sgc status` says where, under what needs attention",
+    ),
+    counted("clocks_differ", "the clock of a peer differs from the one here", SET_CLOCK),
+    named(
+        "endpoint_not_verified",
+        "an answer or request is not signed by whom it says, or under a certificate that does not hold",
+        "a router on the way alters it, or a clock is wrong: compare `date -u` on both machines",
+    ),
+    named("endpoint_grant", "a grant cannot be opened, or is not for this node", SAME_VERSION),
+    counted("endpoint_unexpected", "a frame that nobody asked for", SAME_VERSION),
+    named(
+        "endpoint_catalogue_too_large",
+        "this node shares more than fits into what it lists for others: some topics are left out",
+        "share fewer topics, or give some to another node",
+    ),
+    counted("join_refused", "a node that may not have a topic asked for it", "`sgc why TOPIC` names it"),
+    named("replays_full", "too many ask for a history at once; they ask again by themselves", ""),
+    named(
+        "renewal_refused",
+        "the fleet's authority gives this node no new certificate",
+        "see `sgc fleet list` there: is the node revoked or unknown? Then enroll it again",
+    ),
+    named(
+        "credentials_unusable",
+        "what the fleet's authority sent is not usable with this node's key",
+        "is the identity file in use on two machines? Enroll one of them under a name of its own",
+    ),
+    named(
+        "renewal_too_soon",
+        "a node asks this authority for another certificate too soon; it is answered later",
+        "is it started again and again, or is its identity in use at two places?",
+    ),
+    named(
+        "renewal_queue_full",
+        "too many nodes ask this authority at once; they ask again by themselves",
+        "",
+    ),
+    named("renewal_fleet_file", "this authority cannot read or write the fleet's file", FLEET_FILE),
+    named(
+        "renewal_unknown_node",
+        "a node asks this authority that the fleet's file does not know",
+        "another copy of the file enrolled it: bring that here and `sgc fleet merge` it",
+    ),
+    named("renewal_revoked", "a node asks this authority whose incarnation is revoked", ENROLL_AGAIN),
+    named("renewal_unusable", "a node's request for a certificate is not usable", SAME_VERSION),
+    named(
+        "operation_not_permitted",
+        "a node that is no operator wants to change the fleet",
+        "if it may, name it in `operators` of [authority]",
+    ),
+    counted("operation_stale", "an operator's request was of an earlier run; it is made again by itself", ""),
+    counted("operation_repeated", "an operator's request came twice and was carried out once", ""),
+    named("operation_busy", "too many operations wait at this authority", "try again in a minute"),
+    named("operation_fleet_file", "this authority cannot read or write the fleet's file", FLEET_FILE),
+    counted("operation_refused", "an operation was not possible; the operator was told why", ""),
+    named("operation_malformed", "an operator's request cannot be read", SAME_VERSION),
+    counted(
+        "type_differs",
+        "an owner describes a type otherwise than its publishers announce it",
+        "build both from one version of the interface package",
+    ),
+    named(
+        "type_refused",
+        "a description of a type is not what its hash says, or larger than any",
+        SAME_VERSION,
+    ),
+    counted("type_not_described", "an owner does not know what a type looks like", DEFINITIONS),
+    named(
+        "types_full",
+        "there is no room for more descriptions of types",
+        "use fewer types from other nodes at this one",
+    ),
+    counted(
+        "types_busy",
+        "descriptions of types come faster than they are judged; they are asked for again",
+        "",
+    ),
+    named(
+        "type_failed",
+        "a description of a type could not be judged: a fault in this program",
+        "please report it",
+    ),
+    counted(
+        "json_unknown_type",
+        "messages travel as JSON, and what their type looks like is not known here",
+        DEFINITIONS,
+    ),
+    named(
+        "json_refused",
+        "JSON that is not what its type says",
+        "build both sides from one version of the package",
+    ),
+    named("decompress", "a compressed message is not what it claims", SAME_VERSION),
+    named("create_reader", "the local network refused a reader", DDS_LOG),
+    named("create_writer", "the local network refused a writer", DDS_LOG),
+    counted("create_service", "the local network refused an end of a service", DDS_LOG),
+    counted("announce_nodes", "the local network could not be told of other nodes", DDS_LOG),
+    counted("frames", "a transform could not be given the prefix of its owner", SAME_VERSION),
+    counted("call_refused", "a call was refused: too many were under way, or its server is not there", ""),
+    counted("reply_to_nothing", "a reply came to a call that nobody waits for any more", ""),
+    counted("write_payload", "a message could not be given to the local network", DDS_LOG),
+    counted(
+        "write_timeout",
+        "a local subscriber that is to get everything took nothing for too long",
+        "is it stopped?",
+    ),
+    counted("write_failed", "the local network did not take a message", DDS_LOG),
+    named(
+        "over_rate",
+        "a peer sends more than `peer_rate` lets it: best-effort messages are dropped, reliable ones slowed",
+        "raise `peer_rate` in [transport], or set max_rate or max_bandwidth in the [[share]] on the peer",
+    ),
+    counted("mdns_crowded", "more nodes announce themselves on the local network than are listened to", ""),
+    counted("mdns_unknown", "an announcement on the local network is of another version", SAME_VERSION),
+    counted("mdns_overrun", "announcements on the local network come faster than they are read", ""),
+    named(
+        "audit_lost",
+        "records could not be written into the audit log",
+        "is the disk full, or does the directory belong to another user?",
+    ),
+    counted(
+        "audit_summed_up",
+        "records of one peer came too fast for the audit log and stand there as a number",
+        "",
+    ),
+];
+
+/// Packets and messages of a name.
+const PACKETS: &[Refusal] = &[
+    counted("no_subscriber", "nobody asked for it yet, or any more", ""),
+    counted(
+        "wrong_way",
+        "it came over a link that the tree does not use",
+        "a few when a way changes are no fault",
+    ),
+    counted(
+        "hop_limit",
+        "it went in a circle, or over too many routers",
+        "look at the links between the routers",
+    ),
+    counted("no_such_sink", "it was for a subscriber that is gone", ""),
+    counted(
+        "stalled",
+        "a reliable consumer took nothing for seconds",
+        "is a subscriber stopped? A best-effort one would hold nothing up",
+    ),
+    counted(
+        "stale",
+        "newer messages took the place of what could not be sent in time",
+        "the link is thinner than the topic: set max_rate, max_bandwidth or a `priority` in the [[share]]",
+    ),
+    counted(
+        "link_closed",
+        "a link ended with something under way",
+        "reliable topics ask for it again by themselves",
+    ),
+    counted("malformed", "it could not be read", SAME_VERSION),
+    counted("unknown_label", "it could not be read", SAME_VERSION),
+    counted("not_granted", "there was no key for it yet", "a few when a topic begins are no fault"),
+    counted(
+        "sink",
+        "it was refused when it was opened: a replay, a broken seal or signature, or lost for good",
+        "`sgc status` counts the kinds under Drops",
+    ),
+    counted("no_writer", "no local writer was there for it", DDS_LOG),
+    counted("too_large", "larger than 64 MiB", "publish smaller messages"),
+    counted(
+        "thinned",
+        "more came than max_rate or max_bandwidth let on",
+        "raise the limit if that is not meant",
+    ),
+    counted("too_old", "older than max_age", "raise max_age, or compare the clocks of the hosts"),
+    counted("repeated", "a publisher's history came once more after its node started anew", ""),
+    counted(
+        "overrun",
+        "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
+        "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
+    ),
+    counted(
+        "no_definition",
+        "its messages travel as JSON, and what its type looks like was not known",
+        DEFINITIONS,
+    ),
+    counted(
+        "not_converted",
+        "a publisher wrote something else than its type says, so that it could not become JSON",
+        "build the publisher and the definitions that this node finds from one version of the package",
+    ),
+];
+
+/// Peers that wanted a link.
+const DOOR: &[Refusal] = &[
+    named(
+        "no_certificate",
+        "it showed no certificate",
+        "does that node have an identity, and is it an sgc at all?",
+    ),
+    named(
+        "other_ca",
+        "its certificate is of a CA that is not trusted here",
+        "if its fleet may link here, name the CA in a [[partner]], or in `accept` of [router]",
+    ),
+    named(
+        "not_admitted",
+        "its certificate is of a CA that is trusted here, but whose nodes may not link",
+        "if they may, add the CA to `accept` in [router]",
+    ),
+    named("expired", "its certificate is over", "`sgc fleet renew` it there, and compare the clocks"),
+    named("not_yet_valid", "its certificate has not begun by the clock here", SET_CLOCK),
+    named("revoked", "its certificate, or its node's incarnation, is revoked", ENROLL_AGAIN),
+    named(
+        "bad_certificate",
+        "its certificate is altered, malformed or not for a node",
+        "enroll that node again",
+    ),
+    named("version", "it speaks another version, or another protocol", SAME_VERSION),
+    named(
+        "key_exchange",
+        "it offers no key exchange that is accepted here",
+        "one of the two requires post-quantum X25519MLKEM768: upgrade the other, or turn `post_quantum` off in both fleets",
+    ),
+    named(
+        "handshake_too_long",
+        "its handshake is longer than any that is read",
+        "is it an sgc? Certificates have room for many groups, but not for any number",
+    ),
+    named("bad_greeting", "it connected and said something that is no greeting", SAME_VERSION),
+    named(
+        "timed_out",
+        "it did not finish in time",
+        "a few are scanners, or nodes on bad networks; many from one address are somebody who holds places",
+    ),
+    named(
+        "too_many",
+        "too many were connecting at once: the heaviest address gave way",
+        "they try again by themselves; if it goes on, keep the addresses that the log names out by a firewall",
+    ),
+    named(
+        "too_many_from_address",
+        "too many were connecting at once from its address (IPv6: its /64)",
+        "if many nodes share that address, let them start one after the other or link through a router of their own; else keep \
+         it out by a firewall",
+    ),
+    counted("by_peer", "it refused this node, or gave up", "see the log on the other side"),
+    counted("transport", "the connection broke while it was made", ""),
+];
+
+/// Programs at the gateway.
+const GATEWAY: &[Refusal] = &[
+    named("too many clients", "all places for clients are taken", RAISE_CLIENTS),
+    named(
+        "too many clients of other hosts",
+        "all places for clients of other hosts are taken",
+        RAISE_CLIENTS,
+    ),
+    named(
+        "too many clients of one credential",
+        "one token, certificate or address has all the places that one may have",
+        RAISE_CLIENTS,
+    ),
+    named(
+        "too much for all clients with this token, certificate or address",
+        "clients with one token, certificate or address have all the subscriptions, calls or memory that these may have",
+        FEWER,
+    ),
+    named(
+        "too much for all clients of other hosts",
+        "clients of other hosts have all the subscriptions, calls or memory that these may have",
+        FEWER,
+    ),
+    named(
+        "too much for all clients",
+        "the clients have all the subscriptions, calls or memory that there is",
+        FEWER,
+    ),
+    named("too many handshakes", "too many were connecting at once", SLOW_CLIENTS),
+    named(
+        "handshake gave way",
+        "too many were connecting at once, and it was the oldest of the heaviest",
+        SLOW_CLIENTS,
+    ),
+    named("handshake too slow", "it did not finish in time", SLOW_CLIENTS),
+    named(
+        "not admitted",
+        "it shows no token, certificate or origin that holds here, or tries too often",
+        "make a token (`sgc token`), or name it in [gateway]; the log says at DEBUG why",
+    ),
+    named(
+        "no longer admitted",
+        "its token or certificate ended or was revoked while it was connected",
+        "make a new token (`sgc token`) if it may come back",
+    ),
+    counted(
+        "no WebSocket",
+        "it is no WebSocket client, or asks for an unknown subprotocol",
+        "does it use the right port?",
+    ),
+    counted(
+        "TLS failed",
+        "it speaks no TLS that is accepted",
+        "does it use wss:// or https://, and trust the certificate?",
+    ),
+    named(
+        "certificate does not hold",
+        "its certificate is over, revoked or of a CA that is not trusted",
+        ENROLL_AGAIN,
+    ),
+];
+
+/// What an owner, or a router on the way, says to a node that asks for a topic; what to do at the owner, and what at the
+/// node that asked.
+const JOINS: &[(Answer, &str, &str)] = &[
+    // The walk itself says what to add to `to`.
+    (Answer::Owner(RefuseReason::NotPermitted), "", ""),
+    (Answer::Owner(RefuseReason::NotShared), "it asks for what is shared no more; it will hear of that", ""),
+    (Answer::Owner(RefuseReason::NotVerified), SAME_VERSION, SAME_VERSION),
+    (
+        Answer::Owner(RefuseReason::RoleNotOffered),
+        "nobody may publish on it: name who may in `publish` of this [[share]]",
+        "on the owner: name this node in `publish` of its [[share]]",
+    ),
+    (
+        Answer::Owner(RefuseReason::Limit),
+        "a topic has room for 4096 subscribers, of which one node may be 16: end those that are not needed",
+        "the owner has no place for another subscriber of it, or of this node: end those that are not needed",
+    ),
+    (Answer::Owner(RefuseReason::Clock), SET_CLOCK, SET_CLOCK),
+    (
+        Answer::Owner(RefuseReason::Expired),
+        "`sgc fleet renew` it, and compare the clocks",
+        "`sgc fleet renew` this node, and compare the clocks",
+    ),
+    (Answer::Owner(RefuseReason::Revoked), ENROLL_AGAIN, ENROLL_AGAIN),
+    (
+        Answer::Router(RejectReason::NoRoute),
+        "",
+        "is the owner running, and linked to these routers? `sgc status` there",
+    ),
+    (Answer::Router(RejectReason::NotVerified), "", SAME_VERSION),
+    (
+        Answer::Router(RejectReason::Limit),
+        "",
+        "a router on the way has no place for more branches or requests of this node: use fewer topics at it; `sgc status` at the \
+         router counts it (`limit`)",
+    ),
+    (Answer::Router(RejectReason::TimedOut), "", "is the owner running? It is asked again by itself"),
+    (Answer::Router(RejectReason::RouteLost), "", "the way is looked for again by itself"),
+    (Answer::Router(RejectReason::Clock), "", SET_CLOCK),
+    (Answer::Router(RejectReason::Expired), "", "`sgc fleet renew` this node, and compare the clocks"),
+    (Answer::Router(RejectReason::Revoked), "", ENROLL_AGAIN),
+];
+
+/// Who refused a topic, and why.
+#[derive(Clone, Copy, Debug)]
+enum Answer {
+    Owner(RefuseReason),
+    Router(RejectReason),
+}
+
+impl Answer {
+    /// As nodes of this version say it.
+    fn is_said_as(self, text: &str) -> bool {
+        match self {
+            Self::Owner(reason) => reason.to_string() == text,
+            Self::Router(reason) => reason.to_string() == text,
+        }
+    }
+}
+
+/// Returns what the owner of a topic can do about a refusal of its own, unless the policy is why.
+pub(super) fn fix_at_owner(why: &str) -> Option<&'static str> {
+    fixes(why).map(|(owner, _)| owner).filter(|fix| !fix.is_empty())
+}
+
+/// Returns what a node can do that a topic is refused to, unless the owner's policy is why.
+pub(super) fn fix_at_asker(why: &str) -> Option<&'static str> {
+    fixes(why).map(|(_, asker)| asker).filter(|fix| !fix.is_empty())
+}
+
+fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
+    JOINS.iter().find(|(answer, ..)| answer.is_said_as(why)).map(|(_, owner, asker)| (*owner, *asker))
+}
+
+/// Returns what a dropped packet or message of a name means.
+pub(super) fn of_packets(key: &str) -> Option<&'static Refusal> {
+    find(PACKETS, key)
+}
+
+/// Returns what a row of `sgc status`, Drops, means.
+pub(crate) fn drop_meaning(row: &str) -> String {
+    let key = row.split(" from ").next().unwrap_or(row);
+    let all = [find(CONTROL, key), find(PACKETS, key)];
+    let mut all: Vec<_> = all.into_iter().flatten().map(|refusal| refusal.means).collect();
+    all.dedup();
+    all.join("; or ")
+}
+
+/// Returns what a row of `sgc status`, Refused peers, means.
+pub(crate) fn door_meaning(row: &str) -> String {
+    find(DOOR, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
+}
+
+/// Returns what a row of refused clients of the gateway means.
+pub(crate) fn gateway_meaning(row: &str) -> String {
+    find(GATEWAY, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
+}
+
+/// Returns a step for each refusal that somebody has to see to, with the links that are up which cause it.
+pub(super) fn steps(graph: &Graph) -> Vec<Step> {
+    let counts = [
+        ("refused here", CONTROL, &graph.drops),
+        ("peers refused a link", DOOR, &graph.refused),
+        ("programs refused at the gateway", GATEWAY, &graph.gateway_refused),
+    ];
+    let of = |(what, table, counts): (&'static str, &'static [Refusal], &'_ BTreeMap<String, u64>)| {
+        let counted = |refusal: &'static Refusal| {
+            let count = counts.get(refusal.key).copied().filter(|count| *count > 0)?;
+            let by = culprits(graph, refusal.key);
+            let found = format!("{what}: {} {count}{by} ({})", refusal.key, refusal.means);
+            let step = Step::unknown(found);
+            Some((count, if refusal.fix.is_empty() { step } else { step.with_fix(refusal.fix) }))
+        };
+        table.iter().filter(|refusal| refusal.is_named).filter_map(counted).collect::<Vec<_>>()
+    };
+    let mut all: Vec<_> = counts.into_iter().flat_map(of).collect();
+    all.sort_by_key(|(count, _)| std::cmp::Reverse(*count));
+    all.into_iter().take(NAMED_MAX).map(|(_, step)| step).collect()
+}
+
+/// The links that are up and cause a refusal, by whom they lead to.
+fn culprits(graph: &Graph, key: &str) -> String {
+    let of_link = |link: &sgc_node::graph::Link| {
+        let count = graph.drops.get(&format!("{key} from link {}", link.id))?;
+        Some(format!("{count} over {}", diagnose::link_of(graph, link.id)))
+    };
+    let all: Vec<_> = graph.links.iter().filter_map(of_link).collect();
+    if all.is_empty() { String::new() } else { format!(", of these {}", all.join(", ")) }
+}
+
+fn find(table: &'static [Refusal], key: &str) -> Option<&'static Refusal> {
+    table.iter().find(|refusal| refusal.key == key)
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    #![allow(clippy::unwrap_used, clippy::panic)]
+
+    use std::collections::BTreeSet;
+
+    use sgc_transport::RefusalKind;
+
+    use super::*;
+    use crate::why::Verdict;
+
+    /// Counters that are named whatever the topic.
+    pub(in crate::why) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
+        CONTROL.iter().filter(|refusal| refusal.is_named).map(|refusal| refusal.key)
+    }
+
+    /// The keys of a row of the table of counters in the specification.
+    fn specified(row: &str) -> BTreeSet<String> {
+        let text = include_str!("../../../../docs/spec/routing.md");
+        let drops = text.split("\n## Drops\n").nth(1).unwrap();
+        let cell = drops.lines().find_map(|line| line.strip_prefix(&format!("| {row} | "))).unwrap();
+        let keys = cell.split('`').skip(1).step_by(2).map(str::to_owned);
+        // What differs is told in words behind the key.
+        keys.filter(|key| key.bytes().all(|b| b.is_ascii_lowercase() || b == b'_')).collect()
+    }
+
+    fn keys(table: &[Refusal]) -> BTreeSet<String> {
+        table.iter().map(|refusal| refusal.key.to_owned()).collect()
+    }
+
+    #[test]
+    fn every_counter_of_the_specification_is_explained_and_no_other() {
+        let control = [
+            "router machine",
+            "control frames",
+            "endpoint machine",
+            "authority (by peer; the first is a warning)",
+            "types",
+            "local network",
+            "peers and files",
+        ];
+        let control: BTreeSet<_> = control.into_iter().flat_map(specified).collect();
+        assert_eq!(control, keys(CONTROL));
+        assert_eq!(specified("data path"), keys(PACKETS));
+        assert_eq!(specified("links refused"), keys(DOOR));
+        let kinds = RefusalKind::ALL.into_iter().map(|kind| kind.label().to_owned());
+        assert_eq!(kinds.collect::<BTreeSet<_>>(), keys(DOOR));
+    }
+
+    #[test]
+    fn every_answer_to_a_request_has_a_remedy() {
+        use RefuseReason as Refuse;
+        use RejectReason as Reject;
+        for reason in [
+            Refuse::NotVerified,
+            Refuse::RoleNotOffered,
+            Refuse::Limit,
+            Refuse::Clock,
+            Refuse::Expired,
+            Refuse::Revoked,
+        ] {
+            let why = reason.to_string();
+            assert!(fix_at_owner(&why).is_some() && fix_at_asker(&why).is_some(), "{why}");
+        }
+        for reason in [
+            Reject::NoRoute,
+            Reject::NotVerified,
+            Reject::Limit,
+            Reject::TimedOut,
+            Reject::RouteLost,
+            Reject::Clock,
+            Reject::Expired,
+            Reject::Revoked,
+        ] {
+            assert!(fix_at_asker(&reason.to_string()).is_some(), "{reason}");
+        }
+        // The walk says what to add to the policy.
+        assert_eq!(fix_at_owner(&Refuse::NotPermitted.to_string()), None);
+    }
+
+    #[test]
+    fn each_refusal_is_named_with_its_remedy_and_those_of_a_sound_network_are_not() {
+        for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
+            for refusal in table {
+                let mut graph = Graph::default();
+                let counts = match place {
+                    0 => &mut graph.drops,
+                    1 => &mut graph.refused,
+                    _ => &mut graph.gateway_refused,
+                };
+                counts.insert(refusal.key.to_owned(), 3);
+                let steps = steps(&graph);
+                assert_eq!(steps.len(), usize::from(refusal.is_named), "{refusal:?}");
+                for step in steps {
+                    assert_eq!(step.verdict, Verdict::Unknown);
+                    assert!(step.found.contains(&format!("{} 3 ({})", refusal.key, refusal.means)));
+                    assert_eq!(step.fix.as_deref().unwrap_or_default(), refusal.fix);
+                }
+            }
+        }
+    }
+}
