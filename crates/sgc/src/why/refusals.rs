@@ -107,6 +107,16 @@ const CONTROL: &[Refusal] = &[
         "a neighbour brings too many announcements that are old; more of them are not looked at for a while",
         "look at that neighbour: somebody behind it replays, or signs anew all the time; end the link to it if it goes on",
     ),
+    named(
+        "questions_full",
+        "too many questions for names wait here; a neighbour's further ones are dropped for a while",
+        "have the nodes behind it use fewer topics that do not exist; the log names the neighbour",
+    ),
+    counted(
+        "owner_key",
+        "an answer that does not verify with the key that is known of its owner",
+        "a few when an owner gets another certificate are no fault",
+    ),
     named("malformed_control", "a neighbour sends control frames that cannot be read", SAME_VERSION),
     named(
         "control_queue_full",
