@@ -1,23 +1,24 @@
 //! DTLS beside ours: `openssl`, floods of hellos, keys that DTLS cannot use.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
+#[path = "support/openssl.rs"]
+mod openssl;
 #[path = "support/relay.rs"]
 mod relay;
 mod support;
 
 use std::net::UdpSocket;
 use std::path::PathBuf;
-use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
+use openssl::{openssl, pem};
 use relay::Relay;
 use sgc_transport::*;
 use sgc_trust::{CertError, Identity};
 use support::*;
 use tokio::io::{AsyncBufReadExt as _, AsyncRead, AsyncWriteExt as _, BufReader};
-use tokio::process::{Child, Command};
 
 /// The identity's parts in the form that `openssl` reads, in a directory that goes with it.
 struct Files {
@@ -28,16 +29,13 @@ impl Files {
     fn of(identity: &Identity, name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("sgc-dtls-{}-{name}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
-        let text = identity.to_text();
-        let block = |from: &str, to: &str| {
-            let (begin, end) = (format!("-----BEGIN {from}-----"), format!("-----END {from}-----\n"));
-            let start = text.find(&begin).unwrap();
-            let stop = text[start..].find(&end).unwrap() + start + end.len();
-            text[start..stop].replace(from, to)
-        };
-        std::fs::write(dir.join("ca.pem"), block("SGC CA CERTIFICATE", "CERTIFICATE")).unwrap();
+        std::fs::write(
+            dir.join("ca.pem"),
+            pem(identity, "SGC CA CERTIFICATE").replace("SGC CA CERTIFICATE", "CERTIFICATE"),
+        )
+        .unwrap();
         std::fs::write(dir.join("leaf.der"), &identity.chain()[0]).unwrap();
-        std::fs::write(dir.join("key.pem"), block("PRIVATE KEY", "PRIVATE KEY")).unwrap();
+        std::fs::write(dir.join("key.pem"), pem(identity, "PRIVATE KEY")).unwrap();
         Self { dir }
     }
 
@@ -50,18 +48,6 @@ impl Drop for Files {
     fn drop(&mut self) {
         let _ = std::fs::remove_dir_all(&self.dir);
     }
-}
-
-fn openssl(what: &str, args: &[&str]) -> Child {
-    Command::new("openssl")
-        .arg(what)
-        .args(args)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .kill_on_drop(true)
-        .spawn()
-        .expect("these tests need the program `openssl`")
 }
 
 /// Reads lines until one has this in it, and returns what came.
@@ -120,7 +106,7 @@ async fn openssl_connects_with_certificates_of_both_sides() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused() {
     let (ours, theirs) = (fleet(1), fleet(2));
-    let mut server = Server::start_on("dtls", enroll(&ours, "router"), LinkOptions::default());
+    let mut server = dtls_router(&ours);
     let to = server.addr.to_string();
     let _nobody = openssl("s_client", &["-dtls1_2", "-connect", &to]);
     let refused = server.refusal().await;
@@ -232,7 +218,7 @@ fn resident_kib() -> u64 {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hello_in_the_name_of_a_peer_does_not_disturb_its_link() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let listener = server.addr;
     // In between, so that its address can be used by somebody else as well.
     let middle = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
@@ -323,7 +309,7 @@ async fn until_true(mut is_so: impl FnMut() -> bool) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn datagrams_that_were_overheard_move_no_link() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let relay = Relay::start(server.addr, 3).await;
     let url = format!("dtls://{}", relay.addr).parse().unwrap();
     let near = dial(enroll(&fleet, "arm-1"), &url).await.unwrap();
@@ -361,7 +347,7 @@ async fn datagrams_that_were_overheard_move_no_link() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_node_that_is_another_inside_gets_no_link() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let relay = Relay::start(server.addr, 3).await;
     relay.weather.tap.store(true, Relaxed);
     relay.weather.loss.store(1000, Relaxed);
@@ -489,7 +475,7 @@ async fn spoof(
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn member_that_spoofs_an_address_takes_no_route() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let nat = SharedAddress::before(server.addr).await;
     let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
     let far = server.link().await;
@@ -506,7 +492,7 @@ async fn member_that_spoofs_an_address_takes_no_route() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn member_that_spoofs_an_address_keeps_nobody_out_there() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let nat = SharedAddress::before(server.addr).await;
     let _thief = spoof(&mut server, &fleet, &nat.outside).await;
     let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
@@ -517,7 +503,7 @@ async fn member_that_spoofs_an_address_keeps_nobody_out_there() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn address_of_a_peer_that_is_gone_is_given_to_the_next() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let nat = SharedAddress::before(server.addr).await;
     let gone = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
     let _far = server.link().await;
@@ -532,7 +518,7 @@ async fn address_of_a_peer_that_is_gone_is_given_to_the_next() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn peer_that_answers_keeps_its_address_from_one_that_listens_in() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let nat = SharedAddress::before(server.addr).await;
     let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
     let far = server.link().await;

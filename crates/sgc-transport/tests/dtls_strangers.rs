@@ -1,22 +1,23 @@
 //! Strangers that meet a node over DTLS: certificates of any length, and listeners that are nobody.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
+#[path = "support/openssl.rs"]
+mod openssl;
 #[path = "support/stranger.rs"]
 mod stranger;
 mod support;
 
 use std::path::PathBuf;
-use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
 use dimpl::{DtlsCertificate, ProtocolVersion};
+use openssl::{openssl, pem};
 use sgc_transport::*;
 use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX, Identity};
 use sgc_wire::CERT_BYTES_MAX;
 use stranger::{Encounter, FakeListener, LongCertificate, VERSIONS, visit};
 use support::*;
-use tokio::process::Command;
 
 /// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot send
 /// longer ones.
@@ -45,7 +46,7 @@ async fn still_serves(server: &mut Server, fleet: &sgc_trust::Fleet) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn listener_survives_long_certificates_of_openssl() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     let dir: PathBuf = std::env::temp_dir().join(format!("sgc-long-{}", std::process::id()));
     std::fs::create_dir_all(&dir).unwrap();
     for bytes in [2100, 8000, 16_000, 100_000] {
@@ -54,17 +55,10 @@ async fn listener_survives_long_certificates_of_openssl() {
         std::fs::write(&leaf, long.certificate.pem()).unwrap();
         std::fs::write(&key, long.key.serialize_pem()).unwrap();
         for mtu in ["1200", "16000"] {
-            let mut child = Command::new("openssl")
-                .args(["s_client", "-dtls1_2", "-mtu", mtu, "-connect", &server.addr.to_string(), "-cert"])
-                .arg(&leaf)
-                .arg("-key")
-                .arg(&key)
-                .stdin(Stdio::piped())
-                .stdout(Stdio::null())
-                .stderr(Stdio::null())
-                .kill_on_drop(true)
-                .spawn()
-                .expect("this test needs the program `openssl`");
+            let to = server.addr.to_string();
+            let (leaf, key) = (leaf.to_str().unwrap(), key.to_str().unwrap());
+            let args = ["-dtls1_2", "-mtu", mtu, "-connect", &to, "-cert", leaf, "-key", key];
+            let mut child = openssl("s_client", &args);
             let refused = server.refusal().await;
             let is_expected = match &refused.reason {
                 Refusal::Certificate(reason) => is_judged(reason, bytes),
@@ -83,7 +77,7 @@ async fn listener_survives_long_certificates_of_openssl() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn listener_survives_long_certificates_in_both_versions() {
     let fleet = fleet(1);
-    let mut server = Server::start_on("dtls", enroll(&fleet, "router"), LinkOptions::default());
+    let mut server = dtls_router(&fleet);
     for version in VERSIONS {
         for &(bytes, datagram_bytes) in long(version) {
             let certificate = LongCertificate::new(bytes).for_dtls();
@@ -147,11 +141,7 @@ fn rng() -> rand_chacha::ChaCha20Rng {
 
 /// A member's certificate and key, for a DTLS that is not ours.
 fn for_dtls(identity: &Identity) -> DtlsCertificate {
-    let text = identity.to_text();
-    let (begin, end) = ("-----BEGIN PRIVATE KEY-----", "-----END PRIVATE KEY-----");
-    let start = text.find(begin).unwrap();
-    let stop = text[start..].find(end).unwrap() + start + end.len();
-    let key = rcgen::KeyPair::from_pem(&text[start..stop]).unwrap();
+    let key = rcgen::KeyPair::from_pem(&pem(identity, "PRIVATE KEY")).unwrap();
     DtlsCertificate { certificate: identity.chain()[0].to_vec(), private_key: key.serialize_der() }
 }
 
@@ -233,17 +223,8 @@ async fn listener_without_dtls13_is_named() {
     std::fs::write(&key, stranger.key.serialize_pem()).unwrap();
     let port = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let accept = format!("127.0.0.1:{port}");
-    let _server = Command::new("openssl")
-        .args(["s_server", "-dtls1_2", "-accept", &accept, "-cert"])
-        .arg(&leaf)
-        .arg("-key")
-        .arg(&key)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .kill_on_drop(true)
-        .spawn()
-        .expect("this test needs the program `openssl`");
+    let (leaf, key) = (leaf.to_str().unwrap(), key.to_str().unwrap());
+    let _server = openssl("s_server", &["-dtls1_2", "-accept", &accept, "-cert", leaf, "-key", key]);
     let dialer = dialer(enroll(&fleet, "arm-1"));
     let url = format!("dtls://{accept}").parse().unwrap();
     let error = dial_with(&dialer, &url).await.unwrap_err();
@@ -255,7 +236,7 @@ async fn listener_without_dtls13_is_named() {
 async fn listener_is_told_why_a_dialer_does_not_go_on() {
     let (ours, theirs) = (fleet(1), fleet(2));
     for dtls12 in [false, true] {
-        let mut server = Server::start_on("dtls", enroll(&ours, "router"), LinkOptions::default());
+        let mut server = dtls_router(&ours);
         let options = LinkOptions { dtls12, ..LinkOptions::default() };
         let dialer = Dialer::new(enroll(&theirs, "arm-1"), options, Arc::default());
         let error = dial_with(&dialer, &server.url).await.unwrap_err();

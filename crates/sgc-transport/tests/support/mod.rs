@@ -96,6 +96,11 @@ pub struct Server {
     pub results: mpsc::Receiver<Result<AnyLink, RefusedPeer>>,
 }
 
+/// A router of this fleet that listens for DTLS.
+pub fn dtls_router(fleet: &Fleet) -> Server {
+    Server::start_on("dtls", enroll(fleet, "router"), LinkOptions::default())
+}
+
 impl Server {
     pub fn start(identity: impl Into<CredentialStore>, options: LinkOptions) -> Self {
         Self::start_at("quic://127.0.0.1:0", identity, options)
