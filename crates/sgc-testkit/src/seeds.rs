@@ -8,6 +8,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 ///
 /// # Panics
 /// If a seed fails, after all were executed. Each failing seed is shown once, with its trace.
+#[allow(clippy::print_stderr, reason = "a seed that fails is of no use without its trace")]
 pub fn run_seeds<R, T>(
     committed: &[u64],
     start: impl Fn(u64) -> R,
