@@ -1,7 +1,7 @@
 //! Network namespaces, as `ip netns` makes them: for processes, for threads, and gone with the value.
 
 use std::ffi::OsStr;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io;
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
@@ -11,6 +11,10 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
 /// Where `ip netns` keeps them.
 const NAMESPACES: &str = "/run/netns";
+
+/// Where programs keep memory that they share. Those of a namespace share it with each other alone: DDS implementations take each
+/// other for programs of one host by what is in it.
+const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Why a network could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -23,6 +27,9 @@ pub enum NetsimError {
         /// What it complained of.
         why: String,
     },
+    /// The folder for the memory that its programs share could not be made.
+    #[error("cannot make the folder {0:?}: {1}")]
+    SharedMemory(PathBuf, io::Error),
     /// There is no such namespace.
     #[error("no network namespace {0:?}: make it with `ip netns add {0}`")]
     NoNamespace(String),
@@ -51,6 +58,8 @@ impl Namespace {
     pub fn create(name: impl Into<String>) -> Result<Self, NetsimError> {
         let namespace = Self { name: name.into() };
         ip(&["netns", "add", &namespace.name])?;
+        let memory = namespace.shared_memory();
+        fs::create_dir(&memory).map_err(|e| NetsimError::SharedMemory(memory, e))?;
         namespace.ip(&["link", "set", "lo", "up"])?;
         Ok(namespace)
     }
@@ -70,11 +79,19 @@ impl Namespace {
         finish(self.command(program).args(args))
     }
 
-    /// A program in it. The process is the program's own: `ip` replaces itself by it.
+    /// A program in it. The process is the program's own: `ip` and the shell replace themselves by it.
     pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new("ip");
-        command.args(["netns", "exec", &self.name]).arg(program);
+        // `ip` has made the mounts the process's own.
+        let script = format!("mount --bind \"$0\" {SHARED_MEMORY} && exec \"$@\"");
+        command.args(["netns", "exec", &self.name, "sh", "-c", &script]);
+        command.arg(self.shared_memory()).arg(program);
         command
+    }
+
+    /// The folder that its programs have in the place of [`SHARED_MEMORY`].
+    fn shared_memory(&self) -> PathBuf {
+        Path::new(SHARED_MEMORY).join(format!("netns-{}", self.name))
     }
 
     /// A pair of interfaces, up: one here with this name and these addresses, one there. Addresses are with their
@@ -114,6 +131,7 @@ impl Namespace {
 impl Drop for Namespace {
     fn drop(&mut self) {
         let _ = ip(&["netns", "delete", &self.name]);
+        let _ = fs::remove_dir_all(self.shared_memory());
     }
 }
 
