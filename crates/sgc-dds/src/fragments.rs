@@ -2,9 +2,9 @@
 //!
 //! Cyclone takes a sample for complete once its fragments reach the length that the first one announces. It does not compare
 //! that length with the other fragments, which announce one each: a fragment that announces more may reach beyond it. What
-//! compares them in Cyclone and `cyclors` are assertions, which are not compiled in. [`cover_exactly`] does it here.
+//! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here.
 //!
-//! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `identified.rs`.
+//! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`.
 
 use std::ffi::c_void;
 

@@ -3,13 +3,16 @@
 //! Pure. RPC over DDS 1.0 (7.8.2) puts it into the inline QoS of the RTPS DATA submessage, in front of the payload:
 //! Fast DDS and RustDDS do that. rmw_cyclonedds puts 16 bytes into the payload, in front of the body. [`Mapping`] says which.
 
-use sgc_ros::Guid;
+use sgc_ros::{Guid, KeyHash};
 
 /// PID_RELATED_SAMPLE_IDENTITY of RPC over DDS 1.0 (7.8.2, table 7.11).
 pub const PID_RELATED: u16 = 0x0083;
 
 /// The same, as Fast DDS numbered it before; 2.9 knows no other, and newer ones write both.
 pub const PID_RELATED_FAST: u16 = 0x800f;
+
+/// PID_KEY_HASH (RTPS 2.5, 9.6.4.8): the key of a sample, hashed.
+pub const PID_KEY_HASH: u16 = 0x0070;
 
 /// A parameter that nobody knows, vendor-specific and "must be understood" (RTPS 2.5, 9.6.3.1): Cyclone drops
 /// a sample of a Cyclone participant that carries it, without a word, which keeps a message in the other mapping
@@ -66,18 +69,10 @@ impl SampleIdentity {
     /// The related identity in the inline QoS of a submessage: parameters up to the sentinel. `None` if there is
     /// none or the list is broken.
     pub fn related(inline_qos: &[u8], big_endian: bool) -> Option<Self> {
-        let u16_at = |b: [u8; 2]| if big_endian { u16::from_be_bytes(b) } else { u16::from_le_bytes(b) };
         let u32_at = |b: [u8; 4]| if big_endian { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) };
-        let mut rest = inline_qos;
         let mut older = None;
-        loop {
-            let (pid, after) = rest.split_first_chunk::<2>()?;
-            let (length, after) = after.split_first_chunk::<2>()?;
-            let (pid, length) = (u16_at(*pid), usize::from(u16_at(*length)));
-            if pid == PID_SENTINEL {
-                return older;
-            }
-            let (value, after) = after.split_at_checked(length)?;
+        for parameter in Parameters::new(inline_qos, big_endian) {
+            let (pid, value) = parameter?;
             if matches!(pid, PID_RELATED | PID_RELATED_FAST)
                 && let Some((guid, number)) = value.split_first_chunk::<16>()
                 && let Some((high, low)) = number.split_first_chunk::<4>()
@@ -90,7 +85,54 @@ impl SampleIdentity {
                 }
                 older = Some(identity);
             }
+        }
+        older
+    }
+}
+
+/// The hash of a sample's key in the inline QoS of a submessage. `None` if there is none or the list is broken before it.
+pub fn key_hash(inline_qos: &[u8], big_endian: bool) -> Option<KeyHash> {
+    Parameters::new(inline_qos, big_endian)
+        .map_while(|parameter| parameter)
+        .find_map(|(pid, value)| value.first_chunk().filter(|_| pid == PID_KEY_HASH).copied())
+}
+
+/// The parameters of a list up to its sentinel (RTPS 2.5, 9.4.2.11); `None` where the list is broken, and nothing after it.
+struct Parameters<'a> {
+    rest: Option<&'a [u8]>,
+    big_endian: bool,
+}
+
+impl<'a> Parameters<'a> {
+    fn new(list: &'a [u8], big_endian: bool) -> Self {
+        Self { rest: Some(list), big_endian }
+    }
+}
+
+impl<'a> Iterator for Parameters<'a> {
+    type Item = Option<(u16, &'a [u8])>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let big_endian = self.big_endian;
+        let number = |b: [u8; 2]| if big_endian { u16::from_be_bytes(b) } else { u16::from_le_bytes(b) };
+        let mut rest = self.rest.take()?;
+        let mut next = || {
+            let (pid, after) = rest.split_first_chunk::<2>()?;
+            let (length, after) = after.split_first_chunk::<2>()?;
+            if number(*pid) == PID_SENTINEL {
+                return Some(None);
+            }
+            let (value, after) = after.split_at_checked(usize::from(number(*length)))?;
             rest = after;
+            Some(Some((number(*pid), value)))
+        };
+        match next() {
+            Some(Some(parameter)) => {
+                self.rest = Some(rest);
+                Some(Some(parameter))
+            }
+            Some(None) => None,
+            None => Some(None),
         }
     }
 }

@@ -5,8 +5,8 @@
 //! another thread takes longer than all the rest. Everything else is queued, within bounds of its own, for the reader's
 //! thread, which may block for as long as it likes: no other reader waits for that, and nothing behind it is taken out of order.
 //!
-//! A writer that keeps all waits for acknowledgements, and those for the receiving thread. So where much has gathered that
-//! nobody may leave out, that thread waits for the reader's, for moments and no more than half of the time: enough for a
+//! A writer that keeps all waits for acknowledgements, and those for the receiving thread. So where much has gathered of a reliable
+//! topic, that thread waits for the reader's, for moments and no more than half of the time: enough for a
 //! writer that is up to twice as fast, and no other reader is kept by one whose thread does not move at all.
 
 use std::cell::Cell;
@@ -23,7 +23,6 @@ use cyclors::{
     dds_instance_handle_t, dds_lset_data_available, dds_sample_info_t, dds_takecdr, ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid};
-use sgc_wire::History;
 
 use crate::entity::{Entity, reason};
 use crate::network::Participant;
@@ -34,6 +33,10 @@ const BATCH: usize = 16;
 
 /// Bytes of samples that may wait for one reader's thread; a single sample may be longer.
 pub const WAITING_BYTES_MAX: usize = 64 << 20;
+
+/// Fewest samples that may wait for a reliable reader's thread. Fast DDS does not announce whether a publisher keeps all: if it does, it
+/// loses nothing to a reader on its own network, and is as much faster than this thread as a burst is long.
+pub const RELIABLE_WAITING_MIN: usize = 16_384;
 
 /// How long the receiving thread waits for a reader's at once.
 const HOLD_MAX: Duration = Duration::from_millis(2);
@@ -358,11 +361,12 @@ impl<R: Receiver> Intake<R> {
         let group = participant.group(EndpointKind::Reader, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
         let (_, depth) = history_of(EndpointKind::Reader, spec.qos.history, spec.keyless);
+        let (depth, reliable) = (usize::try_from(depth).unwrap_or(1), spec.qos.is_reliable());
         let shared = Arc::new(Shared {
-            queue: Mutex::new(Queue::new(usize::try_from(depth).unwrap_or(1))),
+            queue: Mutex::new(Queue::new(if reliable { depth.max(RELIABLE_WAITING_MIN) } else { depth })),
             filled: Condvar::new(),
             eased: Condvar::new(),
-            holds_back: spec.qos.is_reliable() && spec.qos.history == History::KeepAll,
+            holds_back: reliable,
             receiver: Mutex::new(None),
             participant: Arc::clone(participant),
         });

@@ -7,11 +7,11 @@
 //! them.
 //!
 //! This is the only crate with `unsafe`: everything that Cyclone hands out is owned by a type of
-//! `entity` or `serdata`, whose `Drop` gives it back, and no raw pointer leaves the crate.
+//! `entity` or `sample`, whose `Drop` gives it back, and no raw pointer leaves the crate.
 //!
 //! # Keyed topics
-//! The types of samples here know no keys: all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
-//! flows both ways, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
+//! The type of samples here knows no keys: all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
+//! flows both ways with the hash of its key, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
 //! hash of its key (Fast DDS may send one) does not. History is kept per topic rather than per
 //! instance, so it is made [`qos::KEYED_INSTANCES_KEPT`] times as deep to make up for it.
 
@@ -23,7 +23,6 @@ mod discovery;
 mod entity;
 mod fragments;
 mod graph;
-mod identified;
 pub mod identity;
 mod intake;
 mod known_writers;
@@ -33,17 +32,16 @@ pub mod payload;
 pub mod qos;
 mod reader;
 mod rpc;
-mod serdata;
+mod sample;
 mod service;
-mod topic;
 pub mod user_data;
 mod wait;
 mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
-pub use identified::unidentified_messages;
-pub use intake::WAITING_BYTES_MAX;
+pub use intake::{RELIABLE_WAITING_MIN, WAITING_BYTES_MAX};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
+pub use sample::unidentified_messages;
 pub use service::{CycloneClient, CycloneServer};
 pub use writer::CycloneWriter;

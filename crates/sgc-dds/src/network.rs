@@ -4,7 +4,7 @@
 //! them alive as long as they need them. Moves no sample itself.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cyclors::{
@@ -26,8 +26,8 @@ use crate::intake::Pace;
 use crate::log;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
+use crate::sample;
 use crate::service::{CycloneClient, CycloneServer};
-use crate::topic;
 use crate::user_data;
 use crate::writer::CycloneWriter;
 
@@ -65,6 +65,7 @@ pub(crate) struct Participant {
     tag: Option<String>,
     pace: Pace,
     holds: Pace,
+    writers: AtomicUsize,
 }
 
 impl CycloneNetwork {
@@ -93,6 +94,7 @@ impl CycloneNetwork {
             tag: config.tag.clone(),
             pace: Pace::new(),
             holds: Pace::new(),
+            writers: AtomicUsize::new(0),
         };
         let participant = Arc::new(participant);
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
@@ -192,6 +194,11 @@ impl Participant {
         &self.pace
     }
 
+    /// Writers of samples that live.
+    pub(crate) fn writers(&self) -> &AtomicUsize {
+        &self.writers
+    }
+
     /// How much they wait for readers' threads.
     pub(crate) fn holds(&self) -> &Pace {
         &self.holds
@@ -204,7 +211,7 @@ impl Participant {
 
     /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.
     pub(crate) fn topic(&self, spec: &EndpointSpec) -> Result<Entity, String> {
-        topic::topic(self, spec)
+        sample::topic(self, spec)
     }
 
     /// The publisher or subscriber for a spec, if its partitions need one of their own.

@@ -27,6 +27,19 @@ pub const HISTORY_DEPTH_MAX: u32 = 4096;
 /// wait: one that keeps the last samples overwrites them, acknowledged or not.
 pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
 
+/// Fewest samples that a reliable writer that keeps the last ones keeps until they are acknowledged. Fast DDS acknowledges some 7 ms
+/// after the heartbeat, and a publisher's own depth, ten by default, is for a reader on its network.
+pub const UNACKNOWLEDGED_MIN: u32 = 16;
+
+/// Most samples of a writer, if they are short, that are kept for that.
+pub const UNACKNOWLEDGED_MAX: u32 = 1024;
+
+/// Bytes of one writer that are kept for that; [`UNACKNOWLEDGED_MIN`] samples may be more.
+pub const UNACKNOWLEDGED_BYTES_MAX: usize = 32 << 20;
+
+/// The same of all writers of a network together.
+pub const UNACKNOWLEDGED_BYTES_IN_ALL: usize = 256 << 20;
+
 /// History of a volatile endpoint that does not announce it: as ROS 2 has it by default. With the specification's single sample
 /// a writer here would overwrite what a reader that is late by one message has not acknowledged: of nine images of 1 MB from Fast
 /// DDS to a Fast DDS subscriber that stood still meanwhile, seven were lost, and with ten none are (`sgc/tests/peers.rs`).
@@ -86,8 +99,8 @@ impl NativeQos {
             if qos.is_transient_local() {
                 // What late joiners get is governed by this one, whose default is a single sample.
                 let unlimited = DDS_LENGTH_UNLIMITED;
-                let kept = dds_history_kind_DDS_HISTORY_KEEP_LAST;
-                dds_qset_durability_service(native.0, 0, kept, depth, unlimited, unlimited, unlimited);
+                let last = dds_history_kind_DDS_HISTORY_KEEP_LAST;
+                dds_qset_durability_service(native.0, 0, last, depth, unlimited, unlimited, unlimited);
             }
             dds_qset_deadline(native.0, duration(qos.deadline_ns));
             dds_qset_liveliness(
@@ -125,6 +138,12 @@ impl NativeQos {
     pub(crate) fn set_ignores_own(&self) {
         // SAFETY: the object is valid; the call takes a number.
         unsafe { dds_qset_ignorelocal(self.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT) };
+    }
+
+    /// Has a writer keep so many samples of each instance until they are acknowledged. Late joiners get as many as before.
+    pub(crate) fn set_unacknowledged(&self, kept: Unacknowledged) {
+        // SAFETY: the object is valid.
+        unsafe { dds_qset_history(self.0, dds_history_kind_DDS_HISTORY_KEEP_LAST, kept.depth as i32) };
     }
 
     /// Lets a writer put samples into one packet until it is flushed.
@@ -175,6 +194,42 @@ pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) ->
     let native =
         if all { dds_history_kind_DDS_HISTORY_KEEP_ALL } else { dds_history_kind_DDS_HISTORY_KEEP_LAST };
     (native, depth as i32)
+}
+
+/// How a reliable writer that keeps the last samples keeps those that are not acknowledged yet. It never waits, so they are a matter
+/// of memory, not of what its publisher keeps: Cyclone has so many of each instance, and a writer spreads its samples over as many
+/// instances as their size allows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Unacknowledged {
+    /// Samples of each instance.
+    pub(crate) depth: u32,
+    /// Most instances. One where more would give late joiners too much, miss deadlines, or mean something to readers.
+    pub(crate) instances_max: u32,
+}
+
+impl Unacknowledged {
+    /// Of a writer; none for one that keeps nothing for this, or waits.
+    pub(crate) fn of(qos: &Qos, keyless: bool) -> Option<Self> {
+        if qos.history == History::KeepAll || !qos.is_reliable() {
+            return None;
+        }
+        let (_, depth) = history_of(EndpointKind::Writer, qos.history, keyless);
+        let depth = u32::try_from(depth).unwrap_or(1).max(UNACKNOWLEDGED_MIN);
+        let is_one = qos.is_transient_local() || qos.deadline_ns.is_some() || !keyless;
+        Some(Self { depth, instances_max: if is_one { 1 } else { (UNACKNOWLEDGED_MAX / depth).max(1) } })
+    }
+
+    /// The same for a writer whose samples readers of its participant get as they are, instance by instance.
+    pub(crate) fn of_one_instance(self) -> Self {
+        Self { instances_max: 1, ..self }
+    }
+
+    /// Instances for samples of so many bytes, by one of so many writers.
+    pub(crate) fn instances(self, bytes: usize, writers: usize) -> u32 {
+        let allowed = (UNACKNOWLEDGED_BYTES_IN_ALL / writers.max(1)).min(UNACKNOWLEDGED_BYTES_MAX);
+        let of_one = bytes.max(1).saturating_mul(self.depth as usize);
+        u32::try_from(allowed / of_one).unwrap_or(u32::MAX).clamp(1, self.instances_max)
+    }
 }
 
 fn duration(ns: Option<u64>) -> i64 {
@@ -464,6 +519,31 @@ mod tests {
         assert_eq!(depth(writer, History::KeepLast(2), false), 2 * KEYED_INSTANCES_KEPT as i32);
         let all = Qos { history: History::KeepAll, ..Qos::default() };
         assert_eq!(round_trip(writer, &all, true), all);
+    }
+
+    #[test]
+    fn what_is_not_acknowledged_is_kept_as_far_as_memory_goes() {
+        let reliable = |n| Qos { history: History::KeepLast(n), ..Qos::default() };
+        let of = |n| Unacknowledged::of(&reliable(n), true).unwrap();
+        let window = |n, bytes, writers| of(n).depth * of(n).instances(bytes, writers);
+        assert_eq!(window(1, 100, 1), UNACKNOWLEDGED_MAX);
+        assert_eq!(window(1, UNACKNOWLEDGED_BYTES_MAX / 64, 1), 64);
+        assert_eq!(window(1, usize::MAX, 1), UNACKNOWLEDGED_MIN, "no fewer");
+        assert_eq!(window(2000, 100, 1), 2000, "what its publisher keeps is kept");
+        let bytes = UNACKNOWLEDGED_BYTES_IN_ALL / 1000 / 32;
+        assert_eq!(
+            (window(1, bytes, 1), window(1, bytes, 1000)),
+            (UNACKNOWLEDGED_MAX, 32),
+            "all share the room"
+        );
+        let latched = Qos { durability: Durability::TransientLocal, ..reliable(1) };
+        let timed = Qos { deadline_ns: Some(1), ..reliable(1) };
+        for (qos, keyless) in [(latched, true), (timed, true), (reliable(1), false)] {
+            assert_eq!(Unacknowledged::of(&qos, keyless).unwrap().instances_max, 1, "{qos:?}");
+        }
+        let waits = Qos { history: History::KeepAll, ..Qos::default() };
+        let best_effort = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
+        assert_eq!([waits, best_effort].map(|qos| Unacknowledged::of(&qos, true)), [None, None]);
     }
 
     #[test]

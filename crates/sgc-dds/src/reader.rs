@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use cyclors::{dds_entity_t, ddsi_serdata};
-use sgc_ros::{EndpointSpec, Guid, Sample, SampleHandler, SampleKind};
+use sgc_ros::{EndpointSpec, Guid, KeyHash, Sample, SampleHandler, SampleKind};
 use sgc_wire::History;
 
 use crate::intake::{Arrival, Intake, Receiver, Taken};
 use crate::known_writers::{KnownWriter, KnownWriters};
 use crate::network::Participant;
 use crate::payload::HEADER_BYTES;
-use crate::serdata::Serdata;
+use crate::sample::SampleRef;
 
 /// A raw reader; dropping it ends its thread, waits for a handler that is at work, and deletes the entities.
 #[derive(Debug)]
@@ -44,14 +44,16 @@ impl CycloneReader {
 /// What a sample says.
 struct Content {
     kind: SampleKind,
+    key_hash: Option<KeyHash>,
     payload: Bytes,
 }
 
 impl Taken for Content {
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
-        // SAFETY: a reference to a blob, by contract and by the topic of this module's readers.
-        let sample = unsafe { Serdata::from_raw(sample) };
-        let content = Self { kind: sample.kind(), payload: sample.into_payload() };
+        // SAFETY: a reference to a sample of this crate's type, by contract and by the topic of this module's readers.
+        let sample = unsafe { SampleRef::from_raw(sample) };
+        let key_hash = sample.origin().and_then(|origin| origin.key_hash);
+        let content = Self { kind: sample.kind(), key_hash, payload: sample.into_payload() };
         if content.payload.len() < HEADER_BYTES {
             tracing::debug!(
                 bytes = content.payload.len(),
@@ -88,8 +90,8 @@ impl Samples {
 }
 
 fn sample(content: Content, writer: Option<KnownWriter>, source_timestamp_ns: i64) -> Sample {
-    let Content { kind, payload } = content;
-    Sample { kind, writer: writer.map(|w| w.guid), source_timestamp_ns, payload, more: false }
+    let Content { kind, key_hash, payload } = content;
+    Sample { kind, writer: writer.map(|w| w.guid), source_timestamp_ns, key_hash, payload, more: false }
 }
 
 impl Receiver for Samples {
@@ -120,8 +122,10 @@ impl Receiver for Samples {
         }
         let Arrival { sample: content, source_timestamp_ns, .. } = arrival;
         let refused = self.handler.handle_at_once(sample(content, writer, source_timestamp_ns));
-        refused
-            .map_err(|Sample { kind, payload, .. }| Arrival { sample: Content { kind, payload }, ..arrival })
+        refused.map_err(|Sample { kind, key_hash, payload, .. }| Arrival {
+            sample: Content { kind, key_hash, payload },
+            ..arrival
+        })
     }
 
     fn rest(&mut self) {

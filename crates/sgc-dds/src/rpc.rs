@@ -1,5 +1,5 @@
 //! [`RpcReader`], [`RpcWriter`]: endpoints of a service, whose messages may say in their inline QoS to which request they
-//! belong ([`crate::identified`]). What they say elsewhere, and which of both a client or server expects, is for
+//! belong ([`crate::sample`]). What they say elsewhere, and which of both a client or server expects, is for
 //! [`crate::service`] to know.
 
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,12 +13,12 @@ use cyclors::{
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError};
 
 use crate::entity::{Entity, check, reason};
-use crate::identified::{self, IdentifiedSample, Origin};
 use crate::identity::{Mapping, SampleIdentity};
 use crate::intake::{Arrival, Intake, Receiver, Taken};
 use crate::known_writers::KnownWriters;
 use crate::network::Participant;
 use crate::payload::{Frame, HEADER_BYTES};
+use crate::sample::{Extra, Origin, SampleRef};
 
 /// A message of a service, as it comes from the network.
 pub(crate) struct Message {
@@ -59,7 +59,7 @@ impl RpcReader {
         spec: &EndpointSpec,
         more: &str,
     ) -> Result<Self, String> {
-        let intake = Intake::new(participant, spec, identified::topic(participant, spec)?, more)?;
+        let intake = Intake::new(participant, spec, participant.topic(spec)?, more)?;
         Ok(Self { intake, ignores_tagged: participant.ignores_tagged() })
     }
 
@@ -88,8 +88,9 @@ struct Content {
 
 impl Taken for Content {
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
-        // SAFETY: a reference to a sample of `identified`, by contract and by the topic of this module's readers.
-        let (origin, payload) = unsafe { IdentifiedSample::from_raw(sample) }.read();
+        // SAFETY: a reference to a sample of this crate's type, by contract and by the topic of this module's readers.
+        let sample = unsafe { SampleRef::from_raw(sample) };
+        let (origin, payload) = (sample.origin(), sample.into_payload());
         let Some(origin) = origin.filter(|_| payload.len() >= HEADER_BYTES) else {
             tracing::debug!(bytes = payload.len(), "a message of a service without its headers is dropped");
             return None;
@@ -146,7 +147,7 @@ impl RpcWriter {
         more: &str,
     ) -> Result<Self, String> {
         let qos = participant.endpoint_qos(EndpointKind::Writer, spec, more)?;
-        let topic = identified::topic(participant, spec)?;
+        let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
         // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
@@ -180,8 +181,11 @@ impl RpcWriter {
         check(unsafe { dds_get_entity_sertype(self.writer.handle(), &mut sertype) }).map_err(failed)?;
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_ns = unix.as_nanos().try_into().unwrap_or(0);
-        // SAFETY: the sertype of this writer, which `identified::topic` made.
-        let sample = unsafe { IdentifiedSample::build(sertype, &frame, related, number, now_ns) };
+        let extra = Extra { related, ..Extra::default() };
+        // SAFETY: the sertype of this writer, whose topic was made with it.
+        let sample = unsafe { SampleRef::build_framed(sertype, &frame, extra, now_ns) };
+        let mut sample = sample.ok_or_else(|| failed("out of memory".into()))?;
+        sample.set_number(number);
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
         match unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) } {

@@ -4,6 +4,7 @@
 //! thread of Cyclone's or of an async runtime.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -12,12 +13,13 @@ use cyclors::{
     dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
     dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
-use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleKind};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind};
 
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::network::Participant;
 use crate::payload::Frame;
-use crate::serdata::Serdata;
+use crate::qos::Unacknowledged;
+use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
 
 /// Latest source time stamp that RTPS can say, nanoseconds since the Unix epoch: seconds are 32 bits
@@ -36,12 +38,42 @@ pub struct CycloneWriter {
     participant: Arc<Participant>,
     guid: Guid,
     keyless: bool,
+    /// What is kept until it is acknowledged, if the writer does not wait.
+    unacknowledged: Option<Unacknowledged>,
+    /// Samples written so far, which wraps.
+    written: AtomicU32,
+    _counted: Counted,
+}
+
+/// Counts a writer of its network for as long as it lives.
+#[derive(Debug)]
+struct Counted(Arc<Participant>);
+
+impl Counted {
+    fn new(participant: &Arc<Participant>) -> Self {
+        participant.writers().fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(participant))
+    }
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        self.0.writers().fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl CycloneWriter {
     pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
         let qos = participant.endpoint_qos(EndpointKind::Writer, spec, "")?;
         qos.set_batching();
+        // Readers of a participant that ignores none of its own endpoints get what is written here as it is.
+        let has_own_readers = !participant.ignores_tagged();
+        let unacknowledged = Unacknowledged::of(&spec.qos, spec.keyless);
+        let unacknowledged =
+            unacknowledged.map(|kept| if has_own_readers { kept.of_one_instance() } else { kept });
+        if let Some(kept) = unacknowledged {
+            qos.set_unacknowledged(kept);
+        }
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
@@ -59,7 +91,16 @@ impl CycloneWriter {
             participant: Arc::clone(participant),
             guid,
             keyless: spec.keyless,
+            unacknowledged,
+            written: AtomicU32::new(0),
+            _counted: Counted::new(participant),
         })
+    }
+
+    /// Over how many instances samples of so many bytes are spread.
+    fn instances(&self, bytes: usize) -> u32 {
+        let writers = self.participant.writers().load(Ordering::Relaxed);
+        self.unacknowledged.map_or(1, |kept| kept.instances(bytes, writers))
     }
 
     /// GUID of the writer, as others discover it.
@@ -73,12 +114,6 @@ impl RosWriter for CycloneWriter {
         self.guid
     }
 
-    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
-        let written = self.write_ahead(kind, source_timestamp_ns, payload);
-        self.flush();
-        written
-    }
-
     fn flush(&self) {
         // SAFETY: takes a number, checked by Cyclone.
         if let Err(reason) = check(unsafe { dds_write_flush(self.writer.handle()) }) {
@@ -86,12 +121,12 @@ impl RosWriter for CycloneWriter {
         }
     }
 
-    fn write_ahead(
-        &self,
-        kind: SampleKind,
-        source_timestamp_ns: i64,
-        payload: Bytes,
-    ) -> Result<(), RosError> {
+    fn kept(&self, bytes: usize) -> Option<u32> {
+        Some(self.unacknowledged?.depth.saturating_mul(self.instances(bytes)))
+    }
+
+    fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError> {
+        let SampleHead { kind, source_timestamp_ns, key_hash } = head;
         let failed = |reason: String| RosError::Write { reason };
         let frame = Frame::new(&payload)?;
         if !(0..=TIMESTAMP_MAX_NS).contains(&source_timestamp_ns) {
@@ -109,10 +144,12 @@ impl RosWriter for CycloneWriter {
         let mut sertype = std::ptr::null();
         // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
         check(unsafe { dds_get_entity_sertype(self.writer.handle(), &mut sertype) }).map_err(failed)?;
-        // SAFETY: the blob sertype of this writer, which keeps it alive.
-        let sample = unsafe { Serdata::build(sertype, key_only, &frame) };
+        let instance = self.written.fetch_add(1, Ordering::Relaxed) % self.instances(payload.len());
+        let extra = Extra { key_only, key_hash, related: None, instance };
+        // SAFETY: the sertype of this writer, which keeps it alive.
+        let sample = unsafe { SampleRef::build(sertype, &payload, &frame, extra, source_timestamp_ns) };
         let mut sample = sample.ok_or_else(|| failed("out of memory".into()))?;
-        sample.stamp(source_timestamp_ns, statusinfo);
+        sample.set_status(statusinfo);
 
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.

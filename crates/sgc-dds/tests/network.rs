@@ -12,11 +12,12 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use sgc_dds::qos::{UNACKNOWLEDGED_MAX, UNACKNOWLEDGED_MIN};
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
 use sgc_ros::graph::{GidBytes, decode_nodes, encode_nodes, graph_reader, graph_writer};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, HandleSamples, RosError,
-    RosNetwork, RosWriter, Sample, SampleKind,
+    RosNetwork, RosWriter, Sample, SampleHead, SampleKind,
 };
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations, RosNode};
 
@@ -172,7 +173,7 @@ fn discovery_tells_name_type_hash_and_full_qos_and_the_end() {
     let qos = Qos {
         reliability: Reliability::Reliable,
         durability: Durability::TransientLocal,
-        history: History::KeepLast(7),
+        history: History::KeepLast(70),
         deadline_ns: Some(1_500_000_000),
         lifespan_ns: Some(60_000_000_000),
         liveliness: Liveliness::ManualByTopic,
@@ -856,7 +857,8 @@ fn what_is_written_ahead_leaves_with_the_next_and_when_it_is_waited_for() {
     let many = with(spec("ahead"), |qos| qos.history = History::KeepLast(1000));
     let (_reader, samples) = read(&ros, &many);
     let writer = writer(&sgc, &many, 1);
-    let ahead = |text: &str| writer.write_ahead(SampleKind::Write, 1, string_cdr(text)).unwrap();
+    let ahead =
+        |text: &str| writer.write_ahead(SampleHead::new(SampleKind::Write, 1), string_cdr(text)).unwrap();
     let arrive = |range: std::ops::Range<u32>| {
         for i in range {
             assert_eq!(next(&samples).payload, padded(&string_cdr(&i.to_string())));
@@ -1057,4 +1059,85 @@ fn ids_are_as_long_as_those_of_the_network() {
     write(&writer, &encode_nodes(&old.guid(), &[graph_node("new", &[], &[])], GidBytes::Sixteen));
     assert_eq!(nodes(&events).1[0].node.name(), "new");
     assert_eq!(heard().gid_bytes, GidBytes::Sixteen);
+}
+
+#[test]
+fn the_hash_of_a_key_passes_and_one_that_nobody_knows_is_the_same_for_all() {
+    let (ros, sgc) = (open(151, None), open(151, Some("arm-1")));
+    let keyed = |topic| EndpointSpec { keyless: false, ..spec(topic) };
+    let (_reader, samples) = read(&ros, &keyed("h"));
+    let hashing = writer(&sgc, &keyed("h"), 1);
+    let hash = *b"sixteen bytes it";
+    for kind in [SampleKind::Write, SampleKind::Dispose] {
+        let head = SampleHead { key_hash: Some(hash), ..SampleHead::new(kind, 5) };
+        hashing.write_ahead(head, string_cdr("a")).unwrap();
+        hashing.flush();
+        let sample = next(&samples);
+        assert_eq!((sample.kind, sample.key_hash), (kind, Some(hash)));
+    }
+    // Long ones come in fragments, of which the first one says it.
+    let head = SampleHead { key_hash: Some(hash), ..SampleHead::new(SampleKind::Write, 5) };
+    hashing.write_ahead(head, string_cdr(&"a".repeat(100_000))).unwrap();
+    hashing.flush();
+    assert_eq!(next(&samples).key_hash, Some(hash));
+    let unknown = ["a", "b"].map(|text| {
+        write(&hashing, &string_cdr(text));
+        next(&samples).key_hash
+    });
+    assert!(unknown[0].is_some_and(|hash| hash != [0; 16]), "zeros are none to Fast DDS");
+    assert_eq!(unknown[0], unknown[1]);
+    // A topic without keys has none.
+    let (_reader, samples) = read(&ros, &spec("h0"));
+    write(&writer(&sgc, &spec("h0"), 1), &string_cdr("a"));
+    assert_eq!(next(&samples).key_hash, None);
+}
+
+#[test]
+fn a_reliable_writer_keeps_what_is_not_acknowledged_as_far_as_memory_goes() {
+    let (ros, sgc) = (open(152, None), open(152, Some("arm-1")));
+    // Its publisher keeps one.
+    let one = |topic| with(spec(topic), |qos| qos.history = History::KeepLast(1));
+    let (_reader, samples) = read(&ros, &with(spec("deaf"), |qos| qos.history = History::KeepAll));
+    let writer = writer(&sgc, &one("deaf"), 1);
+    assert_eq!(writer.kept(100), Some(UNACKNOWLEDGED_MAX));
+    let short: Vec<_> = (0..500).map(|n| string_cdr(&n.to_string())).collect();
+    ros.set_deaf_mute(Duration::from_millis(500));
+    short.iter().for_each(|payload| write(&writer, payload));
+    for payload in &short {
+        assert_eq!(next(&samples).payload, padded(payload));
+    }
+    // Of long ones as many as there is room for, and they are the last.
+    let bytes = 4 << 20;
+    let kept = writer.kept(bytes).unwrap();
+    assert_eq!(kept, UNACKNOWLEDGED_MIN);
+    let long = |n: u32| string_cdr(&format!("{n:08}{}", "x".repeat(bytes)));
+    ros.set_deaf_mute(Duration::from_millis(1500));
+    (0..kept + 8).for_each(|n| write(&writer, &long(n)));
+    for n in 8..kept + 8 {
+        assert_eq!(next(&samples).payload[8..16], *format!("{n:08}").as_bytes());
+    }
+    quiet(&samples);
+}
+
+#[test]
+fn late_joiners_get_what_the_publisher_keeps_whatever_is_kept_for_others() {
+    let (ros, sgc) = (open(153, None), open(153, Some("arm-1")));
+    let latched = |n| {
+        with(spec("late"), |qos| {
+            qos.durability = Durability::TransientLocal;
+            qos.history = History::KeepLast(n);
+        })
+    };
+    let (_first, first) = read(&ros, &latched(100));
+    let writer = writer(&sgc, &latched(3), 1);
+    for n in 0..UNACKNOWLEDGED_MIN {
+        write(&writer, &string_cdr(&n.to_string()));
+    }
+    (0..UNACKNOWLEDGED_MIN).for_each(|_| drop(next(&first)));
+    let (_late, late) = read(&ros, &latched(100));
+    for n in UNACKNOWLEDGED_MIN - 3..UNACKNOWLEDGED_MIN {
+        assert_eq!(next(&late).payload, padded(&string_cdr(&n.to_string())));
+    }
+    quiet(&late);
+    assert_eq!(writer.kept(100), Some(UNACKNOWLEDGED_MIN));
 }

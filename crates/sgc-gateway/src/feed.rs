@@ -625,6 +625,7 @@ mod tests {
             feed.hand_out(Sample {
                 kind: SampleKind::Write,
                 source_timestamp_ns: number,
+                key_hash: None,
                 payload: vec![0; MESSAGE_BYTES].into(),
                 writer: Some(Guid([writer; 16])),
                 more: false,

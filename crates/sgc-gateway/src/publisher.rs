@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_cdr::{Layout, Value};
-use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosWriter, SampleHead, SampleKind, dds_topic, dds_type};
 use sgc_wire::{History, Qos};
 use tokio::time::Instant;
 
@@ -127,7 +127,7 @@ struct Ahead {
 impl Line {
     /// Writes one message, which leaves with those that follow, or when the writer is flushed.
     fn write(&self, stamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
-        self.writer.write_ahead(SampleKind::Write, stamp_ns, payload)?;
+        self.writer.write_ahead(SampleHead::new(SampleKind::Write, stamp_ns), payload)?;
         self.published.fetch_add(1, Ordering::Relaxed);
         Ok(())
     }

@@ -137,7 +137,8 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
             for n in 1..=messages {
                 let (payload, more) = (payload.clone(), n % at_once != 0);
                 let kind = SampleKind::Write;
-                share.publish(Sample { kind, writer: Some(WRITER), source_timestamp_ns: 0, payload, more });
+                let (writer, source_timestamp_ns, key_hash) = (Some(WRITER), 0, None);
+                share.publish(Sample { kind, writer, source_timestamp_ns, key_hash, payload, more });
                 if !more {
                     for _ in 0..at_once {
                         now(flow.queued());

@@ -13,10 +13,13 @@ use std::time::{Duration, Instant};
 use arc_swap::{ArcSwap, ArcSwapOption};
 use sgc_endpoint::{AskAgain, Decompressor, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 use sgc_ros::{
-    EndpointSpec, Guid, RosError, RosWriter, SampleKind, Shaping, of_all_instances, prefix_frames,
+    EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind, Shaping, of_all_instances, prefix_frames,
 };
 use sgc_router::LinkId;
-use sgc_wire::{History, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId, TopicGrant};
+use sgc_wire::{
+    History, KEY_HASH_BYTES, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId,
+    TopicGrant,
+};
 use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio::time::{sleep_until, timeout_at};
 use tracing::{debug, warn};
@@ -449,7 +452,7 @@ impl LocalSink {
         let mut evicted = 0;
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes a while, and may have to wait for its type.
-        let at_once = head.form == PayloadForm::Cdr;
+        let at_once = head.form != PayloadForm::Json;
         let at_once = at_once.then(|| writer.at_once(bytes, head.source_timestamp_ns)).flatten();
         if let Some(mut take) = at_once {
             take(message, Next::Nothing);
@@ -535,13 +538,14 @@ pub(crate) struct Behind {
     recent: Option<Mutex<Recent>>,
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
-    /// Whether a short message that is taken now waits for nobody, and overwrites none that a reader may lack.
-    is_free: Box<dyn Fn(i64) -> bool + Send + Sync>,
+    /// Whether a short message of so many bytes and that time, taken now, waits for nobody, and overwrites none that a reader may
+    /// lack.
+    is_free: Box<dyn Fn(usize, i64) -> bool + Send + Sync>,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_| false) }
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_, _| false) }
     }
 }
 
@@ -582,20 +586,19 @@ impl WriterQueue {
         let writer = Arc::new(writer);
         // The thread alone keeps it: it ends there, where it may block.
         let weak = Arc::downgrade(&writer);
-        let mut burst = Burst::new(match spec.qos.history {
-            History::KeepLast(n) if spec.qos.is_reliable() => Some(n),
-            _ => None,
-        });
+        let mut burst = Burst::default();
         // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
-        let is_free = Box::new(move |timestamp_ns| {
-            never_blocks && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, timestamp_ns))
+        let is_free = Box::new(move |bytes, timestamp_ns| {
+            never_blocks
+                && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, timestamp_ns))
         });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
+            let mut key_hash = None;
             let kind = match message.head.kind {
                 MessageKind::Write => SampleKind::Write,
                 MessageKind::Dispose => SampleKind::Dispose,
@@ -614,6 +617,14 @@ impl WriterQueue {
             };
             let payload = match message.head.form {
                 PayloadForm::Cdr => payload,
+                PayloadForm::KeyedCdr => {
+                    let Some(hash) = payload.first_chunk::<KEY_HASH_BYTES>().copied() else {
+                        counted.count("key_hash");
+                        return None;
+                    };
+                    key_hash = Some(hash);
+                    payload.slice(KEY_HASH_BYTES..)
+                }
                 PayloadForm::Json => {
                     let known = types.now();
                     let Some(layout) = known.layout() else {
@@ -645,20 +656,21 @@ impl WriterQueue {
                     }
                 },
             };
-            Some((kind, message.head.source_timestamp_ns, payload))
+            let source_timestamp_ns = message.head.source_timestamp_ns;
+            Some((SampleHead { kind, source_timestamp_ns, key_hash }, payload))
         };
         let refused = failures.clone();
         Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, next| {
-            let Some((kind, timestamp_ns, payload)) = prepare(message) else {
+            let Some((head, payload)) = prepare(message) else {
                 return if next != Next::AtOnce {
                     writer.flush()
                 };
             };
-            burst.before_next(&*writer, next == Next::Nothing, timestamp_ns);
-            let written = match next {
-                Next::AtOnce => writer.write_ahead(kind, timestamp_ns, payload),
-                Next::Nothing | Next::Later => writer.write(kind, timestamp_ns, payload),
-            };
+            burst.before_next(&*writer, next == Next::Nothing, &head, payload.len());
+            let written = writer.write_ahead(head, payload);
+            if next != Next::AtOnce {
+                writer.flush();
+            }
             if let Err(error) = written
                 && refused.count(failure_key(&error))
             {
@@ -714,7 +726,7 @@ impl WriterQueue {
         let may = bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
         take.filter(|_| {
-            self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(timestamp_ns)
+            self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(bytes, timestamp_ns)
         })
     }
 
@@ -813,26 +825,27 @@ impl WriterQueue {
 
 /// Keeps what comes at once, after a way was interrupted, from overwriting itself in a reliable writer that keeps the last
 /// samples, which never blocks. Its publisher said it in its own time, and its readers would have had it.
+#[derive(Default)]
 struct Burst {
     room: Arc<Room>,
     /// A reader that stands still is not waited for again before.
     not_before: Option<Instant>,
 }
 
-/// What a writer keeps, and how much of it may not have been acknowledged. Changed only by who may take messages.
+/// How much of what a writer keeps may not have been acknowledged. Changed only by who may take messages.
+#[derive(Default)]
 struct Room {
-    /// Samples that the writer keeps; `None` if it blocks by itself, or nobody acknowledges.
-    depth: Option<u32>,
     unacknowledged: AtomicU32,
     /// When a message was written last, and when it was published.
     last: Mutex<Option<(Instant, i64)>>,
 }
 
 impl Room {
-    /// Whether a message of this time may be written without taking the place of one that somebody may lack; does not wait.
-    fn is_there(&self, writer: &impl RosWriter, timestamp_ns: i64) -> bool {
-        let Some(depth) = self.depth else { return true };
-        if self.unacknowledged.load(Relaxed) < depth || self.is_in_its_time(timestamp_ns) {
+    /// Whether a message of so many bytes and this time may be written without taking the place of one that somebody may lack; does
+    /// not wait.
+    fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
+        let Some(kept) = writer.kept(bytes) else { return true };
+        if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
             return true;
         }
         if !writer.wait_acknowledged(Duration::ZERO) {
@@ -856,25 +869,20 @@ impl Room {
 }
 
 impl Burst {
-    fn new(depth: Option<u32>) -> Self {
-        let room = Room { depth, unacknowledged: AtomicU32::new(0), last: Mutex::new(None) };
-        Self { room: Arc::new(room), not_before: None }
-    }
-
-    /// Waits before a sample would take the place of one that somebody may lack. One that comes alone is written at once, as
-    /// its publisher did.
-    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, timestamp_ns: i64) {
-        let Some(depth) = self.room.depth else { return };
+    /// Waits before a sample of so many bytes would take the place of one that somebody may lack. One that comes alone is written at
+    /// once, as its publisher did.
+    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, head: &SampleHead, bytes: usize) {
+        let Some(kept) = writer.kept(bytes) else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
         // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
         let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
-        if waits && unacknowledged >= depth {
+        if waits && unacknowledged >= kept {
             let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
             self.not_before = (!acknowledged).then(|| Instant::now() + STALLED_READER_PAUSE);
             unacknowledged = 0;
         }
-        self.room.unacknowledged.store(unacknowledged.saturating_add(1).min(depth), Relaxed);
-        *self.room.last() = Some((Instant::now(), timestamp_ns));
+        self.room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
+        *self.room.last() = Some((Instant::now(), head.source_timestamp_ns));
     }
 }
 
@@ -897,15 +905,26 @@ mod tests {
     use super::*;
     use crate::hold::HOLD_BYTES_MAX;
 
-    #[derive(Default)]
     struct Slow {
+        kept: Option<u32>,
         waited: AtomicUsize,
         stands_still: AtomicBool,
     }
 
+    impl Slow {
+        fn new(kept: Option<u32>) -> Self {
+            Self { kept, waited: AtomicUsize::new(0), stands_still: AtomicBool::new(false) }
+        }
+    }
+
     impl RosWriter for Slow {
-        fn write(&self, _: SampleKind, _: i64, _: Bytes) -> Result<(), RosError> {
+        fn write_ahead(&self, _: SampleHead, _: Bytes) -> Result<(), RosError> {
             Ok(())
+        }
+
+        fn kept(&self, bytes: usize) -> Option<u32> {
+            // Half as many where they are long.
+            self.kept.map(|kept| if bytes > 1000 { kept / 2 } else { kept })
         }
 
         fn wait_acknowledged(&self, _: Duration) -> bool {
@@ -926,47 +945,51 @@ mod tests {
         }
     }
 
+    const HEAD: SampleHead = SampleHead::new(SampleKind::Write, 0);
+
     #[test]
     fn a_burst_waits_for_its_readers_but_not_for_one_that_stands_still() {
-        let writer = Slow::default();
-        let mut burst = Burst::new(Some(10));
-        (0..100).for_each(|_| burst.before_next(&writer, true, 0));
+        let writer = Slow::new(Some(10));
+        let mut burst = Burst::default();
+        (0..100).for_each(|_| burst.before_next(&writer, true, &HEAD, 8));
         assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
-        (0..100).for_each(|_| burst.before_next(&writer, false, 0));
+        (0..100).for_each(|_| burst.before_next(&writer, false, &HEAD, 8));
         assert_eq!(writer.waited.load(Relaxed), 10);
+        (0..100).for_each(|_| burst.before_next(&writer, false, &HEAD, 2000));
+        assert_eq!(writer.waited.load(Relaxed), 30, "fewer of long ones are kept");
         writer.stands_still.store(true, Relaxed);
-        (0..1000).for_each(|_| burst.before_next(&writer, false, 0));
-        assert!(writer.waited.load(Relaxed) <= 12, "once in a while");
-        let mut other = Burst::new(None);
-        (0..100).for_each(|_| other.before_next(&writer, false, 0));
-        assert!(writer.waited.load(Relaxed) <= 12, "one that blocks by itself");
+        (0..1000).for_each(|_| burst.before_next(&writer, false, &HEAD, 8));
+        assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
+        let (writer, mut other) = (Slow::new(None), Burst::default());
+        (0..100).for_each(|_| other.before_next(&writer, false, &HEAD, 8));
+        assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
     }
 
     #[test]
     fn there_is_room_while_what_was_written_is_acknowledged() {
-        let writer = Slow::default();
-        let mut burst = Burst::new(Some(10));
+        let writer = Slow::new(Some(10));
+        let mut burst = Burst::default();
         for _ in 0..35 {
-            assert!(burst.room.is_there(&writer, 0));
-            burst.before_next(&writer, true, 0);
+            assert!(burst.room.is_there(&writer, 8, 0));
+            burst.before_next(&writer, true, &HEAD, 8);
         }
         assert_eq!(writer.waited.load(Relaxed), 3, "asked when as many were written as are kept");
         writer.stands_still.store(true, Relaxed);
         for _ in 0..5 {
-            assert!(burst.room.is_there(&writer, 0));
-            burst.before_next(&writer, true, 0);
+            assert!(burst.room.is_there(&writer, 8, 0));
+            burst.before_next(&writer, true, &HEAD, 8);
         }
-        assert!(!burst.room.is_there(&writer, 0), "ten are under way");
-        assert!(Burst::new(None).room.is_there(&writer, 0));
+        assert!(!burst.room.is_there(&writer, 8, 0), "ten are under way");
+        assert!(Burst::default().room.is_there(&Slow::new(None), 8, 0));
         // What comes as its publisher had it needs no more room than that had; what was held up on its way does.
         let hour_ns = 3_600_000_000_000;
-        assert!(!burst.room.is_there(&writer, hour_ns) && !burst.room.is_there(&writer, -1));
+        assert!(!burst.room.is_there(&writer, 8, hour_ns) && !burst.room.is_there(&writer, 8, -1));
         let begun = Instant::now();
-        while !burst.room.is_there(&writer, 1_000_000) {
+        while !burst.room.is_there(&writer, 8, 1_000_000) {
             assert!(begun.elapsed() < Duration::from_secs(20));
             thread::yield_now();
         }
-        assert!(!burst.room.is_there(&writer, hour_ns));
+        assert!(!burst.room.is_there(&writer, 8, hour_ns));
     }
 
     /// What was written, and by which thread.
@@ -976,7 +999,7 @@ mod tests {
     fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
         let taken = Arc::<Mutex<Vec<_>>>::default();
         let (note, gate) = (taken.clone(), gate.clone());
-        let behind = Behind { is_free: Box::new(|_| true), ..Behind::default() };
+        let behind = Behind { is_free: Box::new(|_, _| true), ..Behind::default() };
         let (alive, _) = mpsc::channel(1);
         let take = move |message: Message, _| {
             drop(gate.lock().unwrap());

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use arc_swap::ArcSwap;
 use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
-use sgc_ros::{Guid, HandleSamples, Sample, SampleKind, Shaping};
+use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
 use sgc_transport::prompt::{self, AtHand};
 use sgc_wire::{
@@ -476,7 +476,7 @@ impl LocalShare {
         self.taps.offer(|| Tapped::of_sample(&sample));
         // What may never leave is not worth the time.
         let written = match wanted || slot.keeps_history {
-            true => self.write(sample.kind, sample.payload),
+            true => self.write(sample.kind, sample.key_hash, sample.payload),
             false => Ok((PayloadForm::Cdr, PayloadEncoding::Plain, sample.payload)),
         };
         let (form, encoding, payload) = match written {
@@ -548,13 +548,19 @@ impl LocalShare {
     fn write(
         &self,
         kind: SampleKind,
+        key_hash: Option<KeyHash>,
         payload: Bytes,
     ) -> Result<(PayloadForm, PayloadEncoding, Bytes), DataDrop> {
+        let is_converted = self.is_json.load(Relaxed) && kind == SampleKind::Write;
+        let (form, payload) = match key_hash.filter(|_| !is_converted) {
+            None => (PayloadForm::Cdr, payload),
+            Some(hash) => (PayloadForm::KeyedCdr, [&hash[..], &payload].concat().into()),
+        };
         if !self.is_altered.load(Relaxed) || kind != SampleKind::Write {
-            return Ok((PayloadForm::Cdr, PayloadEncoding::Plain, payload));
+            return Ok((form, PayloadEncoding::Plain, payload));
         }
         let taken = payload.len();
-        let (form, payload) = self.convert(payload)?;
+        let (form, payload) = if is_converted { self.convert(payload)? } else { (form, payload) };
         let (encoding, payload) = self.compress(payload);
         if self.is_shaped.load(Relaxed) {
             lock(&self.held).shaper.corrects(taken, payload.len());
@@ -563,9 +569,6 @@ impl LocalShare {
     }
 
     fn convert(&self, payload: Bytes) -> Result<(PayloadForm, Bytes), DataDrop> {
-        if !self.is_json.load(Relaxed) {
-            return Ok((PayloadForm::Cdr, payload));
-        }
         let known = self.types.now();
         let layout = known.layout().ok_or(DataDrop::NoDefinition)?;
         match conversion::to_json(layout, &payload) {
@@ -775,7 +778,8 @@ mod tests {
 
     fn sample(writer: Guid, more: bool) -> Sample {
         let payload = Bytes::from_static(b"\0\x01\0\0data");
-        Sample { kind: SampleKind::Write, writer: Some(writer), source_timestamp_ns: 0, payload, more }
+        let (kind, writer) = (SampleKind::Write, Some(writer));
+        Sample { kind, writer, source_timestamp_ns: 0, key_hash: None, payload, more }
     }
 
     fn grant(epoch: u32) -> TopicGrant {

@@ -8,12 +8,12 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use bytes::Bytes;
+use bytes::{Buf as _, Bytes};
 use sgc_cdr::Layout;
 use sgc_endpoint::{Decompressor, Message};
 use sgc_ros::{Sample, SampleKind};
 use sgc_types::Described;
-use sgc_wire::{MessageKind, PayloadEncoding, PayloadForm, Representations};
+use sgc_wire::{KEY_HASH_BYTES, MessageKind, PayloadEncoding, PayloadForm, Representations};
 use tokio::sync::Notify;
 
 use crate::conversion;
@@ -78,10 +78,13 @@ impl Tapped {
         }
         let cdr =
             |layout: Arc<Layout>| conversion::from_json(&layout, &self.payload, Representations::XCDR1).ok();
-        if form == PayloadForm::Json
-            && let Some(payload) = layout.and_then(cdr)
-        {
-            self.payload = payload;
+        match form {
+            PayloadForm::Cdr => {}
+            PayloadForm::Json => self.payload = layout.and_then(cdr).unwrap_or(self.payload),
+            PayloadForm::KeyedCdr if self.payload.len() >= KEY_HASH_BYTES => {
+                self.payload.advance(KEY_HASH_BYTES);
+            }
+            PayloadForm::KeyedCdr => {}
         }
         self
     }

@@ -17,8 +17,8 @@ pub use interface::{Interface, Part};
 pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_name, ros_topic, ros_type};
 pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
-    HandleSamples, RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample,
-    SampleHandler, SampleKind, ServiceSpec,
+    HandleSamples, KeyHash, RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter,
+    Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec,
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosPolicy, RELIABLE_READER_DEPTH_MIN,

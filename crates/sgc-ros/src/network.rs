@@ -132,6 +132,27 @@ pub enum SampleKind {
     Unregister,
 }
 
+/// The key of a sample, hashed (RTPS 2.5, 9.6.4.8).
+pub type KeyHash = [u8; 16];
+
+/// What a sample says besides its payload.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SampleHead {
+    /// Data or the end of an instance.
+    pub kind: SampleKind,
+    /// Source time stamp, nanoseconds since the Unix epoch.
+    pub source_timestamp_ns: i64,
+    /// The hash of its key, where the topic has one and its writer told.
+    pub key_hash: Option<KeyHash>,
+}
+
+impl SampleHead {
+    /// The head of a sample without a key.
+    pub const fn new(kind: SampleKind, source_timestamp_ns: i64) -> Self {
+        Self { kind, source_timestamp_ns, key_hash: None }
+    }
+}
+
 /// One serialised sample taken from a reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sample {
@@ -141,6 +162,8 @@ pub struct Sample {
     pub writer: Option<Guid>,
     /// Source time stamp, nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
+    /// The hash of its key, where the topic has one and the writer told.
+    pub key_hash: Option<KeyHash>,
     /// Encapsulation header and body.
     pub payload: Bytes,
     /// True if the handler gets another sample at once: it may then put off what is cheaper for several.
@@ -314,21 +337,26 @@ pub trait RosNetwork: Send + Sync + 'static {
 
 /// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.
 pub trait RosWriter: Send + Sync + 'static {
-    /// Writes, disposes or unregisters with the given source time stamp (nanoseconds since the Unix epoch).
-    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError>;
+    /// Writes, disposes or unregisters. It need not leave before the next call of this kind, or of [`Self::flush`]: short samples
+    /// share packets.
+    fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError>;
 
-    /// The same, but it need not leave before the next write, or [`Self::flush`]: short samples share packets.
-    fn write_ahead(
-        &self,
-        kind: SampleKind,
-        source_timestamp_ns: i64,
-        payload: Bytes,
-    ) -> Result<(), RosError> {
-        self.write(kind, source_timestamp_ns, payload)
+    /// The same, with the given source time stamp (nanoseconds since the Unix epoch), and at once.
+    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+        let written = self.write_ahead(SampleHead::new(kind, source_timestamp_ns), payload);
+        self.flush();
+        written
     }
 
     /// Lets leave what was written ahead.
     fn flush(&self) {}
+
+    /// How many samples of so many bytes it keeps for reliable readers that have not acknowledged them yet. Beyond it each write
+    /// takes the place of the oldest, whether somebody lacks that or not. None if it waits for its readers rather.
+    fn kept(&self, bytes: usize) -> Option<u32> {
+        let _ = bytes;
+        None
+    }
 
     /// Waits until all reliable readers have what was written; false if they have not after `max`.
     fn wait_acknowledged(&self, max: Duration) -> bool {

@@ -13,7 +13,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
     RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
-    SampleKind, ServiceSpec,
+    SampleHead, SampleKind, ServiceSpec,
 };
 use sgc_wire::{History, Qos};
 
@@ -389,7 +389,7 @@ impl FakeWriter {
     pub fn write_burst(&self, payloads: impl IntoIterator<Item = Bytes>) {
         let mut payloads = payloads.into_iter().peekable();
         while let Some(payload) = payloads.next() {
-            self.give(SampleKind::Write, 1, payload, payloads.peek().is_some());
+            self.give(SampleHead::new(SampleKind::Write, 1), payload, payloads.peek().is_some());
         }
     }
 
@@ -404,7 +404,7 @@ impl FakeWriter {
         sample.put_slice(body);
         for _ in 0..PEER_LOOKS {
             if self.matched_readers() > 0 {
-                self.give(SampleKind::Write, 1, sample.freeze(), false);
+                self.give(SampleHead::new(SampleKind::Write, 1), sample.freeze(), false);
                 return Ok(());
             }
             std::thread::sleep(Duration::from_millis(PEER_LOOK_MS));
@@ -412,8 +412,9 @@ impl FakeWriter {
         Err(RosError::NoPeer { waited_ms: PEER_LOOKS * PEER_LOOK_MS })
     }
 
-    fn give(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes, more: bool) {
-        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, payload, more };
+    fn give(&self, head: SampleHead, payload: Bytes, more: bool) {
+        let SampleHead { kind, source_timestamp_ns, key_hash } = head;
+        let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, key_hash, payload, more };
         let readers: Vec<_> = {
             let mut state = self.domain.lock();
             let Some(writer) = state.endpoints.get_mut(&self.guid) else { return };
@@ -443,7 +444,7 @@ impl FakeWriter {
 }
 
 impl RosWriter for FakeWriter {
-    fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
+    fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError> {
         {
             let mut state = self.domain.lock();
             let topic = state.endpoints.get(&self.guid).map(|writer| writer.discovered.topic.clone());
@@ -454,7 +455,7 @@ impl RosWriter for FakeWriter {
                 return Err(RosError::WriteTimeout { waited_ms: 0 });
             }
         }
-        self.give(kind, source_timestamp_ns, payload, false);
+        self.give(head, payload, false);
         Ok(())
     }
 

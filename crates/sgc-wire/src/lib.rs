@@ -36,7 +36,9 @@ pub use ids::{
     Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,
     SecretBytes, SinkId, SourceId, UnixMillis,
 };
-pub use message::{MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding, PayloadForm};
+pub use message::{
+    KEY_HASH_BYTES, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, PayloadEncoding, PayloadForm,
+};
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use operation::{
     Challenge, Operation, OperationAnswer, OperationRefusal, OperationRequest, REFUSAL_DETAIL_BYTES_MAX,

@@ -33,6 +33,9 @@ pub enum MessageKind {
     Gone,
 }
 
+/// Length of the hash of a key, bytes (RTPS 2.5, 9.6.4.8).
+pub const KEY_HASH_BYTES: usize = 16;
+
 /// What a message is written in, before it is compressed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum PayloadForm {
@@ -41,6 +44,8 @@ pub enum PayloadForm {
     Cdr,
     /// JSON (docs/spec/json.md).
     Json,
+    /// The hash of the sample's key ([`KEY_HASH_BYTES`]), and CDR as above.
+    KeyedCdr,
 }
 
 /// How a payload is compressed, before it is sealed.
@@ -129,6 +134,7 @@ impl Decode for MessageHead {
             (0, _) => PayloadForm::Cdr,
             // Keys and marks are no messages.
             (1, MessageKind::Write) => PayloadForm::Json,
+            (2, MessageKind::Write | MessageKind::Dispose | MessageKind::Unregister) => PayloadForm::KeyedCdr,
             (v, _) => return Err(DecodeError::value("payload form", v.into())),
         };
         match r.u8()? {
@@ -148,6 +154,8 @@ mod tests {
             (MessageKind::Dispose, PayloadEncoding::Plain, PayloadForm::Cdr),
             (MessageKind::Write, PayloadEncoding::Zstd, PayloadForm::Cdr),
             (MessageKind::Write, PayloadEncoding::Plain, PayloadForm::Json),
+            (MessageKind::Write, PayloadEncoding::Lz4, PayloadForm::KeyedCdr),
+            (MessageKind::Dispose, PayloadEncoding::Plain, PayloadForm::KeyedCdr),
             (MessageKind::Write, PayloadEncoding::Lz4, PayloadForm::Json),
         ] {
             let head = MessageHead { kind, encoding, form, source_timestamp_ns: -5 };

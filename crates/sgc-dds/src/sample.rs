@@ -1,31 +1,38 @@
-//! Samples with a related identity in their inline QoS: a sertype of our own.
+//! Samples: a sertype of our own, for every topic and service.
 //!
-//! Cyclone DDS 11 neither reads nor writes that parameter. But it lets the type of a topic (de)serialise, and that is
-//! enough: coming in, it hands out the received packet, so the inline QoS in front of the payload can be read; going
-//! out, it asks for the payload when the submessage's header is in the message and before its length is set, so
-//! parameters can still be added. The latter reaches into `struct ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0
-//! builds; [`add_related`] says what it relies on, and leaves the message alone where that does not hold. Another
-//! version of `cyclors` does not compile: [`CYCLORS`].
+//! Cyclone lets the type of a topic (de)serialise, and knows no more of a sample than that. This type
+//! - keeps the payload as it was serialised, received or to be sent, the latter without a copy where it is long;
+//! - tells what stands in the inline QoS of a received sample in front of the payload, since it is handed the packet: the hash of
+//!   its key, and the request that it belongs to;
+//! - puts the hash of a key into the inline QoS of what is sent, where Cyclone asks for it (`Internal/GenerateKeyhash`);
+//! - keeps the serialised key of a sample that has nothing else, for which Cyclone would look up the instance;
+//! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as memory allows
+//!   ([`crate::writer`]).
+//!
+//! Cyclone DDS 11 neither reads nor writes the parameter that says to which request a message belongs. Going out, it asks for the
+//! payload when the submessage's header is in the message and before its length is set, so parameters can still be added. That
+//! reaches into `struct ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0 builds; [`add_related`] says what it relies on, and leaves
+//! the message alone where that does not hold. Another version of `cyclors` does not compile: [`CYCLORS`].
 //!
 //! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
 
-use std::ffi::{c_int, c_void};
+use std::ffi::{c_char, c_int, c_void};
 use std::mem::offset_of;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use cyclors::{
-    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, dds_create_topic_sertype, ddsi_keyhash, ddsi_serdata,
-    ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA, ddsi_serdata_kind_SDK_KEY,
-    ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini, ddsi_sertype_init_flags,
-    ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
+    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, DDSI_STATUSINFO_DISPOSE, dds_alloc, dds_create_topic_sertype,
+    dds_free, ddsi_keyhash, ddsi_serdata, ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA,
+    ddsi_serdata_kind_SDK_KEY, ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini,
+    ddsi_sertype_init_flags, ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
 };
-use sgc_ros::EndpointSpec;
+use sgc_ros::{EndpointSpec, KeyHash, SampleKind};
 
 use crate::entity::{Entity, c_string};
 use crate::fragments::{self, ReceivedFragment};
 use crate::identity::{
-    CYCLONE, IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity,
+    CYCLONE, IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity, key_hash,
 };
 use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
@@ -39,7 +46,7 @@ const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
     contains(include_str!("../Cargo.toml").as_bytes(), CYCLORS.as_bytes()),
-    "identified.rs was written for the C structs of another version of cyclors: see CYCLORS"
+    "sample.rs was written for the C structs of another version of cyclors: see CYCLORS"
 );
 
 const fn contains(text: &[u8], part: &[u8]) -> bool {
@@ -66,25 +73,54 @@ pub(crate) struct Origin {
     pub(crate) number: i64,
     /// Which message it refers to.
     pub(crate) related: Option<SampleIdentity>,
+    /// The hash of its key.
+    pub(crate) key_hash: Option<KeyHash>,
 }
 
-/// A sample of the sertype made here. `common` is first: Cyclone knows no more of it.
-#[repr(C)]
-struct Identified {
-    common: ddsi_serdata,
-    /// Encapsulation header, body and padding.
-    payload: Vec<u8>,
+/// What goes with a payload that is sent.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Extra {
+    /// Whether it is a key alone.
+    pub(crate) key_only: bool,
+    /// The hash of the key, where the topic has one; [`NO_KEY_HASH`] is sent where it is not known.
+    pub(crate) key_hash: Option<KeyHash>,
     /// What to put into the inline QoS.
-    related: Option<SampleIdentity>,
+    pub(crate) related: Option<SampleIdentity>,
+    /// Which of the instances of its writer it belongs to.
+    pub(crate) instance: u32,
+}
+
+/// The hash of the key of a sample whose key nobody here knows: all of them are one instance to a reader. Fast DDS 3.2 ends with a
+/// segmentation fault at a sample of a keyed topic without one, and takes zeros for none.
+const NO_KEY_HASH: KeyHash = *b"sgc: unknown key";
+
+/// Shorter payloads are copied, so that they do not keep alive the larger block that they came in.
+const SHARED_BYTES_MIN: usize = 16 << 10;
+
+/// A sample of the sertype made here, in one block of C's memory: the payload follows it, unless it is shared. `common` is first:
+/// Cyclone knows no more of it.
+#[repr(C)]
+struct Content {
+    common: ddsi_serdata,
+    /// Encapsulation header, body and padding: so many bytes.
+    payload: *const u8,
+    bytes: usize,
+    /// What `payload` points into, if it does not follow.
+    shared: Option<Bytes>,
+    extra: Extra,
     /// What was in the message that it came in.
     origin: Option<Origin>,
 }
 
 /// One reference to a sample of the sertype made here.
 #[derive(Debug)]
-pub(crate) struct IdentifiedSample(*mut ddsi_serdata);
+pub(crate) struct SampleRef(*mut ddsi_serdata);
 
-impl IdentifiedSample {
+// SAFETY: the reference count is atomic, the content is never changed once it is shared, and freeing it is possible on any thread,
+// also when the domain that it came from is gone.
+unsafe impl Send for SampleRef {}
+
+impl SampleRef {
     /// Takes over a reference.
     ///
     /// # Safety
@@ -93,30 +129,98 @@ impl IdentifiedSample {
         Self(sample)
     }
 
-    /// A sample to write under that number, with the identity of the request that it belongs to, or none.
+    /// A sample to write: a payload, and the frame that was made of it. `None` if there is no memory.
     ///
     /// # Safety
     /// `sertype` must be that of a topic that [`topic`] made; Cyclone keeps it while the sample is in use.
     pub(crate) unsafe fn build(
         sertype: *const ddsi_sertype,
+        payload: &Bytes,
         frame: &Frame<'_>,
-        related: Option<SampleIdentity>,
-        number: i64,
+        extra: Extra,
         source_timestamp_ns: i64,
-    ) -> Self {
-        let mut payload = Vec::with_capacity(frame.bytes());
-        payload.extend_from_slice(&frame.header);
-        payload.extend_from_slice(&frame.prefix[..frame.prefix_bytes]);
-        payload.extend_from_slice(frame.body);
-        payload.resize(frame.bytes(), 0);
-        // What readers of the same participant are given is this very sample.
-        let origin = Some(Origin { vendor: CYCLONE, number, related });
-        // SAFETY: valid by contract.
-        let sample =
-            unsafe { Identified::allocate(sertype, ddsi_serdata_kind_SDK_DATA, payload, related, origin) };
+    ) -> Option<Self> {
+        let is_as_it_was = frame.bytes() == payload.len() && payload.starts_with(&frame.header);
+        // SAFETY: the sertype is valid by contract.
+        let sample = unsafe {
+            if is_as_it_was && payload.len() >= SHARED_BYTES_MIN {
+                let (data, bytes) = (payload.as_ptr(), payload.len());
+                Content::allocate(sertype, 0).inspect(|sample| {
+                    (**sample).shared = Some(payload.clone());
+                    ((**sample).payload, (**sample).bytes) = (data, bytes);
+                })
+            } else {
+                Self::copied(sertype, frame)
+            }
+        }?;
         // SAFETY: just made, and not shared yet.
-        unsafe { (*sample).timestamp.v = source_timestamp_ns };
-        Self(sample)
+        unsafe { Self::finish(sample, extra, source_timestamp_ns) }
+    }
+
+    /// A sample to write that is framed otherwise than its payload is.
+    ///
+    /// # Safety
+    /// As of [`Self::build`].
+    pub(crate) unsafe fn build_framed(
+        sertype: *const ddsi_sertype,
+        frame: &Frame<'_>,
+        extra: Extra,
+        source_timestamp_ns: i64,
+    ) -> Option<Self> {
+        // SAFETY: by contract; then just made, and not shared yet.
+        unsafe {
+            let sample = Self::copied(sertype, frame)?;
+            Self::finish(sample, extra, source_timestamp_ns)
+        }
+    }
+
+    /// # Safety
+    /// As of [`Self::build`].
+    unsafe fn copied(sertype: *const ddsi_sertype, frame: &Frame<'_>) -> Option<*mut Content> {
+        const ZEROS: [u8; 4] = [0; 4];
+        // SAFETY: by contract.
+        let sample = unsafe { Content::allocate(sertype, frame.bytes()) }?;
+        let pieces =
+            [&frame.header[..], &frame.prefix[..frame.prefix_bytes], frame.body, &ZEROS[..frame.pad]];
+        // SAFETY: just made, not shared yet, and with room for as many bytes as the pieces have together.
+        unsafe {
+            for piece in pieces {
+                Content::push(sample, piece);
+            }
+        }
+        Some(sample)
+    }
+
+    /// # Safety
+    /// `sample` must be valid and not shared yet.
+    unsafe fn finish(sample: *mut Content, extra: Extra, source_timestamp_ns: i64) -> Option<Self> {
+        // SAFETY: by contract.
+        unsafe {
+            (*sample).extra = extra;
+            if extra.key_only {
+                (*sample).common.kind = ddsi_serdata_kind_SDK_KEY;
+            }
+            // What readers of the same participant are given is this very sample.
+            let Extra { related, key_hash, .. } = extra;
+            (*sample).origin = Some(Origin { vendor: CYCLONE, number: 0, related, key_hash });
+            (*sample).common.timestamp.v = source_timestamp_ns;
+            (*sample).common.hash = extra.instance;
+        }
+        Some(Self(sample.cast()))
+    }
+
+    /// Sets the RTPS status info bits of a sample that is not shared yet.
+    pub(crate) fn set_status(&mut self, statusinfo: u32) {
+        // SAFETY: valid while the reference is held, which is the only one.
+        unsafe { (*self.0).statusinfo = statusinfo }
+    }
+
+    /// Sets the number that a sample will get at its writer, which is not shared yet.
+    pub(crate) fn set_number(&mut self, number: i64) {
+        // SAFETY: valid while the reference is held, which is the only one.
+        if let Some(origin) = unsafe { &mut (*self.0.cast::<Content>()).origin } {
+            origin.number = number;
+        }
     }
 
     /// Gives the reference away, to a call that consumes it.
@@ -126,15 +230,39 @@ impl IdentifiedSample {
         sample
     }
 
-    /// Where a received sample came from, and a copy of its payload: what goes through here is small.
-    pub(crate) fn read(&self) -> (Option<Origin>, Bytes) {
-        // SAFETY: of the sertype made here, by the contract of both constructors; a reference is held.
-        let sample = unsafe { &*self.0.cast::<Identified>() };
-        (sample.origin, Bytes::copy_from_slice(&sample.payload))
+    fn content(&self) -> &Content {
+        // SAFETY: of the sertype made here, by the contract of the constructors; a reference is held.
+        unsafe { &*self.0.cast::<Content>() }
+    }
+
+    /// What the packet of a received sample said.
+    pub(crate) fn origin(&self) -> Option<Origin> {
+        self.content().origin
+    }
+
+    /// What a received sample says of its instance.
+    pub(crate) fn kind(&self) -> SampleKind {
+        let content = self.content();
+        match content.extra.key_only {
+            true if content.common.statusinfo & DDSI_STATUSINFO_DISPOSE != 0 => SampleKind::Dispose,
+            true => SampleKind::Unregister,
+            false => SampleKind::Write,
+        }
+    }
+
+    /// The payload, which keeps the sample alive.
+    pub(crate) fn into_payload(self) -> Bytes {
+        Bytes::from_owner(self)
     }
 }
 
-impl Drop for IdentifiedSample {
+impl AsRef<[u8]> for SampleRef {
+    fn as_ref(&self) -> &[u8] {
+        self.content().payload()
+    }
+}
+
+impl Drop for SampleRef {
     fn drop(&mut self) {
         // SAFETY: one reference is owned and given back once.
         unsafe { ddsi_serdata_unref(self.0) }
@@ -219,22 +347,50 @@ const FLAG_INLINE_QOS: u8 = 0x02;
 /// Length of the RTPS header, bytes (RTPS 2.5, 9.4.4).
 const RTPS_HEADER_BYTES: usize = 20;
 
-impl Identified {
+impl Content {
+    /// A sample without anything, with room for a payload of so many bytes.
+    ///
     /// # Safety
     /// `sertype` must be of this module and outlive the sample.
-    unsafe fn allocate(
-        sertype: *const ddsi_sertype,
-        kind: ddsi_serdata_kind,
-        payload: Vec<u8>,
-        related: Option<SampleIdentity>,
-        origin: Option<Origin>,
-    ) -> *mut ddsi_serdata {
-        // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
-        let common = unsafe { std::mem::zeroed::<ddsi_serdata>() };
-        let sample = Box::into_raw(Box::new(Self { common, payload, related, origin }));
-        // SAFETY: `sample` is valid, the sertype by contract.
-        unsafe { ddsi_serdata_init(&raw mut (*sample).common, sertype, kind) };
-        sample.cast()
+    unsafe fn allocate(sertype: *const ddsi_sertype, room: usize) -> Option<*mut Self> {
+        // SAFETY: takes a size; the block is freed by `free`, with its counterpart.
+        let sample = unsafe { dds_alloc(size_of::<Self>() + room) }.cast::<Self>();
+        if sample.is_null() {
+            return None;
+        }
+        // SAFETY: the block has room for the struct, at an alignment for any type, and the payload follows it. All zeros is a valid
+        // value of Cyclone's plain struct, which the call fills; the sertype is valid by contract.
+        unsafe {
+            sample.write(Self {
+                common: std::mem::zeroed(),
+                payload: sample.add(1).cast(),
+                bytes: 0,
+                shared: None,
+                extra: Extra::default(),
+                origin: None,
+            });
+            ddsi_serdata_init(&raw mut (*sample).common, sertype, ddsi_serdata_kind_SDK_DATA);
+            (*sample).common.hash = 0;
+        }
+        Some(sample)
+    }
+
+    /// Adds to a payload that follows its sample.
+    ///
+    /// # Safety
+    /// `sample` must be valid, not shared yet, and have been made with room for these bytes as well.
+    unsafe fn push(sample: *mut Self, part: &[u8]) {
+        // SAFETY: by contract.
+        unsafe {
+            let end = (*sample).payload.cast_mut().add((*sample).bytes);
+            end.copy_from_nonoverlapping(part.as_ptr(), part.len());
+            (*sample).bytes += part.len();
+        }
+    }
+
+    fn payload(&self) -> &[u8] {
+        // SAFETY: what follows the struct, or what `shared` keeps; so many bytes of it are written and never change.
+        unsafe { std::slice::from_raw_parts(self.payload, self.bytes) }
     }
 }
 
@@ -310,13 +466,12 @@ unsafe fn origin(fragment: &ReceivedFragment) -> Option<Origin> {
     let number = submessage[NUMBER_OFFSET..].first_chunk::<8>()?;
     let (high, low) = (number.first_chunk::<4>()?, number.last_chunk::<4>()?);
     let number = i64::from(i32::from_ne_bytes(*high)) << 32 | i64::from(u32::from_ne_bytes(*low));
-    let related = if flags & FLAG_INLINE_QOS == 0 {
-        None
-    } else {
-        let at = INLINE_QOS_BASE + usize::from(u16::from_ne_bytes([submessage[6], submessage[7]]));
-        submessage.get(at..).and_then(|qos| SampleIdentity::related(qos, flags & FLAG_LITTLE_ENDIAN == 0))
-    };
-    Some(Origin { vendor, number, related })
+    let at = INLINE_QOS_BASE + usize::from(u16::from_ne_bytes([submessage[6], submessage[7]]));
+    let inline_qos = submessage.get(at..).filter(|_| flags & FLAG_INLINE_QOS != 0);
+    let big_endian = flags & FLAG_LITTLE_ENDIAN == 0;
+    let related = inline_qos.and_then(|qos| SampleIdentity::related(qos, big_endian));
+    let key_hash = inline_qos.and_then(|qos| key_hash(qos, big_endian));
+    Some(Origin { vendor, number, related, key_hash })
 }
 
 /// A table of functions that Cyclone reads from any thread.
@@ -356,7 +511,7 @@ static SERDATA: Table<ddsi_serdata_ops> = Table(ddsi_serdata_ops {
     to_untyped: Some(to_untyped),
     untyped_to_sample: None,
     free: Some(free),
-    print: Some(crate::topic::print),
+    print: Some(print),
     get_keyhash: Some(get_keyhash),
     from_loaned_sample: None,
     from_psmx: None,
@@ -381,13 +536,15 @@ unsafe extern "C" fn sertype_hash(_: *const ddsi_sertype) -> u32 {
     0
 }
 
-unsafe extern "C" fn eqkey(_: *const ddsi_serdata, _: *const ddsi_serdata) -> bool {
-    true
+/// The type here knows no keys: what a writer wrote is spread over instances as it likes, and what is received is one.
+unsafe extern "C" fn eqkey(a: *const ddsi_serdata, b: *const ddsi_serdata) -> bool {
+    // SAFETY: of this sertype.
+    unsafe { (*a).hash == (*b).hash }
 }
 
 unsafe extern "C" fn size(sample: *const ddsi_serdata) -> u32 {
     // SAFETY: of this sertype. The length is at most `PAYLOAD_BYTES_MAX`.
-    unsafe { (*sample.cast::<Identified>()).payload.len() as u32 }
+    unsafe { (*sample.cast::<Content>()).bytes as u32 }
 }
 
 unsafe extern "C" fn from_ser(
@@ -400,25 +557,27 @@ unsafe extern "C" fn from_ser(
     if bytes > PAYLOAD_BYTES_MAX || !unsafe { fragments::cover_exactly(fragments, bytes) } {
         return std::ptr::null_mut();
     }
-    let mut payload = Vec::with_capacity(bytes);
-    let mut from = None;
-    let mut at = fragments.cast::<ReceivedFragment>();
-    // SAFETY: a chain of fragments that ends with null; each one's message holds its bytes at the offset of its payload.
+    // SAFETY: the sertype is this one; the fragments are a chain that ends with null and covers exactly so many bytes, and each one's
+    // message holds its bytes at the offset of its payload.
     unsafe {
+        let Some(sample) = Content::allocate(sertype, bytes) else { return std::ptr::null_mut() };
+        let mut at = fragments.cast::<ReceivedFragment>();
         while let Some(fragment) = at.as_ref() {
-            let had = payload.len();
-            if fragment.first == 0 && from.is_none() {
-                from = origin(fragment);
+            let had = (*sample).bytes;
+            if fragment.first == 0 && (*sample).origin.is_none() {
+                (*sample).origin = origin(fragment);
             }
             let (first, end) = (fragment.first as usize, fragment.end as usize);
             // They may overlap.
             if end > had {
                 let start = fragment.message.add(1).cast::<u8>().add(usize::from(fragment.payload_offset));
-                payload.extend_from_slice(std::slice::from_raw_parts(start.add(had - first), end - had));
+                Content::push(sample, std::slice::from_raw_parts(start.add(had - first), end - had));
             }
             at = fragment.next;
         }
-        Identified::allocate(sertype, kind, payload, None, from)
+        // To Cyclone the end of an instance is a sample like any other, which keeps its place and its payload, the serialised key.
+        (*sample).extra.key_only = kind == ddsi_serdata_kind_SDK_KEY;
+        sample.cast()
     }
 }
 
@@ -429,14 +588,18 @@ unsafe extern "C" fn from_ser_iov(
     pieces: *const ddsrt_iovec_t,
     bytes: usize,
 ) -> *mut ddsi_serdata {
-    let mut payload = Vec::with_capacity(bytes);
-    // SAFETY: an array of so many pieces, each valid for its length.
+    // SAFETY: an array of so many pieces, each valid for its length, and together as long as `bytes`, which is checked.
     unsafe {
-        for i in 0..count {
-            let piece = &*pieces.add(i);
-            payload.extend_from_slice(std::slice::from_raw_parts(piece.iov_base.cast::<u8>(), piece.iov_len));
+        let pieces = if count == 0 { &[] } else { std::slice::from_raw_parts(pieces, count) };
+        if pieces.iter().map(|piece| piece.iov_len).sum::<usize>() != bytes {
+            return std::ptr::null_mut();
         }
-        Identified::allocate(sertype, kind, payload, None, None)
+        let Some(sample) = Content::allocate(sertype, bytes) else { return std::ptr::null_mut() };
+        for piece in pieces.iter().filter(|piece| piece.iov_len > 0) {
+            Content::push(sample, std::slice::from_raw_parts(piece.iov_base.cast::<u8>(), piece.iov_len));
+        }
+        (*sample).extra.key_only = kind == ddsi_serdata_kind_SDK_KEY;
+        sample.cast()
     }
 }
 
@@ -447,8 +610,8 @@ unsafe extern "C" fn from_keyhash(_: *const ddsi_sertype, _: *const ddsi_keyhash
 unsafe extern "C" fn to_ser(sample: *const ddsi_serdata, offset: usize, bytes: usize, to: *mut c_void) {
     // SAFETY: of this sertype; Cyclone asks for what is in it, and has room for it.
     unsafe {
-        let payload = &(*sample.cast::<Identified>()).payload;
-        if let Some(part) = payload.get(offset..offset + bytes) {
+        let payload = (*sample.cast::<Content>()).payload();
+        if let Some(part) = offset.checked_add(bytes).and_then(|end| payload.get(offset..end)) {
             to.cast::<u8>().copy_from_nonoverlapping(part.as_ptr(), bytes);
         }
     }
@@ -463,17 +626,17 @@ unsafe extern "C" fn to_ser_ref(
     // SAFETY: of this sertype; payloads that are written are whole multiples of four, so the part is in it. Only a
     // message under construction asks a sample with an identity for its payload.
     unsafe {
-        let identified = &*sample.cast::<Identified>();
+        let content = &*sample.cast::<Content>();
         // The first fragment carries it, as Cyclone has it for parameters of its own.
         if offset == 0
-            && let Some(related) = identified.related
+            && let Some(related) = content.extra.related
             && !add_related(view, related)
         {
             UNIDENTIFIED.fetch_add(1, Ordering::Relaxed);
         }
-        let offset = offset.min(identified.payload.len());
-        (*view).iov_base = identified.payload.as_ptr().add(offset).cast_mut().cast();
-        (*view).iov_len = bytes.min(identified.payload.len() - offset);
+        let offset = offset.min(content.bytes);
+        (*view).iov_base = content.payload.add(offset).cast_mut().cast();
+        (*view).iov_len = bytes.min(content.bytes - offset);
         ddsi_serdata_ref(sample)
     }
 }
@@ -486,7 +649,9 @@ unsafe extern "C" fn to_ser_unref(sample: *mut ddsi_serdata, _: *const ddsrt_iov
 unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdata {
     // SAFETY: a sample of this sertype; the copy has no type, as Cyclone wants it.
     unsafe {
-        let copy = Identified::allocate((*sample).type_, ddsi_serdata_kind_SDK_KEY, Vec::new(), None, None);
+        let Some(copy) = Content::allocate((*sample).type_, 0) else { return std::ptr::null_mut() };
+        let copy = copy.cast::<ddsi_serdata>();
+        (*copy).kind = ddsi_serdata_kind_SDK_KEY;
         (*copy).type_ = std::ptr::null();
         (*copy).hash = (*sample).hash;
         (*copy).timestamp.v = i64::MIN;
@@ -495,11 +660,32 @@ unsafe extern "C" fn to_untyped(sample: *const ddsi_serdata) -> *mut ddsi_serdat
 }
 
 unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
-    // SAFETY: the last reference to what `allocate` made of a box.
-    drop(unsafe { Box::from_raw(sample.cast::<Identified>()) });
+    // SAFETY: the last reference to what `allocate` made.
+    unsafe {
+        sample.cast::<Content>().drop_in_place();
+        dds_free(sample.cast());
+    }
 }
 
-unsafe extern "C" fn get_keyhash(_: *const ddsi_serdata, hash: *mut ddsi_keyhash, _: bool) {
-    // SAFETY: room for a hash. There is no key, as for the sertype of `cyclors`.
-    unsafe { hash.write_bytes(0, 1) };
+/// Shows nothing of a sample. Cyclone calls it without a look whether it is there, once a user has the content of samples written to
+/// its trace.
+unsafe extern "C" fn print(
+    _: *const ddsi_sertype,
+    _: *const ddsi_serdata,
+    text: *mut c_char,
+    bytes: usize,
+) -> usize {
+    if bytes > 0 {
+        // SAFETY: there is room for one.
+        unsafe { text.write(0) };
+    }
+    0
+}
+
+unsafe extern "C" fn get_keyhash(sample: *const ddsi_serdata, hash: *mut ddsi_keyhash, _: bool) {
+    // SAFETY: of this sertype, and room for a hash.
+    unsafe {
+        let known = (*sample.cast::<Content>()).extra.key_hash;
+        hash.cast::<KeyHash>().write(known.unwrap_or(NO_KEY_HASH));
+    }
 }
