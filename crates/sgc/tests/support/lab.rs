@@ -90,6 +90,16 @@ impl Lab {
         lab
     }
 
+    /// The same for real ROS 2: the nodes discover as ROS does by default.
+    pub(crate) fn real(plan: Plan, tables: [String; 2]) -> Self {
+        let mut lab = Self::silent(plan, tables);
+        for site in [Site::Robot, Site::Desk] {
+            lab.reconfigure(site, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+        }
+        lab.start_all();
+        lab
+    }
+
     /// The same before the nodes are started.
     pub(crate) fn silent(plan: Plan, [robot, desk]: [String; 2]) -> Self {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
@@ -219,6 +229,30 @@ impl Lab {
         let mut command = support::command(self.namespace(site), self.dir(), &Peer::program(vendor));
         command.args([role, "--domain", self.domain(site)]).args(args);
         Peer::start(command)
+    }
+
+    /// The load generator on a distribution's client library, `"jazzy"` or `"kilted"`, with its arguments.
+    pub(crate) fn load(&self, site: Site, distribution: &str, args: &[&str]) -> Peer {
+        let library = Peer::program(distribution).join("load.so");
+        let mut command = self.ros(site, distribution, "run.py");
+        command.arg(library).args(args);
+        Peer::start(command)
+    }
+
+    /// A program of `tests/peers/ros2` on a distribution's rclpy.
+    pub(crate) fn rclpy(&self, site: Site, distribution: &str, program: &str, args: &[&str]) -> Peer {
+        let mut command = self.ros(site, distribution, program);
+        command.args(args);
+        Peer::start(command)
+    }
+
+    fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
+        let python = Peer::program(distribution).join("bin/python");
+        let mut command = support::command(self.namespace(site), self.dir(), &python);
+        command.arg("-B").arg(support::repository("tests/peers/ros2").join(program));
+        // What it logs goes there, and nowhere else.
+        command.env("HOME", self.dir()).env("ROS_DOMAIN_ID", self.domain(site));
+        command
     }
 
     /// A Python program of `tests/peers/py` at a site.
