@@ -22,7 +22,7 @@ use cyclors::{
     DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
     dds_instance_handle_t, dds_lset_data_available, dds_sample_info_t, dds_takecdr, ddsi_serdata,
 };
-use sgc_ros::{EndpointKind, EndpointSpec, Guid};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
 
 use crate::entity::{Entity, reason};
 use crate::network::Participant;
@@ -34,7 +34,7 @@ const BATCH: usize = 16;
 /// Bytes of samples that may wait for one reader's thread; a single sample may be longer.
 pub const WAITING_BYTES_MAX: usize = 64 << 20;
 
-/// Fewest samples that may wait for a reliable reader's thread. Fast DDS does not announce whether a publisher keeps all: if it does, it
+/// Fewest samples that may wait for the thread of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does not announce whether a publisher keeps all: if it does, it
 /// loses nothing to a reader on its own network, and is as much faster than this thread as a burst is long.
 pub const RELIABLE_WAITING_MIN: usize = 16_384;
 
@@ -361,12 +361,14 @@ impl<R: Receiver> Intake<R> {
         let group = participant.group(EndpointKind::Reader, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
         let (_, depth) = history_of(EndpointKind::Reader, spec.qos.history, spec.keyless);
-        let (depth, reliable) = (usize::try_from(depth).unwrap_or(1), spec.qos.is_reliable());
+        let (depth, deep) = (usize::try_from(depth).unwrap_or(1), RELIABLE_READER_DEPTH_MIN as usize);
+        // One that asks for less is to have the newest alone.
+        let is_deep = spec.qos.is_reliable() && depth >= deep;
         let shared = Arc::new(Shared {
-            queue: Mutex::new(Queue::new(if reliable { depth.max(RELIABLE_WAITING_MIN) } else { depth })),
+            queue: Mutex::new(Queue::new(if is_deep { depth.max(RELIABLE_WAITING_MIN) } else { depth })),
             filled: Condvar::new(),
             eased: Condvar::new(),
-            holds_back: reliable,
+            holds_back: is_deep,
             receiver: Mutex::new(None),
             participant: Arc::clone(participant),
         });

@@ -196,7 +196,7 @@ pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) ->
     (native, depth as i32)
 }
 
-/// How a reliable writer that keeps the last samples keeps those that are not acknowledged yet. It never waits, so they are a matter
+/// The room for samples that are not acknowledged yet, of a reliable writer that keeps the last ones. It never waits, so they are a matter
 /// of memory, not of what its publisher keeps: Cyclone has so many of each instance, and a writer spreads its samples over as many
 /// instances as their size allows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

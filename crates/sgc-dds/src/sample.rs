@@ -16,14 +16,14 @@
 //!
 //! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
 
-use std::ffi::{c_char, c_int, c_void};
+use std::ffi::{c_char, c_int, c_ulong, c_void};
 use std::mem::offset_of;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use cyclors::{
-    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, DDSI_STATUSINFO_DISPOSE, dds_alloc, dds_create_topic_sertype,
-    dds_free, ddsi_keyhash, ddsi_serdata, ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA,
+    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, DDSI_STATUSINFO_DISPOSE, dds_create_topic_sertype, ddsi_keyhash,
+    ddsi_serdata, ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA,
     ddsi_serdata_kind_SDK_KEY, ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini,
     ddsi_sertype_init_flags, ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
 };
@@ -77,14 +77,14 @@ pub(crate) struct Origin {
     pub(crate) key_hash: Option<KeyHash>,
 }
 
-/// What goes with a payload that is sent.
+/// Facts that go with a payload that is sent.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Extra {
-    /// Whether it is a key alone.
+    /// True for a key alone.
     pub(crate) key_only: bool,
     /// The hash of the key, where the topic has one; [`NO_KEY_HASH`] is sent where it is not known.
     pub(crate) key_hash: Option<KeyHash>,
-    /// What to put into the inline QoS.
+    /// The identity to put into the inline QoS.
     pub(crate) related: Option<SampleIdentity>,
     /// Which of the instances of its writer it belongs to.
     pub(crate) instance: u32,
@@ -105,7 +105,7 @@ struct Content {
     /// Encapsulation header, body and padding: so many bytes.
     payload: *const u8,
     bytes: usize,
-    /// What `payload` points into, if it does not follow.
+    /// The block that `payload` points into, if it does not follow.
     shared: Option<Bytes>,
     extra: Extra,
     /// What was in the message that it came in.
@@ -200,7 +200,7 @@ impl SampleRef {
             if extra.key_only {
                 (*sample).common.kind = ddsi_serdata_kind_SDK_KEY;
             }
-            // What readers of the same participant are given is this very sample.
+            // Readers of the same participant are given this very sample.
             let Extra { related, key_hash, .. } = extra;
             (*sample).origin = Some(Origin { vendor: CYCLONE, number: 0, related, key_hash });
             (*sample).common.timestamp.v = source_timestamp_ns;
@@ -235,12 +235,12 @@ impl SampleRef {
         unsafe { &*self.0.cast::<Content>() }
     }
 
-    /// What the packet of a received sample said.
+    /// Returns the contents of a received sample's packet beside its payload.
     pub(crate) fn origin(&self) -> Option<Origin> {
         self.content().origin
     }
 
-    /// What a received sample says of its instance.
+    /// Tells data from the end of an instance.
     pub(crate) fn kind(&self) -> SampleKind {
         let content = self.content();
         match content.extra.key_only {
@@ -353,8 +353,9 @@ impl Content {
     /// # Safety
     /// `sertype` must be of this module and outlive the sample.
     unsafe fn allocate(sertype: *const ddsi_sertype, room: usize) -> Option<*mut Self> {
+        // Cyclone's own allocator zeroes what it gives, and ends the process where there is nothing to give.
         // SAFETY: takes a size; the block is freed by `free`, with its counterpart.
-        let sample = unsafe { dds_alloc(size_of::<Self>() + room) }.cast::<Self>();
+        let sample = unsafe { cyclors::malloc((size_of::<Self>() + room) as c_ulong) }.cast::<Self>();
         if sample.is_null() {
             return None;
         }
@@ -663,7 +664,7 @@ unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
     // SAFETY: the last reference to what `allocate` made.
     unsafe {
         sample.cast::<Content>().drop_in_place();
-        dds_free(sample.cast());
+        cyclors::free(sample.cast());
     }
 }
 

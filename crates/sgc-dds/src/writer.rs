@@ -38,7 +38,7 @@ pub struct CycloneWriter {
     participant: Arc<Participant>,
     guid: Guid,
     keyless: bool,
-    /// What is kept until it is acknowledged, if the writer does not wait.
+    /// The room for samples until they are acknowledged, if the writer does not wait.
     unacknowledged: Option<Unacknowledged>,
     /// Samples written so far, which wraps.
     written: AtomicU32,

@@ -538,7 +538,7 @@ pub(crate) struct Behind {
     recent: Option<Mutex<Recent>>,
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
-    /// Whether a short message of so many bytes and that time, taken now, waits for nobody, and overwrites none that a reader may
+    /// Returns `true` if a short message of so many bytes and that time, taken now, waits for nobody, and overwrites none that a reader may
     /// lack.
     is_free: Box<dyn Fn(usize, i64) -> bool + Send + Sync>,
 }
@@ -832,7 +832,7 @@ struct Burst {
     not_before: Option<Instant>,
 }
 
-/// How much of what a writer keeps may not have been acknowledged. Changed only by who may take messages.
+/// An upper bound of the samples that a writer keeps unacknowledged. Changed only by the holder of the turn to take messages.
 #[derive(Default)]
 struct Room {
     unacknowledged: AtomicU32,
@@ -841,7 +841,7 @@ struct Room {
 }
 
 impl Room {
-    /// Whether a message of so many bytes and this time may be written without taking the place of one that somebody may lack; does
+    /// Returns `true` if a message of so many bytes and this time may be written without taking the place of one that somebody may lack; does
     /// not wait.
     fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
         let Some(kept) = writer.kept(bytes) else { return true };

@@ -135,7 +135,7 @@ pub enum SampleKind {
 /// The key of a sample, hashed (RTPS 2.5, 9.6.4.8).
 pub type KeyHash = [u8; 16];
 
-/// What a sample says besides its payload.
+/// A sample without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleHead {
     /// Data or the end of an instance.
@@ -351,7 +351,7 @@ pub trait RosWriter: Send + Sync + 'static {
     /// Lets leave what was written ahead.
     fn flush(&self) {}
 
-    /// How many samples of so many bytes it keeps for reliable readers that have not acknowledged them yet. Beyond it each write
+    /// Returns the number of samples of so many bytes that it keeps for reliable readers that have not acknowledged them yet. Beyond it each write
     /// takes the place of the oldest, whether somebody lacks that or not. None if it waits for its readers rather.
     fn kept(&self, bytes: usize) -> Option<u32> {
         let _ = bytes;

@@ -40,7 +40,7 @@ fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64
     summary
 }
 
-/// Whether all of them came, once each, unaltered and in their order. The first may be lost: a reader is matched a moment before it
+/// Asserts that all of them came, once each, unaltered and in their order. The first may be lost: a reader is matched a moment before it
 /// knows (`tests/peers/README.md`).
 fn assert_whole(summary: &Value, messages: u64, what: &str) {
     let counts = ["last", "lost", "duplicated", "altered", "reordered"].map(|key| count(summary, key));

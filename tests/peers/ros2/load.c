@@ -19,7 +19,7 @@ enum { EXIT_FINE = 0, EXIT_WRONG = 1, EXIT_USAGE = 2, EXIT_INCOMPLETE = 3 };
 
 // The first bytes of a message: sequence number, time of writing in ns, and the sum of all bytes behind.
 enum { HEAD_BYTES = 24 };
-// How long a publisher waits for what it wrote to be acknowledged.
+// The longest wait of a publisher for acknowledgements.
 #define ACKNOWLEDGED_WAIT_NS ((int64_t)20 * 1000000000)
 // Latencies that are kept; of more, each takes the place of another at random.
 enum { LATENCIES_MAX = 100000 };
@@ -144,7 +144,7 @@ static void pause_for_ns(int64_t ns) {
     nanosleep(&t, NULL);
 }
 
-// Whether a line, or the end, came on standard input within some milliseconds.
+// Returns true if a line, or the end, came on standard input within some milliseconds.
 static bool line_came(int wait_ms) {
     struct pollfd input = {STDIN_FILENO, POLLIN, 0};
     if (poll(&input, 1, wait_ms) <= 0) return false;
@@ -293,7 +293,7 @@ static Tally tally_of_none(void) {
     return tally;
 }
 
-// Whether so many messages have come, or the last one.
+// Returns true once so many messages have come, or the last one.
 static bool is_enough(const Tally *tally) {
     if (options.last != 0) return tally->received > 0 && tally->last + 1 >= options.last;
     return options.count != 0 && tally->received >= options.count;

@@ -12,7 +12,7 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 /// Where `ip netns` keeps them.
 const NAMESPACES: &str = "/run/netns";
 
-/// Where programs keep memory that they share. Those of a namespace share it with each other alone: DDS implementations take each
+/// The folder of memory that programs share. Those of a namespace share it with each other alone: DDS implementations take each
 /// other for programs of one host by what is in it.
 const SHARED_MEMORY: &str = "/dev/shm";
 

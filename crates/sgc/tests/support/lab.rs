@@ -250,7 +250,7 @@ impl Lab {
         let python = Peer::program(distribution).join("bin/python");
         let mut command = support::command(self.namespace(site), self.dir(), &python);
         command.arg("-B").arg(support::repository("tests/peers/ros2").join(program));
-        // What it logs goes there, and nowhere else.
+        // Its logs go there, and nowhere else.
         command.env("HOME", self.dir()).env("ROS_DOMAIN_ID", self.domain(site));
         command
     }
