@@ -442,7 +442,7 @@ mod tests {
                         "state":"trying again","failures":2,"last_failure":"no answer","again_in_s":3}],
             "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
                        "state":"waiting for a publisher"}],
-            "names":[],"drops":{"no_tree":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
+            "names":[],"drops":{"hop_limit":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
         let lines = parse(Path::new("x"), text).unwrap().lines();
         let expected = [
             "arm-1: sgc 0.1.0, up for 1 min 15 s",
@@ -462,8 +462,8 @@ mod tests {
             "Names: none",
             "",
             "Drops:",
-            "  reason   count",
-            "  no_tree  3",
+            "  reason     count  meaning",
+            "  hop_limit  3      it went in a circle, or over too many routers",
             "",
             "Refused peers: none",
             "",
