@@ -223,7 +223,6 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
          <FragmentSize>{FRAGMENT_BYTES}B</FragmentSize></General>\
          <Discovery>{discovery}</Discovery>\
          <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
-         <GenerateKeyhash>true</GenerateKeyhash>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/>\
          <MaxSampleSize>{PAYLOAD_BYTES_MAX}B</MaxSampleSize></Internal>\
          </Domain></CycloneDDS>"

@@ -214,7 +214,9 @@ impl Unacknowledged {
             return None;
         }
         let (_, depth) = history_of(EndpointKind::Writer, qos.history, keyless);
-        let depth = u32::try_from(depth).unwrap_or(1).max(UNACKNOWLEDGED_MIN);
+        let depth = u32::try_from(depth).unwrap_or(1);
+        // Late joiners get from Cyclone whatever is kept for others.
+        let depth = if qos.is_transient_local() { depth } else { depth.max(UNACKNOWLEDGED_MIN) };
         let is_one = qos.is_transient_local() || qos.deadline_ns.is_some() || !keyless;
         Some(Self { depth, instances_max: if is_one { 1 } else { (UNACKNOWLEDGED_MAX / depth).max(1) } })
     }

@@ -4,7 +4,7 @@
 //! - keeps the payload as it was serialised, received or to be sent, the latter without a copy where it is long;
 //! - tells what stands in the inline QoS of a received sample in front of the payload, since it is handed the packet: the hash of
 //!   its key, and the request that it belongs to;
-//! - puts the hash of a key into the inline QoS of what is sent, where Cyclone asks for it (`Internal/GenerateKeyhash`);
+//! - puts the hash of a key into the inline QoS of what is sent, where Cyclone asks for it (`Internal/GenerateKeyhash`, off by default);
 //! - keeps the serialised key of a sample that has nothing else, for which Cyclone would look up the instance;
 //! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as memory allows
 //!   ([`crate::writer`]).
@@ -82,17 +82,13 @@ pub(crate) struct Origin {
 pub(crate) struct Extra {
     /// True for a key alone.
     pub(crate) key_only: bool,
-    /// The hash of the key, where the topic has one; [`NO_KEY_HASH`] is sent where it is not known.
+    /// The hash of the key, where the topic has one and it is known.
     pub(crate) key_hash: Option<KeyHash>,
     /// The identity to put into the inline QoS.
     pub(crate) related: Option<SampleIdentity>,
     /// Which of the instances of its writer it belongs to.
     pub(crate) instance: u32,
 }
-
-/// The hash of the key of a sample whose key nobody here knows: all of them are one instance to a reader. Fast DDS 3.2 ends with a
-/// segmentation fault at a sample of a keyed topic without one, and takes zeros for none.
-const NO_KEY_HASH: KeyHash = *b"sgc: unknown key";
 
 /// Shorter payloads are copied, so that they do not keep alive the larger block that they came in.
 const SHARED_BYTES_MIN: usize = 16 << 10;
@@ -687,6 +683,6 @@ unsafe extern "C" fn get_keyhash(sample: *const ddsi_serdata, hash: *mut ddsi_ke
     // SAFETY: of this sertype, and room for a hash.
     unsafe {
         let known = (*sample.cast::<Content>()).extra.key_hash;
-        hash.cast::<KeyHash>().write(known.unwrap_or(NO_KEY_HASH));
+        hash.cast::<KeyHash>().write(known.unwrap_or_default());
     }
 }

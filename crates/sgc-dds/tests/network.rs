@@ -1062,30 +1062,31 @@ fn ids_are_as_long_as_those_of_the_network() {
 }
 
 #[test]
-fn the_hash_of_a_key_passes_and_one_that_nobody_knows_is_the_same_for_all() {
-    let (ros, sgc) = (open(151, None), open(151, Some("arm-1")));
+fn the_hash_of_a_key_passes_where_it_is_asked_for() {
+    let uri = "<CycloneDDS><Domain><Internal><GenerateKeyhash>true</GenerateKeyhash></Internal></Domain></CycloneDDS>";
+    let config = DdsConfig {
+        domain: 151,
+        discovery: DiscoveryRange::LocalHost,
+        cyclonedds_uri: Some(uri.into()),
+        ..DdsConfig::default()
+    };
+    let sgc = CycloneNetwork::open(&DdsConfig { tag: Some("arm-1".into()), ..config.clone() }).unwrap();
+    let ros = CycloneNetwork::open(&config).unwrap();
     let keyed = |topic| EndpointSpec { keyless: false, ..spec(topic) };
     let (_reader, samples) = read(&ros, &keyed("h"));
     let hashing = writer(&sgc, &keyed("h"), 1);
     let hash = *b"sixteen bytes it";
-    for kind in [SampleKind::Write, SampleKind::Dispose] {
+    // Long ones come in fragments, of which the first one says it.
+    let (short, long) = (string_cdr("a"), string_cdr(&"a".repeat(100_000)));
+    for (kind, payload) in
+        [(SampleKind::Write, &short), (SampleKind::Dispose, &short), (SampleKind::Write, &long)]
+    {
         let head = SampleHead { key_hash: Some(hash), ..SampleHead::new(kind, 5) };
-        hashing.write_ahead(head, string_cdr("a")).unwrap();
+        hashing.write_ahead(head, payload.clone()).unwrap();
         hashing.flush();
         let sample = next(&samples);
         assert_eq!((sample.kind, sample.key_hash), (kind, Some(hash)));
     }
-    // Long ones come in fragments, of which the first one says it.
-    let head = SampleHead { key_hash: Some(hash), ..SampleHead::new(SampleKind::Write, 5) };
-    hashing.write_ahead(head, string_cdr(&"a".repeat(100_000))).unwrap();
-    hashing.flush();
-    assert_eq!(next(&samples).key_hash, Some(hash));
-    let unknown = ["a", "b"].map(|text| {
-        write(&hashing, &string_cdr(text));
-        next(&samples).key_hash
-    });
-    assert!(unknown[0].is_some_and(|hash| hash != [0; 16]), "zeros are none to Fast DDS");
-    assert_eq!(unknown[0], unknown[1]);
     // A topic without keys has none.
     let (_reader, samples) = read(&ros, &spec("h0"));
     write(&writer(&sgc, &spec("h0"), 1), &string_cdr("a"));
@@ -1117,27 +1118,4 @@ fn a_reliable_writer_keeps_what_is_not_acknowledged_as_far_as_memory_goes() {
         assert_eq!(next(&samples).payload[8..16], *format!("{n:08}").as_bytes());
     }
     quiet(&samples);
-}
-
-#[test]
-fn late_joiners_get_what_the_publisher_keeps_whatever_is_kept_for_others() {
-    let (ros, sgc) = (open(153, None), open(153, Some("arm-1")));
-    let latched = |n| {
-        with(spec("late"), |qos| {
-            qos.durability = Durability::TransientLocal;
-            qos.history = History::KeepLast(n);
-        })
-    };
-    let (_first, first) = read(&ros, &latched(100));
-    let writer = writer(&sgc, &latched(3), 1);
-    for n in 0..UNACKNOWLEDGED_MIN {
-        write(&writer, &string_cdr(&n.to_string()));
-    }
-    (0..UNACKNOWLEDGED_MIN).for_each(|_| drop(next(&first)));
-    let (_late, late) = read(&ros, &latched(100));
-    for n in UNACKNOWLEDGED_MIN - 3..UNACKNOWLEDGED_MIN {
-        assert_eq!(next(&late).payload, padded(&string_cdr(&n.to_string())));
-    }
-    quiet(&late);
-    assert_eq!(writer.kept(100), Some(UNACKNOWLEDGED_MIN));
 }

@@ -114,17 +114,3 @@ fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     assert_whole(&frozen.summary(), MESSAGES, "the one that stood still");
     talker.summary();
 }
-
-/// Fast DDS 3.2 ends with a segmentation fault at a sample of a keyed topic that comes without the hash of its key. Jazzy has no such
-/// types.
-#[test]
-fn topics_with_keys_arrive_by_value_and_instance() {
-    let topics = ["/keyed_long", "/keyed_string", "/complex_nested_key"];
-    let lab = Lab::real(PLAN, robot_to_desk("topic", topics));
-    let mut listener = lab.rclpy(Site::Desk, "kilted", "keyed.py", &["sub", "--timeout", "100"]);
-    listener.wait("ready", |event| event["event"] == "ready");
-    let mut talker = lab.rclpy(Site::Robot, "kilted", "keyed.py", &["pub", "--timeout", "100"]);
-    let summary = listener.summary();
-    assert_eq!((&summary["complete"], count(&summary, "altered")), (&Value::Bool(true), 0), "{summary}");
-    talker.end();
-}

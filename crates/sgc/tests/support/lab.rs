@@ -239,13 +239,6 @@ impl Lab {
         Peer::start(command)
     }
 
-    /// A program of `tests/peers/ros2` on a distribution's rclpy.
-    pub(crate) fn rclpy(&self, site: Site, distribution: &str, program: &str, args: &[&str]) -> Peer {
-        let mut command = self.ros(site, distribution, program);
-        command.args(args);
-        Peer::start(command)
-    }
-
     fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
         let python = Peer::program(distribution).join("bin/python");
         let mut command = support::command(self.namespace(site), self.dir(), &python);
