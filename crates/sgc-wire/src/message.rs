@@ -173,9 +173,10 @@ mod tests {
         for kind in 1..=10 {
             assert!(decode(kind, 0, 0).is_ok() && decode(kind, 1, 0).is_err() && decode(kind, 2, 0).is_err());
             assert!(decode(kind, 0, 1).is_err());
+            assert_eq!(decode(kind, 0, 2).is_ok(), kind <= 2, "keys are of data and of the end of instances");
         }
         assert!(decode(0, 2, 0).is_ok() && decode(0, 3, 0).is_err());
-        assert!(decode(0, 2, 1).is_ok() && decode(0, 0, 2).is_err());
+        assert!(decode(0, 2, 1).is_ok() && decode(0, 0, 2).is_ok() && decode(0, 0, 3).is_err());
     }
 
     /// The bytes are normative.
