@@ -34,9 +34,10 @@ const BATCH: usize = 16;
 /// Bytes of samples that may wait for one reader's thread; a single sample may be longer.
 pub const WAITING_BYTES_MAX: usize = 64 << 20;
 
-/// Fewest samples that may wait for the thread of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does not announce whether a publisher keeps all: if it does, it
-/// loses nothing to a reader on its own network, and is as much faster than this thread as a burst is long.
-pub const RELIABLE_WAITING_MIN: usize = 16_384;
+/// Fewest samples that may wait for the thread of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does
+/// not announce whether a publisher keeps all: if it does, it loses nothing to a reader on its own network, and is as much faster
+/// than this thread as a burst is long.
+const RELIABLE_WAITING_MIN: usize = 16_384;
 
 /// How long the receiving thread waits for a reader's at once.
 const HOLD_MAX: Duration = Duration::from_millis(2);

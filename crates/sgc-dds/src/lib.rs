@@ -39,7 +39,7 @@ mod wait;
 mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
-pub use intake::{RELIABLE_WAITING_MIN, WAITING_BYTES_MAX};
+pub use intake::WAITING_BYTES_MAX;
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
 pub use sample::unidentified_messages;

@@ -86,7 +86,7 @@ pub(crate) struct Extra {
     pub(crate) key_hash: Option<KeyHash>,
     /// The identity to put into the inline QoS.
     pub(crate) related: Option<SampleIdentity>,
-    /// Which of the instances of its writer it belongs to.
+    /// The number of its instance at its writer.
     pub(crate) instance: u32,
 }
 

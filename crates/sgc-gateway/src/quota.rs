@@ -783,7 +783,7 @@ mod tests {
         assert_eq!(counts(&client("10.0.0.1:2")).0, 0);
         // The pool of all other hosts has it once.
         assert_eq!(quotas.remote.bytes.load(Ordering::Relaxed), 30);
-        // What it takes from now on is the other's, too, and the other gets everything back.
+        // Anything that it takes from now on is the other's, too, and the other gets everything back.
         let more = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
         assert_eq!(counts(&after).0, 2);
         drop((charge, held, permits, more));

@@ -357,7 +357,7 @@ async fn what_a_session_has_counts_for_the_credential_that_it_shows_last() {
     let end = first.next().await.unwrap().unwrap();
     assert!(matches!(&end, Message::Close(Some(why)) if u16::from(why.code) == 1013), "{end:?}");
     drop((own, first));
-    // What the session had is gone with it.
+    // The session's own are gone with it.
     let until_room = async {
         while flood(&site, "10.0.0.2:1").await.0.len() < LIMITS.subscriptions_max {
             tokio::time::sleep(Duration::from_millis(20)).await;

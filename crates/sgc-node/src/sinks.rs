@@ -666,7 +666,7 @@ impl WriterQueue {
                     writer.flush()
                 };
             };
-            burst.before_next(&*writer, next == Next::Nothing, &head, payload.len());
+            burst.before_next(&*writer, next == Next::Nothing, payload.len(), head.source_timestamp_ns);
             let written = writer.write_ahead(head, payload);
             if next != Next::AtOnce {
                 writer.flush();
@@ -871,7 +871,7 @@ impl Room {
 impl Burst {
     /// Waits before a sample of so many bytes would take the place of one that somebody may lack. One that comes alone is written at
     /// once, as its publisher did.
-    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, head: &SampleHead, bytes: usize) {
+    fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, bytes: usize, timestamp_ns: i64) {
         let Some(kept) = writer.kept(bytes) else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
         // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
@@ -882,7 +882,7 @@ impl Burst {
             unacknowledged = 0;
         }
         self.room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
-        *self.room.last() = Some((Instant::now(), head.source_timestamp_ns));
+        *self.room.last() = Some((Instant::now(), timestamp_ns));
     }
 }
 
@@ -945,23 +945,21 @@ mod tests {
         }
     }
 
-    const HEAD: SampleHead = SampleHead::new(SampleKind::Write, 0);
-
     #[test]
     fn a_burst_waits_for_its_readers_but_not_for_one_that_stands_still() {
         let writer = Slow::new(Some(10));
         let mut burst = Burst::default();
-        (0..100).for_each(|_| burst.before_next(&writer, true, &HEAD, 8));
+        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
-        (0..100).for_each(|_| burst.before_next(&writer, false, &HEAD, 8));
+        (0..100).for_each(|_| burst.before_next(&writer, false, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 10);
-        (0..100).for_each(|_| burst.before_next(&writer, false, &HEAD, 2000));
+        (0..100).for_each(|_| burst.before_next(&writer, false, 2000, 0));
         assert_eq!(writer.waited.load(Relaxed), 30, "fewer of long ones are kept");
         writer.stands_still.store(true, Relaxed);
-        (0..1000).for_each(|_| burst.before_next(&writer, false, &HEAD, 8));
+        (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
         assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
         let (writer, mut other) = (Slow::new(None), Burst::default());
-        (0..100).for_each(|_| other.before_next(&writer, false, &HEAD, 8));
+        (0..100).for_each(|_| other.before_next(&writer, false, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
     }
 
@@ -971,13 +969,13 @@ mod tests {
         let mut burst = Burst::default();
         for _ in 0..35 {
             assert!(burst.room.is_there(&writer, 8, 0));
-            burst.before_next(&writer, true, &HEAD, 8);
+            burst.before_next(&writer, true, 8, 0);
         }
         assert_eq!(writer.waited.load(Relaxed), 3, "asked when as many were written as are kept");
         writer.stands_still.store(true, Relaxed);
         for _ in 0..5 {
             assert!(burst.room.is_there(&writer, 8, 0));
-            burst.before_next(&writer, true, &HEAD, 8);
+            burst.before_next(&writer, true, 8, 0);
         }
         assert!(!burst.room.is_there(&writer, 8, 0), "ten are under way");
         assert!(Burst::default().room.is_there(&Slow::new(None), 8, 0));

@@ -551,6 +551,7 @@ impl LocalShare {
         key_hash: Option<KeyHash>,
         payload: Bytes,
     ) -> Result<(PayloadForm, PayloadEncoding, Bytes), DataDrop> {
+        let taken = payload.len();
         let is_converted = self.is_json.load(Relaxed) && kind == SampleKind::Write;
         let (form, payload) = match key_hash.filter(|_| !is_converted) {
             None => (PayloadForm::Cdr, payload),
@@ -559,7 +560,6 @@ impl LocalShare {
         if !self.is_altered.load(Relaxed) || kind != SampleKind::Write {
             return Ok((form, PayloadEncoding::Plain, payload));
         }
-        let taken = payload.len();
         let (form, payload) = if is_converted { self.convert(payload)? } else { (form, payload) };
         let (encoding, payload) = self.compress(payload);
         if self.is_shaped.load(Relaxed) {

@@ -37,7 +37,7 @@ const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
 /// Errors that a client may make at once, and a second: who makes more is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
-/// What a client is told of a message whose pieces have not come in time.
+/// The text for a client whose message lacks pieces that have not come in time.
 const PIECES_LATE: &str = "pieces of the message did not come in time, and it is given up";
 /// Things that a client which has become another may not have any more, each said for itself; further ones are counted.
 const ENDED_SHOWN_MAX: usize = 16;

@@ -1,4 +1,4 @@
-//! What each refusal means and what to do about it: the one table that `sgc why` and `sgc status` explain counters by.
+//! The meaning and the remedy of each refusal: the one table that `sgc why` and `sgc status` explain counters by.
 //!
 //! The counters themselves are listed in `docs/spec/routing.md`, drops, and kept by the node.
 
@@ -18,7 +18,7 @@ pub(crate) struct Refusal {
     /// The counter, as the node spells it.
     pub(super) key: &'static str,
     pub(super) means: &'static str,
-    /// What the user can do; empty where nothing has to be done.
+    /// The user's remedy; empty where nothing has to be done.
     pub(super) fix: &'static str,
     /// True if an honest network never causes it, or somebody has to see to it: `sgc why` names it for any topic.
     pub(super) is_named: bool,
@@ -435,7 +435,7 @@ const GATEWAY: &[Refusal] = &[
     ),
 ];
 
-/// What an owner, or a router on the way, says to a node that asks for a topic; what to do at the owner, and what at the
+/// Answers of an owner, or of a router on the way, to a node that asks for a topic; the remedy at the owner, and that at the
 /// node that asked.
 const JOINS: &[(Answer, &str, &str)] = &[
     // The walk itself says what to add to `to`.
@@ -478,7 +478,7 @@ const JOINS: &[(Answer, &str, &str)] = &[
     (Answer::Router(RejectReason::Revoked), "", ENROLL_AGAIN),
 ];
 
-/// Who refused a topic, and why.
+/// A refusal of a topic, by an owner or a router, with its reason.
 #[derive(Clone, Copy, Debug)]
 enum Answer {
     Owner(RefuseReason),
@@ -591,7 +591,7 @@ pub(super) mod tests {
         let drops = text.split("\n## Drops\n").nth(1).unwrap();
         let cell = drops.lines().find_map(|line| line.strip_prefix(&format!("| {row} | "))).unwrap();
         let keys = cell.split('`').skip(1).step_by(2).map(str::to_owned);
-        // What differs is told in words behind the key.
+        // Differences are told in words behind the key.
         keys.filter(|key| key.bytes().all(|b| b.is_ascii_lowercase() || b == b'_')).collect()
     }
 

@@ -365,7 +365,7 @@ fn refusals_are_named_before_the_way_with_the_peers_that_cause_them() {
         "{said:?}"
     );
     assert!(said[3].starts_with("peers refused a link: revoked 3"), "{said:?}");
-    // What happens in a sound network is no news.
+    // Refusals of a sound network are no news.
     assert!(!steps.iter().any(|step| step.found.contains("unknown 30")));
     // The same at a router, which knows names alone.
     assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
