@@ -1,26 +1,10 @@
-//! Real ROS 2 through `sgc`: programs on the client library of Jazzy (Fast DDS 2.14) and of Kilted (Fast DDS 3.2), installed from PyPI
-//! (`tests/peers/README.md`), as their packages set them up: default QoS, default discovery, shared memory.
-//!
-//! A robot's network, the cloud and a desk's network (`support/lab.rs`). The same programs with nothing between them are the measure.
+//! Messages at full speed, large ones, and subscribers that stand still.
 
-#![allow(clippy::unwrap_used)]
-
-#[path = "support/lab.rs"]
-mod lab;
-mod support;
-
-use lab::{Lab, Plan, Site, robot_to_desk};
 use rustix::process::Signal;
 use serde_json::Value;
 
-const PLAN: Plan = Plan { name: "sgcr", domains: ["87", "88"], peer_life: "120" };
-
-/// The distribution at the robot and that at the desk.
-const PAIRS: [[&str; 2]; 2] = [["jazzy", "kilted"], ["kilted", "jazzy"]];
-
-fn count(summary: &Value, key: &str) -> u64 {
-    summary[key].as_u64().unwrap()
-}
+use crate::lab::{Lab, Site, robot_to_desk};
+use crate::{PAIRS, PLAN, count};
 
 /// A publisher of so many messages, the second half a second after the first, and a subscriber, matched with each other or by `sgc`;
 /// what the subscriber sums up once it has the last.
