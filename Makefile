@@ -18,7 +18,7 @@ help:
 	@echo '                 transports (NATs, roaming and bad paths for each transport; minutes)'
 	@echo '                 vendors (each DDS vendor to each, every type with every QoS; minutes)'
 	@echo '                 model-check (larger bounds)'
-	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, most of an hour; ARGS="--quick" is minutes)'
+	@echo '                 bench (SGC beside what users would pick instead: bench/README.md; root, about an hour; ARGS="--quick" is minutes)'
 	@echo '                 bench-routing (what routing costs, beside a TCP relay and zenoh: bench/README.md; ARGS="--quick")'
 	@echo '                 bench-teleop, bench-transports (every transport over emulated paths; root)'
 	@echo '                 bench-gateway (gRPC and the rosbridge protocol: bench/README.md)'
@@ -133,9 +133,10 @@ model-check:
 	CARGO_PROFILE_DEV_OPT_LEVEL=3 $(CARGO) test --locked -p sgc-testkit --test tree_protocol -- --ignored --nocapture
 
 # SGC and what users would pick instead, side by side; root. What SGC is measured beside is built first, each where `compare`
-# looks for it: the load generator with DDS Security, and the Zenoh bridge as its own project builds it, which takes long.
+# looks for it: ROS 2, the load generator with DDS Security, and the Zenoh bridge as its own project builds it, which takes long.
 bench: build
 	@scripts/install-deps.sh bench
+	@scripts/build-ros2.sh
 	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
 		--target-dir bench/target/dds-security
 	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
@@ -161,8 +162,9 @@ bench-gateway: build
 	$(CARGO) run --release --locked --manifest-path bench/Cargo.toml --no-default-features -p sgc-bench -- gateway \
 		--sgc "$${CARGO_TARGET_DIR:-target}/release/sgc" $(ARGS)
 
-# What `compare` runs beside `sgc`: the Zenoh bridge (minutes, the first time), and talkers with DDS Security.
+# What `compare` runs beside `sgc`: the Zenoh bridge (minutes, the first time), talkers with DDS Security, and ROS 2.
 bench-peers: deps-bench
+	@scripts/build-ros2.sh
 	$(CARGO) build --release --locked --manifest-path bench/zenoh-bridge/Cargo.toml --target-dir bench/zenoh-bridge/target
 	$(CARGO) build --release --locked --manifest-path bench/Cargo.toml -p sgc-bench-load --features dds-security \
 		--target-dir bench/target/dds-security

@@ -64,6 +64,7 @@ if [ "$what" = test ]; then
     need 'command -v openssl' openssl -- "a DTLS program that is not ours"
 fi
 if [ "$what" = bench ]; then
+    need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"
     need 'command -v ip' iproute2 -- "networks of their own for what is measured (ip netns)"
     need 'command -v wireguard-go' wireguard-go -- "DDS over WireGuard"
     need 'command -v wg' wireguard-tools -- "DDS over WireGuard: its keys"

@@ -5,6 +5,7 @@
 
 use super::figures::{Figure, Figures};
 use super::plot::Unit;
+use super::real_ros2::{self, JAZZY_KILTED, KILTED_JAZZY};
 use super::round_trip::GAVE_UP;
 
 /// A goal and what became of it.
@@ -214,6 +215,10 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
         ),
     ]);
 
+    goals.extend(
+        [("group", GROUP), ("standard", STANDARD)].into_iter().flat_map(|suite| run.real_ros2(suite)),
+    );
+
     let thin = ["paper", "lossy"];
     let huge = |path| run.ratio(("round-trip", path, HUGE, "p50_us"), STANDARD, "tcp");
     let parts = thin.iter().map(|path| part(path, huge(path))).collect();
@@ -296,6 +301,55 @@ impl Run<'_> {
 
     fn at_size(&self, at: f64, value: Option<f64>) -> Part {
         Part { label: Unit::Bytes.text(at), value }
+    }
+
+    /// Judges programs of real ROS 2, each suite beside what they reach natively.
+    fn real_ros2(&self, (suite, ours): (&str, &str)) -> Vec<Goal> {
+        /// A measurement in words, and the table and place of its figures.
+        type Row = (&'static str, &'static str, f64);
+        const FLOWS: [Row; 2] =
+            [("20 000 a second", real_ros2::TABLE, 20e3), ("`KEEP_ALL`", real_ros2::KEEP_ALL, 0.0)];
+        const SIZES_SMALL: [f64; 3] = [24.0, 1e3, 8e3];
+        const PAIRS: [(&str, &str); 2] =
+            [("Jazzy to Kilted", JAZZY_KILTED), ("Kilted to Jazzy", KILTED_JAZZY)];
+        let over = |what: &str| format!("Real ROS 2, {what}: `{suite}` to native");
+        let round_trip = |&at: &f64| {
+            PAIRS.map(|(name, path)| {
+                let place = (real_ros2::ROUND_TRIP, path, at, "p50_us");
+                part(&format!("{}, {name}", Unit::Bytes.text(at)), self.ratio(place, ours, "direct"))
+            })
+        };
+        let rate = |&(what, table, at): &Row| {
+            let parts = PAIRS
+                .map(|(name, path)| part(name, self.ratio((table, path, at, "per_second"), ours, "direct")));
+            let what = format!("{what}, messages of 1000 B a second");
+            goal(over(&what), Bound::AtLeast(0.9), None, parts.into())
+        };
+        let lost = FLOWS.iter().flat_map(|&(what, table, at)| {
+            PAIRS.map(|(name, path)| {
+                let place = (table, path, at, "lost");
+                let lost = self.number(place, ours).zip(self.number(place, "direct"));
+                // What is lost natively, too, is not the system's fault.
+                part(&format!("{what}, {name}"), lost.map(|(ours, theirs)| (ours - theirs).max(0.0)))
+            })
+        });
+        let mut goals: Vec<_> = FLOWS.iter().map(rate).collect();
+        goals.extend([
+            goal(
+                format!("Real ROS 2, messages lost: `{suite}` beyond native"),
+                Bound::AtMost(0.0),
+                Some(Unit::Plain),
+                lost.collect(),
+            ),
+            goal(
+                over("round trip p50, 24 B to 8 KB"),
+                Bound::AtMost(2.2),
+                None,
+                SIZES_SMALL.iter().flat_map(round_trip).collect(),
+            ),
+            goal(over("round trip p50, 1 MB"), Bound::AtMost(2.0), None, round_trip(&LARGE).into()),
+        ]);
+        goals
     }
 
     /// Driving over an uplink that a camera fills, by the default transport.
@@ -478,6 +532,23 @@ mod tests {
         // What was measured last counts.
         figures.push("throughput", GROUP, "bare", 1000.0, "per_second", 97_000.0);
         assert_eq!(verdict(&figures, what).0, Verdict::Met);
+    }
+
+    #[test]
+    fn real_ros2_may_lose_no_more_than_natively() {
+        let what = "Real ROS 2, messages lost: `group` beyond native";
+        let mut figures = Figures::default();
+        for path in [JAZZY_KILTED, KILTED_JAZZY] {
+            for (table, at) in [(real_ros2::TABLE, 20e3), (real_ros2::KEEP_ALL, 0.0)] {
+                figures.push(table, "direct", path, at, "lost", 10.0);
+                figures.push(table, GROUP, path, at, "lost", 9.0);
+            }
+        }
+        assert_eq!(verdict(&figures, what).0, Verdict::Met);
+        figures.push(real_ros2::KEEP_ALL, GROUP, KILTED_JAZZY, 0.0, "lost", 12.0);
+        let (judged, reached) = verdict(&figures, what);
+        assert_eq!(judged, Verdict::Missed);
+        assert!(reached.ends_with("`KEEP_ALL`, Kilted to Jazzy: 2"), "{reached}");
     }
 
     #[test]

@@ -13,7 +13,7 @@ use sgc_testkit::netsim::{Loss, Namespace, Profile, TunLink};
 use tempfile::TempDir;
 
 use super::program::Program;
-use super::system::{Dds, Running};
+use super::system::{Dds, Networks, Running};
 use crate::uplink::{FAR, NEAR, Uplink};
 
 /// The interface at each end of the path.
@@ -97,6 +97,8 @@ pub(crate) struct Lab {
     pub(crate) path: Option<TunLink>,
     /// What it is.
     pub(crate) kind: PathKind,
+    /// What systems connect.
+    pub(crate) networks: Networks,
     places: [Arc<Namespace>; 2],
     /// For all that is written while it is there.
     pub(crate) dir: TempDir,
@@ -107,6 +109,20 @@ pub(crate) struct Lab {
 impl Lab {
     /// Makes them; `load` is the program that talks and listens. Needs root.
     pub(crate) fn new(kind: PathKind, load: &Path) -> Result<Self> {
+        Self::with_networks(Networks::Loopback, kind, load)
+    }
+
+    /// Makes places for programs of ROS 2 as it is by default.
+    pub(crate) fn stock(kind: PathKind, load: &Path) -> Result<Self> {
+        let lab = Self::with_networks(Networks::Stock, kind, load)?;
+        for place in &lab.places {
+            // Multicast leaves by the interface that this route names.
+            place.ip(&["route", "add", "default", "dev", INTERFACE])?;
+        }
+        Ok(lab)
+    }
+
+    fn with_networks(networks: Networks, kind: PathKind, load: &Path) -> Result<Self> {
         let (path, places) = match kind.profiles() {
             Some(profiles) => {
                 let Uplink { path, near, far } = Uplink::new(profiles)?;
@@ -119,7 +135,7 @@ impl Lab {
             place.ip(&["link", "set", "lo", "multicast", "on"])?;
         }
         let dir = tempfile::tempdir()?;
-        Ok(Self { path, kind, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
+        Ok(Self { path, kind, networks, places, dir, load: load.to_owned(), started: AtomicU32::new(0) })
     }
 
     /// The namespace of a place.
@@ -156,7 +172,7 @@ impl Lab {
     pub(crate) fn load_in(&self, dds: &Dds, side: Side, args: &[&str]) -> Result<Program> {
         let mut command = self.command(side, dds.load.as_deref().unwrap_or(&self.load));
         command.args(args).args(["--domain", &dds.domain.to_string()]);
-        command.env("CYCLONEDDS_URI", &dds.uri);
+        dds.configure(&mut command);
         let name = format!("load-{}-{}", side.name(), args.first().copied().unwrap_or_default());
         Program::start(&name, command, &self.new_dir(&name)?)
     }

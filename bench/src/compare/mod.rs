@@ -16,6 +16,7 @@ mod multi_hop;
 mod plan;
 mod plot;
 mod program;
+mod real_ros2;
 mod report;
 mod roaming;
 mod round_trip;
@@ -47,9 +48,10 @@ pub(crate) use system::Dds;
 type Table = fn(&Compare, &mut Figures) -> Result<()>;
 
 /// Every table, in the order of the report.
-const TABLES: [(&str, Table); 10] = [
+const TABLES: [(&str, Table); 11] = [
     ("round-trip", round_trip::run),
     ("throughput", throughput::run),
+    (real_ros2::TABLE, real_ros2::run),
     ("start-up", start_up::run),
     ("applications", applications::run),
     ("fleet-step", fleet_step::run),
@@ -115,7 +117,7 @@ impl Compare {
         let mut relays = system::relays();
         let mut names: Vec<_> = systems.iter().chain(&relays).map(|system| system.name()).collect();
         names.extend(system::CONFIGURED.map(str::to_owned));
-        names.push(tcp::NAME.to_owned());
+        names.extend([tcp::NAME, real_ros2::ONE_HOST].map(str::to_owned));
         for pattern in &args.systems {
             ensure!(
                 names.iter().any(|name| fits(pattern, name)),
@@ -191,6 +193,11 @@ impl Compare {
     /// The program that is measured.
     pub(crate) fn sgc(&self) -> &Path {
         &self.args.sgc
+    }
+
+    /// The folder with an environment of each distribution of ROS 2.
+    pub(crate) fn ros2(&self) -> &Path {
+        &self.args.peers.ros2
     }
 
     /// Bytes of an image of `fleet-step`.

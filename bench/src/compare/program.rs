@@ -9,6 +9,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use crate::process::{PATIENCE, cpu_seconds_of, resident_bytes_of};
@@ -30,7 +31,18 @@ pub(crate) struct Program {
     orders: Option<ChildStdin>,
     lines: Receiver<String>,
     log: PathBuf,
-    grace: Duration,
+    ending: Ending,
+}
+
+/// The way in which a process is ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    /// It ends by itself once its standard input does.
+    Input,
+    /// It ends by itself at SIGTERM.
+    Terminate,
+    /// It is killed.
+    Kill,
 }
 
 impl Program {
@@ -49,14 +61,27 @@ impl Program {
                 }
             }
         });
-        Ok(Self { name: name.to_owned(), child, orders, lines, log, grace: GRACE })
+        Ok(Self { name: name.to_owned(), child, orders, lines, log, ending: Ending::Input })
     }
 
     /// The same for one that does not care for its standard input: it is killed.
     pub(crate) fn start_daemon(name: &str, command: Command, dir: &Path) -> Result<Self> {
         let mut program = Self::start(name, command, dir)?;
-        program.grace = Duration::ZERO;
+        program.ending = Ending::Kill;
         Ok(program)
+    }
+
+    /// Starts a process that ends at SIGTERM.
+    pub(crate) fn start_terminated(name: &str, command: Command, dir: &Path) -> Result<Self> {
+        let mut program = Self::start(name, command, dir)?;
+        program.ending = Ending::Terminate;
+        Ok(program)
+    }
+
+    /// Sends it SIGTERM.
+    pub(crate) fn terminate(&self) {
+        // One that has ended is left alone.
+        let _ = Pid::from_raw(self.pid() as i32).map(|pid| kill_process(pid, Signal::TERM));
     }
 
     /// The next line that it prints.
@@ -87,6 +112,19 @@ impl Program {
                         return Ok(value);
                     }
                 }
+                _ => {}
+            }
+        }
+    }
+
+    /// Waits for an object whose member `event` is this one, and returns the object. Other lines are skipped.
+    pub(crate) fn until_event(&mut self, event: &str, patience: Duration) -> Result<Value> {
+        let deadline = Instant::now() + patience;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let line = self.line(left).with_context(|| format!("waiting for {event:?}"))?;
+            match serde_json::from_str::<Value>(&line) {
+                Ok(said) if said["event"] == event => return Ok(said),
                 _ => {}
             }
         }
@@ -141,7 +179,15 @@ impl Program {
 impl Drop for Program {
     fn drop(&mut self) {
         drop(self.orders.take());
-        let deadline = Instant::now() + self.grace;
+        let grace = match self.ending {
+            Ending::Input => GRACE,
+            Ending::Terminate => {
+                self.terminate();
+                GRACE
+            }
+            Ending::Kill => Duration::ZERO,
+        };
+        let deadline = Instant::now() + grace;
         while Instant::now() < deadline {
             if !matches!(self.child.try_wait(), Ok(None)) {
                 return;

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::figures::{Figure, Figures};
 use super::goals;
 use super::plot::{self, Axis, Bar, Hue, Series, Stroke, Unit, join, three_digits};
+use super::real_ros2;
 use super::round_trip::GAVE_UP;
 use crate::report::Machine;
 
@@ -150,6 +151,38 @@ impl<'a> About<'a> {
                 Unit::Bytes,
                 Plot::Bars("per_second"),
             ),
+            real_ros2::TABLE => (
+                "Real ROS 2",
+                "A C program on `rcl` and stock `rmw_fastrtps` publishes to another of the other distribution: 1000 B, reliable, `KEEP_LAST` \
+                 10, as ROS 2 has it by default. *lost* counts from the first message that arrived. *direct DDS* is what users have natively, \
+                 one network over the path; goals compare with it. *one host* is natively in shared memory, where nothing goes over a path.\n",
+                "messages a second",
+                Unit::Plain,
+                Plot::Nothing,
+            ),
+            real_ros2::KEEP_ALL => (
+                "Real ROS 2, `KEEP_ALL`",
+                "The same programs, which keep all that is not acknowledged; the publisher writes without a pause. *refused* are messages \
+                 that DDS did not take from the publisher.\n",
+                "",
+                Unit::Plain,
+                Plot::Nothing,
+            ),
+            real_ros2::ROUND_TRIP => (
+                "Real ROS 2, round trip",
+                "One message there and the same back, one at a time, between the same programs.\n",
+                "bytes of a message",
+                Unit::Bytes,
+                Plot::Curves,
+            ),
+            real_ros2::RESTART => (
+                "Real ROS 2, restart",
+                "Numbered messages from a publisher to a subscriber. Both are ended after runs 1 and 2 and started anew, while the system runs on. \
+                 *duplicated* counts copies beyond the first that the subscriber of that run takes.\n",
+                "run",
+                Unit::Plain,
+                Plot::Nothing,
+            ),
             "start-up" => (
                 "Start-up and advertisement",
                 "With so many records known to the router beforehand.\n",
@@ -213,7 +246,7 @@ impl<'a> About<'a> {
 impl About<'_> {
     /// Whether its tables have a place each and metrics as columns, since there are more of these than places.
     fn has_many_metrics(&self) -> bool {
-        matches!(self.table, "throughput" | "teleop" | "roaming")
+        matches!(self.table, "throughput" | real_ros2::TABLE | "teleop" | "roaming")
     }
 
     /// A place in words.
@@ -227,9 +260,13 @@ impl About<'_> {
 
 /// The tables of a run, the known ones first and in their order.
 fn tables(figures: &Figures) -> Vec<&str> {
-    const ORDER: [&str; 10] = [
+    const ORDER: [&str; 14] = [
         "round-trip",
         "throughput",
+        real_ros2::TABLE,
+        real_ros2::KEEP_ALL,
+        real_ros2::ROUND_TRIP,
+        real_ros2::RESTART,
         "start-up",
         "applications",
         "fleet-step",
@@ -360,6 +397,8 @@ fn path_name(path: &str) -> String {
         "bare" => "Bare link (`bare`)",
         "paper" => "76 ms round trip, 5 Mbit/s (`paper`)",
         "lossy" => "40 ms round trip, 50 Mbit/s, 2 % loss (`lossy`)",
+        real_ros2::JAZZY_KILTED => "Jazzy to Kilted, bare link (`jazzy-kilted`)",
+        real_ros2::KILTED_JAZZY => "Kilted to Jazzy, bare link (`kilted-jazzy`)",
         "near" => "10 ms round trip (`near`)",
         "far" => "76 ms round trip (`far`)",
         "uplink" => "Uplink of 5 Mbit/s",
@@ -485,7 +524,8 @@ fn measure(metric: &str) -> (Unit, f64, String) {
 
 /// A system's place among the others, by the parts of its name.
 fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
-    const PEERS: [&str; 11] = [
+    const PEERS: [&str; 12] = [
+        real_ros2::ONE_HOST,
         "tcp",
         "direct",
         "relay",
@@ -542,6 +582,7 @@ fn system_name(system: &str) -> String {
     let name = match system {
         "tcp" => "plain TCP",
         "direct" => "direct DDS",
+        real_ros2::ONE_HOST => "one host, shared memory",
         "relay" => "bare relay, TCP",
         "relay-gathers" => "bare relay, TCP, gathering",
         "wireguard" => "DDS over WireGuard",
@@ -578,7 +619,7 @@ fn look(system: &str) -> (Hue, Stroke) {
     match system {
         "sgc-proxy-use" => (Hue::Blue, Stroke::Dashed),
         "direct" => (Hue::Grey, Stroke::Solid),
-        "tcp" => (Hue::Grey, Stroke::Dashed),
+        "tcp" | real_ros2::ONE_HOST => (Hue::Grey, Stroke::Dashed),
         "relay" | "relay-gathers" => (Hue::Grey, Stroke::Dotted),
         "wireguard" => (Hue::Orange, Stroke::Solid),
         "dds-security" => (Hue::Olive, Stroke::Solid),

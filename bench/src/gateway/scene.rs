@@ -78,7 +78,7 @@ impl Scene {
         let load = |role: &str, args: &[&str]| {
             let mut command = Command::new(load);
             command.arg(role).args(args).args(["--domain", &DOMAIN.to_string(), "--reliable"]);
-            command.env("CYCLONEDDS_URI", Dds::loopback().uri);
+            Dds::loopback().configure(&mut command);
             let mut program = Program::start(role, command, dir.path())?;
             program.until("up", UP_MAX)?;
             Ok::<_, anyhow::Error>(program)

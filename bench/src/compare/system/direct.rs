@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 
-use super::{Dds, Running, System, Topic};
+use super::{Dds, Networks, Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
 
 /// Programs that see each other.
@@ -14,7 +14,10 @@ impl System for Direct {
     }
 
     fn start(&self, lab: &Lab, _: &[Topic]) -> Result<Running> {
-        let dds = Side::BOTH.map(|side| Dds::between(lab.address(side), lab.address(side.other())));
+        let dds = Side::BOTH.map(|side| match lab.networks {
+            Networks::Loopback => Dds::between(lab.address(side), lab.address(side.other())),
+            Networks::Stock => Dds::stock(0),
+        });
         Ok(Running { processes: Vec::new(), dds })
     }
 }

@@ -9,6 +9,7 @@ mod zenoh;
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use anyhow::Result;
 use clap::Args;
@@ -44,8 +45,8 @@ pub(crate) struct Topic {
 pub(crate) struct Dds {
     /// The domain.
     pub(crate) domain: u32,
-    /// For `CYCLONEDDS_URI`.
-    pub(crate) uri: String,
+    /// For `CYCLONEDDS_URI`; none where everything is as the middleware has it by itself.
+    pub(crate) uri: Option<String>,
     /// Another build of the program that talks and listens, if it takes one.
     pub(crate) load: Option<PathBuf>,
 }
@@ -72,7 +73,39 @@ impl Dds {
              <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>{peers}</Peers></Discovery>\
              </Domain></CycloneDDS>"
         );
-        Self { domain: 0, uri, load: None }
+        Self { domain: 0, uri: Some(uri), load: None }
+    }
+
+    /// A network on every interface with multicast, as ROS 2 has it by default.
+    pub(crate) fn stock(domain: u32) -> Self {
+        Self { domain, uri: None, load: None }
+    }
+
+    /// Gives a program of Cyclone DDS its configuration, and no other.
+    pub(crate) fn configure(&self, command: &mut Command) {
+        match &self.uri {
+            Some(uri) => command.env("CYCLONEDDS_URI", uri),
+            None => command.env_remove("CYCLONEDDS_URI"),
+        };
+    }
+}
+
+/// The DDS networks of the two places.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Networks {
+    /// Each keeps to the loopback interface of its place.
+    Loopback,
+    /// Each is on every interface, as ROS 2 has it by default. Domains keep them apart.
+    Stock,
+}
+
+impl Networks {
+    /// Returns the network of a place, where a system connects the two.
+    pub(crate) fn local(self, side: Side) -> Dds {
+        match self {
+            Self::Loopback => Dds::loopback(),
+            Self::Stock => Dds::stock(1 + side as u32),
+        }
     }
 }
 
@@ -113,6 +146,9 @@ pub(crate) struct Peers {
     /// The program that talks and listens, built with its feature `dds-security`
     #[arg(long, value_name = "FILE", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/target/dds-security/release/load"))]
     secure_load: PathBuf,
+    /// The environments of ROS 2, of scripts/build-ros2.sh
+    #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/../.peers"))]
+    pub(super) ros2: PathBuf,
 }
 
 /// Every system, in the order of the report. `sgc` is the program under test.

@@ -57,6 +57,6 @@ fn own_dds() -> Dds {
          <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/></Internal>"
     );
-    dds.uri = dds.uri.replace("</General>", &general);
+    dds.uri = dds.uri.map(|uri| uri.replace("</General>", &general));
     dds
 }

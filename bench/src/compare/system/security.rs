@@ -39,7 +39,8 @@ impl System for DdsSecurity {
         let keystore = Keystore::make(lab.new_dir("keystore")?)?;
         let dds = Side::BOTH.map(|side| {
             let mut dds = Dds::between(lab.address(side), lab.address(side.other()));
-            dds.uri = dds.uri.replace("</Domain>", &format!("{}</Domain>", keystore.config(side)));
+            let security = format!("{}</Domain>", keystore.config(side));
+            dds.uri = dds.uri.map(|uri| uri.replace("</Domain>", &security));
             dds.load = Some(load.clone());
             dds
         });

@@ -96,28 +96,30 @@ impl Sgc {
         let text = format!(
             "[node]\nstate = \"left.state\"\n[router]\nlisten = [{listen}]\n{}\
              [[share]]\ntopic = \"{topic}\"\nto = [\"*\"]\nsuite = \"{}\"\n",
-            ros(0),
+            ros(&Dds::loopback()),
             self.suite
         );
         running.processes.push((Side::Left, self.start_node(lab, Side::Left, "left", &dir, &text)?));
         for domain in 0..nodes {
+            let dds = Dds { domain, ..Dds::loopback() };
             let node = format!("right-{domain}");
             fleet.write(&dir, &node, false)?;
             let text = format!(
                 "[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n{}\
                  [[use]]\nfrom = \"left\"\ntopic = \"{topic}\"\n",
-                ros(domain)
+                ros(&dds)
             );
             running.processes.push((Side::Right, self.start_node(lab, Side::Right, &node, &dir, &text)?));
-            networks.push(Dds { domain, ..Dds::loopback() });
+            networks.push(dds);
         }
         Ok((running, networks))
     }
 }
 
 /// The local network of a place.
-fn ros(domain: u32) -> String {
-    format!("[ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n")
+fn ros(dds: &Dds) -> String {
+    let range = if dds.uri.is_some() { "localhost" } else { "subnet" };
+    format!("[ros]\ndomain_id = {}\ndiscovery_range = \"{range}\"\nstatic_peers = []\n", dds.domain)
 }
 
 impl System for Sgc {
@@ -133,7 +135,8 @@ impl System for Sgc {
     fn start(&self, lab: &Lab, topics: &[Topic]) -> Result<Running> {
         let dir = lab.new_dir(&self.name())?;
         let fleet = BenchFleet::new()?;
-        let mut running = Running { processes: Vec::new(), dds: Side::BOTH.map(|_| Dds::loopback()) };
+        let dds = Side::BOTH.map(|side| lab.networks.local(side));
+        let mut running = Running { processes: Vec::new(), dds };
         // Numbered from the right; each dials the one before.
         for number in 0..self.routers {
             let node = format!("router-{number}");
@@ -159,7 +162,7 @@ impl System for Sgc {
                 (Side::Left, routers) => self.url(lab.address(Side::Right), routers.saturating_sub(1)),
             };
             let mut text = format!("[node]\nstate = \"{node}.state\"\nrouters = [{dials}]\n");
-            text += &ros(0);
+            text += &ros(&running.dds[side as usize]);
             if listens {
                 writeln!(text, "[router]\nlisten = [{}]", self.url("0.0.0.0", 0))?;
             }

@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, DnType, IsCa, KeyPair, SanType};
 use serde_json::{Value, json};
 
-use super::{Dds, Running, System, Topic};
+use super::{Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
 use crate::compare::program::Program;
 
@@ -46,7 +46,7 @@ impl Zenoh {
     fn config(&self, lab: &Lab, dir: &Path) -> Result<Value> {
         let mut config = json!({
             "scouting": { "multicast": { "enabled": false } },
-            "plugins": { "ros2dds": { "domain": 0 } },
+            "plugins": { "ros2dds": {} },
         });
         if self.over == Over::Tls {
             merge(&mut config, &json!({ "transport": { "link": { "tls": certificates(lab, dir)? } } }));
@@ -74,7 +74,8 @@ impl System for Zenoh {
         let config = dir.join("bridge.json5");
         fs::write(&config, self.config(lab, &dir)?.to_string())?;
         let scheme = if self.over == Over::Tls { "tls" } else { "tcp" };
-        let mut running = Running { processes: Vec::new(), dds: Side::BOTH.map(|_| Dds::loopback()) };
+        let dds = Side::BOTH.map(|side| lab.networks.local(side));
+        let mut running = Running { processes: Vec::new(), dds };
         for side in [Side::Right, Side::Left] {
             let mut command = lab.command(side, &program);
             match side {
@@ -84,7 +85,9 @@ impl System for Zenoh {
                 }
             };
             command.arg("--config").arg(&config);
-            command.env("CYCLONEDDS_URI", &running.dds[side as usize].uri);
+            let dds = &running.dds[side as usize];
+            dds.configure(&mut command);
+            command.args(["--domain", &dds.domain.to_string()]);
             // The ids in `ros_discovery_info` have 16 bytes from Iron on, as those of the programs here.
             command.env("ROS_DISTRO", "jazzy");
             for variable in
