@@ -40,6 +40,7 @@ mod writer;
 
 pub use config::{DdsConfig, DiscoveryRange};
 pub use intake::WAITING_BYTES_MAX;
+pub use log::{Unsent, unsent};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
 pub use sample::unidentified_messages;

@@ -2,15 +2,90 @@
 //!
 //! Cyclone reports *why* a domain cannot be created only to its log. It also prints there what no operator
 //! needs to see on stderr. Tracing to a file, if the user's `CYCLONEDDS_URI` asks for it, is not touched.
+//!
+//! Errors that repeat are counted: each kind is logged once in [`QUIET`], in the words of the operator where it is known.
 
 use std::cell::RefCell;
 use std::ffi::{CStr, c_void};
-use std::sync::Once;
+use std::sync::{Mutex, Once, PoisonError};
+use std::time::{Duration, Instant};
 
 use cyclors::{DDS_LC_ERROR, DDS_LC_FATAL, DDS_LC_WARNING, dds_log_data_t, dds_set_log_sink};
 
 /// Bound on what one failure may say, bytes.
 const REASON_BYTES_MAX: usize = 1024;
+
+/// Shortest time between two log lines of a kind.
+const QUIET: Duration = Duration::from_secs(60);
+
+/// Packets of the local network that could not be sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unsent {
+    /// Their number since the beginning of this process.
+    pub packets: u64,
+    /// The address that the last one was for.
+    pub to: String,
+    /// The time of the last one.
+    pub last: Instant,
+}
+
+static UNSENT: Mutex<Option<Unsent>> = Mutex::new(None);
+
+/// Returns the packets of the local networks of this process that could not be sent, if there were any.
+pub fn unsent() -> Option<Unsent> {
+    UNSENT.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+/// Lines of one kind.
+#[derive(Debug)]
+struct Repeats {
+    logged: Option<Instant>,
+    since: u64,
+}
+
+impl Repeats {
+    const NONE: Self = Self { logged: None, since: 0 };
+
+    /// Counts a line; the number of earlier ones that were not logged if this one is to be.
+    fn note(&mut self, now: Instant) -> Option<u64> {
+        if self.logged.is_some_and(|logged| now.saturating_duration_since(logged) < QUIET) {
+            self.since += 1;
+            return None;
+        }
+        self.logged = Some(now);
+        Some(std::mem::take(&mut self.since))
+    }
+}
+
+static REPEATS: Mutex<[Repeats; 2]> = Mutex::new([Repeats::NONE; 2]);
+
+/// Returns the address of a packet that could not be sent, where Cyclone says so:
+/// `ddsi_udp_conn_write to udp/10.0.0.1:7411 failed with retcode -1`.
+fn unsent_to(message: &str) -> Option<&str> {
+    let (to, _) = message.strip_prefix("ddsi_udp_conn_write to ")?.split_once(" failed with retcode")?;
+    Some(to.strip_prefix("udp/").unwrap_or(to))
+}
+
+/// Counts an error, and logs it if its kind was not logged of late.
+fn complain(message: &str, now: Instant) {
+    let to = unsent_to(message);
+    if let Some(to) = to {
+        let mut unsent = UNSENT.lock().unwrap_or_else(PoisonError::into_inner);
+        let packets = unsent.as_ref().map_or(0, |unsent| unsent.packets) + 1;
+        *unsent = Some(Unsent { packets, to: to.to_owned(), last: now });
+    }
+    let [sending, other] = &mut *REPEATS.lock().unwrap_or_else(PoisonError::into_inner);
+    let kind = if to.is_some() { sending } else { other };
+    let Some(before) = kind.note(now) else { return };
+    let more = if before == 0 { String::new() } else { format!(" ({before} more since the last such line)") };
+    match to {
+        Some(to) => tracing::warn!(
+            "packets to the local ROS 2 network cannot be sent, this one to {to}{more}: no way leads there, or this host's address \
+             changed"
+        ),
+        None => tracing::warn!(target: "cyclonedds", "{message}{more}"),
+    }
+}
 
 thread_local! {
     static HEARD: RefCell<Option<String>> = const { RefCell::new(None) };
@@ -52,12 +127,44 @@ unsafe extern "C" fn sink(_: *mut c_void, data: *const dds_log_data_t) {
             None => false,
         });
         if !heard {
-            tracing::warn!(target: "cyclonedds", "{message}");
+            complain(message, Instant::now());
         }
     } else if data.priority & DDS_LC_WARNING != 0 {
         // Cyclone's warnings name topics and types.
         tracing::debug!(target: "cyclonedds", "{message}");
     } else {
         tracing::trace!(target: "cyclonedds", "{message}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_packet_that_is_not_sent_is_told_by_its_address() {
+        let said = "ddsi_udp_conn_write to udp/239.255.0.1:7400 failed with retcode -1";
+        assert_eq!(unsent_to(said), Some("239.255.0.1:7400"));
+        assert_eq!(unsent_to("ddsi_udp_conn_write to nowhere"), None);
+        assert_eq!(unsent_to("malformed packet received"), None);
+    }
+
+    #[test]
+    fn lines_of_a_kind_are_counted_and_logged_once_in_a_while() {
+        let (mut repeats, start) = (Repeats::NONE, Instant::now());
+        assert_eq!(repeats.note(start), Some(0));
+        for n in 1..=175 {
+            assert_eq!(repeats.note(start + n * QUIET / 176), None);
+        }
+        assert_eq!(repeats.note(start + QUIET), Some(175));
+        assert_eq!(repeats.note(start + 2 * QUIET), Some(0));
+    }
+
+    #[test]
+    fn packets_that_are_not_sent_are_counted() {
+        let now = Instant::now();
+        let before = unsent().map_or(0, |unsent| unsent.packets);
+        complain("ddsi_udp_conn_write to udp/192.0.2.1:7411 failed with retcode -1", now);
+        assert_eq!(unsent(), Some(Unsent { packets: before + 1, to: "192.0.2.1:7411".into(), last: now }));
     }
 }
