@@ -66,6 +66,22 @@ pub enum Alert {
         /// The time here, RFC 3339.
         now: String,
     },
+    /// Programs find each other by a Discovery Server of Fast DDS, which this node cannot join.
+    DiscoveryServer {
+        /// The server, as `ROS_DISCOVERY_SERVER` names it.
+        server: String,
+        /// The program that has the variable set; none for this one.
+        program: Option<String>,
+    },
+    /// Packets to programs of the local ROS 2 network cannot be sent.
+    LocalNetworkFails {
+        /// The address that the last one was for.
+        to: String,
+        /// The number of them since the node's start.
+        packets: u64,
+        /// Seconds since the last one.
+        ago_s: u64,
+    },
     /// An alert that this version does not know.
     #[serde(other)]
     Other,
@@ -89,6 +105,13 @@ impl Alert {
             }
             Self::ClockBeforeCertificate { .. } => {
                 "set the clock, for instance by NTP (`timedatectl`); the node goes on by itself as soon as it is right"
+            }
+            Self::DiscoveryServer { .. } => {
+                "start programs whose topics cross without ROS_DISCOVERY_SERVER, with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST \
+                 and ROS_STATIC_PEERS where multicast is to be avoided (docs/vendors.md)"
+            }
+            Self::LocalNetworkFails { .. } => {
+                "compare `ip addr` and `ip route` with that address; if this host's own address changed, restart the node"
             }
             Self::Other => "use an `sgc` of the node's version",
         }
@@ -121,6 +144,18 @@ impl fmt::Display for Alert {
             Self::ClockBeforeCertificate { not_before, now } => write!(
                 f,
                 "the clock here says {now}, and this node's certificate begins at {not_before}: the clock is wrong"
+            ),
+            Self::DiscoveryServer { server, program: None } => write!(
+                f,
+                "ROS_DISCOVERY_SERVER={server} is set: sgc cannot join a Discovery Server, and finds no program that uses one"
+            ),
+            Self::DiscoveryServer { server, program: Some(program) } => write!(
+                f,
+                "{program} runs with ROS_DISCOVERY_SERVER={server}: sgc finds no program that uses a Discovery Server"
+            ),
+            Self::LocalNetworkFails { to, packets, ago_s } => write!(
+                f,
+                "packets to the local ROS 2 network cannot be sent, the last to {to} {ago_s} s ago ({packets} so far)"
             ),
             Self::Other => f.write_str("the node says something that this version of sgc does not know"),
         }

@@ -22,6 +22,7 @@ mod conversion;
 mod core;
 mod credentials;
 mod dataplane;
+pub mod discovery_server;
 mod file_watch;
 mod finding;
 mod fleet_file;

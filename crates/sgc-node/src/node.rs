@@ -32,6 +32,7 @@ use crate::authority::Authority;
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
 use crate::credentials::{Keeper, with_kept_crls};
+use crate::discovery_server;
 use crate::file_watch::FileWatch;
 use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
 use crate::gateway::{
@@ -285,6 +286,9 @@ pub async fn run(
         Some(ros) => Some(Arc::new(CycloneNetwork::open(&dds_config(ros, &identity))?)),
         None => None,
     };
+    if network.is_some() {
+        tokio::spawn(discovery_server::watch());
+    }
     let gateway = config.ros.as_ref().map(|ros| -> OpenLocalRos {
         // An ordinary participant, whose topics the node's own sees as any program's.
         let config = DdsConfig { tag: None, ..dds_config(ros, &identity) };

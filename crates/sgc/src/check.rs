@@ -12,6 +12,7 @@ use sgc_node::config::{
     self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
     TokenSource,
 };
+use sgc_node::discovery_server;
 use sgc_trust::Identity;
 use sgc_types::Definitions;
 use sgc_wire::PayloadForm;
@@ -144,6 +145,11 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
     }
     if let Some(alert) = clock_alert(identity, unix_now()) {
         rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
+    }
+    if config.ros.is_some() {
+        for alert in discovery_server::alerts(&run::environment) {
+            rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);
+        }
     }
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
     if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {

@@ -16,6 +16,9 @@ use crate::alerts::{Alert, clock_alert};
 /// The place of a process that is linked to another router of the mesh.
 const ELSEWHERE: &str = "another router";
 
+/// Seconds for which a failure to send to the local network is shown: longer than participants' announcements are apart.
+const UNSENT_SHOWN_S: u64 = 60;
+
 impl<N: RosNetwork> Core<N> {
     /// Closes the link of a run whose place another one has. One that came back after it was told so is a second
     /// process; the first is told of it, and whoever keeps this node.
@@ -110,6 +113,11 @@ impl<N: RosNetwork> Core<N> {
         let mut alerts = Vec::from_iter(clock_alert(&self.identity, now.unix));
         let node = self.identity.node_name().as_str();
         alerts.extend(self.alerts.shown(node, |peer| self.called(peer), now.instant));
+        alerts.extend(sgc_dds::unsent().and_then(|unsent| {
+            let ago_s = now.instant.saturating_duration_since(unsent.last).as_secs();
+            let (to, packets) = (unsent.to, unsent.packets);
+            (ago_s < UNSENT_SHOWN_S).then_some(Alert::LocalNetworkFails { to, packets, ago_s })
+        }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
             let ahead_ms = self.router.clock_ahead_ms(*id).filter(|ms| clocks_differ(*ms))?;
             let peer = self.called(&entry.link.peer().node_id);

@@ -14,12 +14,13 @@ use std::process::ExitCode;
 
 use clap::Args;
 use serde::Serialize;
+use sgc_node::discovery_server;
 use sgc_node::graph::Graph;
 use sgc_wire::Name;
 
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::output;
 use crate::topic::NodeArgs;
+use crate::{output, run};
 
 /// Say why a topic, service or action does not flow: walk its way and name the first thing that is wrong
 ///
@@ -126,7 +127,12 @@ fn graph(
     walk: impl FnOnce(&Graph) -> Vec<Step>,
 ) -> Result<Vec<Step>, CliError> {
     match args.node.graph(name) {
-        Ok(graph) => Ok(walk(&graph)),
+        Ok(mut graph) => {
+            if graph.has_ros {
+                graph.alerts.extend(discovery_server::alerts(&run::environment));
+            }
+            Ok(walk(&graph))
+        }
         Err(error @ (CliError::NoNode { .. } | CliError::NoNodeHere { .. })) => Ok(vec![Step::wrong(
             error.to_string(),
             "start it with `sgc run -c FILE`; if it runs elsewhere, ask there, or as the user that runs it",

@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod flow;
+mod hosts;
 #[path = "../support/lab.rs"]
 mod lab;
 #[path = "../support/mod.rs"]

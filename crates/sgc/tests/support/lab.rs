@@ -218,6 +218,13 @@ impl Lab {
         serde_json::from_slice(&output.stdout).unwrap_or_default()
     }
 
+    /// The text of `sgc why` about a topic at a site.
+    pub(crate) fn why(&self, site: Site, topic: &str) -> String {
+        let mut command = self.sgc(Some(site), &["why", topic, "--socket"]);
+        let output = command.arg(self.path(site, "sock")).output().unwrap();
+        String::from_utf8(output.stdout).unwrap()
+    }
+
     /// A peer that keeps to its own network, by loopback alone.
     pub(crate) fn peer(&self, site: Site, vendor: &str, role: &str, args: &[&str]) -> Peer {
         let common = ["--localhost", "--timeout", self.plan.peer_life];
@@ -233,9 +240,20 @@ impl Lab {
 
     /// The load generator on a distribution's client library, `"jazzy"` or `"kilted"`, with its arguments.
     pub(crate) fn load(&self, site: Site, distribution: &str, args: &[&str]) -> Peer {
+        self.load_within(site, distribution, &[], args)
+    }
+
+    /// The same with variables in its environment.
+    pub(crate) fn load_within(
+        &self,
+        site: Site,
+        distribution: &str,
+        environment: &[(&str, &str)],
+        args: &[&str],
+    ) -> Peer {
         let library = Peer::program(distribution).join("load.so");
         let mut command = self.ros(site, distribution, "run.py");
-        command.arg(library).args(args);
+        command.arg(library).args(args).envs(environment.iter().copied());
         Peer::start(command)
     }
 
