@@ -21,6 +21,7 @@
 pub mod config;
 mod discovery;
 mod entity;
+mod first_messages;
 mod fragments;
 mod graph;
 pub mod identity;

@@ -41,7 +41,8 @@ use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 /// no other version than the one that is written there with `=`, and whoever writes another one there meets the assertion
 /// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
 /// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), the callers of
-/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with the text here and in `fragments.rs`.
+/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with the text here and in `fragments.rs`; and all that
+/// `first_messages.rs` names.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
