@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod calls;
 mod flow;
 mod hosts;
 #[path = "../support/lab.rs"]
