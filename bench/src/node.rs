@@ -171,6 +171,7 @@ fn spec(topic: &str, qos: Qos) -> EndpointSpec {
         topic: dds_topic(topic),
         type_name: dds_type("std_msgs/msg/ByteMultiArray"),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos,
     }

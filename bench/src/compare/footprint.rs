@@ -308,6 +308,7 @@ impl Applications {
             topic: dds_topic(&format!("{TOPIC}{n}")),
             type_name: dds_type("std_msgs/msg/ByteMultiArray"),
             keyless: true,
+            asks_key_hash: false,
             type_hash: None,
             qos: Qos::default(),
         };

@@ -14,13 +14,16 @@ pub const PID_RELATED_FAST: u16 = 0x800f;
 /// PID_KEY_HASH (RTPS 2.5, 9.6.4.8): the key of a sample, hashed.
 pub const PID_KEY_HASH: u16 = 0x0070;
 
+/// PID_STATUS_INFO (RTPS 2.5, 9.6.4.9): the end of an instance.
+pub(crate) const PID_STATUS_INFO: u16 = 0x0071;
+
 /// A parameter that nobody knows, vendor-specific and "must be understood" (RTPS 2.5, 9.6.3.1): Cyclone drops
 /// a sample of a Cyclone participant that carries it, without a word, which keeps a message in the other mapping
 /// from a program that would read its first 16 bytes as an id. Other vendors skip what is specific to Cyclone.
 pub const PID_NOT_FOR_CYCLONE: u16 = 0xcfff;
 
 /// End of a parameter list (RTPS 2.5, 9.4.2.11).
-const PID_SENTINEL: u16 = 0x0001;
+pub(crate) const PID_SENTINEL: u16 = 0x0001;
 
 /// Length of a sample identity in a parameter, bytes: a GUID and a sequence number.
 pub const IDENTITY_BYTES: usize = 24;
@@ -98,13 +101,13 @@ pub fn key_hash(inline_qos: &[u8], big_endian: bool) -> Option<KeyHash> {
 }
 
 /// The parameters of a list up to its sentinel (RTPS 2.5, 9.4.2.11); `None` where the list is broken, and nothing after it.
-struct Parameters<'a> {
+pub(crate) struct Parameters<'a> {
     rest: Option<&'a [u8]>,
     big_endian: bool,
 }
 
 impl<'a> Parameters<'a> {
-    fn new(list: &'a [u8], big_endian: bool) -> Self {
+    pub(crate) fn new(list: &'a [u8], big_endian: bool) -> Self {
         Self { rest: Some(list), big_endian }
     }
 }

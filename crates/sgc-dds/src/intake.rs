@@ -24,8 +24,8 @@ use cyclors::{
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
 
+use crate::announced;
 use crate::entity::{Entity, reason};
-use crate::first_messages;
 use crate::network::Participant;
 use crate::qos::history_of;
 
@@ -380,10 +380,9 @@ impl<R: Receiver> Intake<R> {
         let reader = unsafe {
             let listener = dds_create_listener(arg);
             dds_lset_data_available(listener, Some(arrived::<R>));
-            if spec.qos.is_reliable() {
-                first_messages::listen(listener);
-            }
-            let reader = dds_create_reader(parent, topic.handle(), qos.as_ptr(), listener);
+            let reader = announced::asking(spec.asks_key_hash, || {
+                dds_create_reader(parent, topic.handle(), qos.as_ptr(), listener)
+            });
             dds_delete_listener(listener);
             Entity::new(reader)?
         };

@@ -11,20 +11,21 @@
 //!
 //! # Keyed topics
 //! The type of samples here knows no keys: all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
-//! flows both ways with the hash of its key, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
-//! hash of its key (Fast DDS may send one) does not. History is kept per topic rather than per
-//! instance, so it is made [`qos::KEYED_INSTANCES_KEPT`] times as deep to make up for it.
+//! flows both ways with the hash of its key, for which publishers are asked, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
+//! hash of its key (Fast DDS may send one) does not. A sample whose key has no known hash is not written. What is kept for late joiners is kept for
+//! each of up to [`qos::KEYED_INSTANCES_KEPT`] keys; other history is kept per topic rather than per instance, so it is made so many times as deep.
 
 #![allow(unsafe_code)]
 #![warn(clippy::undocumented_unsafe_blocks)]
 
+mod announced;
 pub mod config;
 mod discovery;
 mod entity;
-mod first_messages;
 mod fragments;
 mod graph;
 pub mod identity;
+mod inline_qos;
 mod intake;
 mod known_writers;
 mod log;

@@ -9,19 +9,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use cyclors::{
     DDS_RETCODE_PRECONDITION_NOT_MET, dds_create_domain, dds_create_participant, dds_create_publisher,
-    dds_create_subscriber, dds_domain_set_deafmute, dds_get_children,
+    dds_create_subscriber, dds_domain_set_deafmute, dds_get_children, dds_get_entity_sertype,
 };
+use sgc_ros::graph::graph_writer;
 use sgc_ros::{
     DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError, RosNetwork,
     SampleHandler, ServiceSpec,
 };
 
+use crate::announced;
 use crate::config::{
     DdsConfig, Instance, PEERS_MAX, chooses_interfaces, cyclone_config, far_hosts, local_addresses,
 };
 use crate::discovery::{self, Running};
-use crate::entity::{Entity, c_string, reason};
-use crate::first_messages;
+use crate::entity::{Entity, c_string, check, reason};
 use crate::graph::Announcer;
 use crate::intake::Pace;
 use crate::log;
@@ -87,12 +88,6 @@ impl CycloneNetwork {
             Entity::new(unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) })
                 .map_err(refused)?;
         let guid = entity.guid().map_err(refused)?;
-        if let Err(reason) = first_messages::install(&domain.entity, &entity) {
-            tracing::warn!(
-                reason,
-                "this Cyclone DDS is another one: first messages of Fast DDS writers may be lost"
-            );
-        }
         let participant = Participant {
             entity,
             domain: domain.entity,
@@ -103,6 +98,12 @@ impl CycloneNetwork {
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
         };
+        // Before there are endpoints to announce.
+        if !participant.complete_announcements().map_err(refused)? {
+            tracing::warn!(
+                "readers and writers are announced as Cyclone does: Fast DDS 3 shows no node for them"
+            );
+        }
         let participant = Arc::new(participant);
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
         Ok(Self { discovery: Mutex::new(None), announcer: announcer.map(Arc::new), participant })
@@ -214,6 +215,17 @@ impl Participant {
     /// True if endpoints made by SGC are to be ignored.
     pub(crate) fn ignores_tagged(&self) -> bool {
         self.tag.is_some()
+    }
+
+    /// Has announcements of endpoints say what Cyclone leaves out; false if this Cyclone is not as expected. For the thread that makes the
+    /// participant, before any other knows it.
+    fn complete_announcements(&self) -> Result<bool, String> {
+        let topic = self.topic(&graph_writer())?;
+        let mut sertype = std::ptr::null();
+        // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
+        check(unsafe { dds_get_entity_sertype(topic.handle(), &mut sertype) })?;
+        // SAFETY: the topic keeps its type registered, and no other thread makes topics in its domain yet.
+        Ok(unsafe { announced::complete(sertype) })
     }
 
     /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.

@@ -12,6 +12,7 @@ use cyclors::*;
 use sgc_ros::EndpointKind;
 // Cyclone is not told the keys and takes all samples of a keyed topic for one instance.
 pub use sgc_ros::KEYED_INSTANCES_KEPT;
+use sgc_ros::KEYED_SAMPLES_MAX;
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
 use crate::entity::{INFINITE, c_string};
@@ -75,7 +76,8 @@ impl NativeQos {
         user_data: &[u8],
     ) -> Result<Self, String> {
         let native = Self::new()?;
-        let (history, depth) = history_of(kind, qos.history, keyless);
+        let by_key = kind == EndpointKind::Writer && keys_kept(qos, keyless).is_some();
+        let (history, depth) = history_of(kind, qos.history, keyless || by_key);
         // SAFETY: the object is valid and every setter copies its arguments.
         unsafe {
             dds_qset_reliability(
@@ -196,6 +198,17 @@ pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) ->
     (native, depth as i32)
 }
 
+/// Returns the number of keys whose samples a writer keeps apart, so that late joiners get the last ones of each; none where it keeps the
+/// last ones of all together.
+pub(crate) fn keys_kept(qos: &Qos, keyless: bool) -> Option<u32> {
+    match qos.history {
+        History::KeepLast(n) if !keyless && qos.is_transient_local() => {
+            Some((KEYED_SAMPLES_MAX / n.max(1)).clamp(1, KEYED_INSTANCES_KEPT))
+        }
+        _ => None,
+    }
+}
+
 /// The room for samples that are not acknowledged yet, of a reliable writer that keeps the last ones. It never waits, so they are a matter
 /// of memory, not of what its publisher keeps: Cyclone has so many of each instance, and a writer spreads its samples over as many
 /// instances as their size allows.
@@ -213,7 +226,8 @@ impl Unacknowledged {
         if qos.history == History::KeepAll || !qos.is_reliable() {
             return None;
         }
-        let (_, depth) = history_of(EndpointKind::Writer, qos.history, keyless);
+        let is_by_key = keys_kept(qos, keyless).is_some();
+        let (_, depth) = history_of(EndpointKind::Writer, qos.history, keyless || is_by_key);
         let depth = u32::try_from(depth).unwrap_or(1);
         // Late joiners get from Cyclone whatever is kept for others.
         let depth = if qos.is_transient_local() { depth } else { depth.max(UNACKNOWLEDGED_MIN) };

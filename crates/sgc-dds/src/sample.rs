@@ -4,45 +4,44 @@
 //! - keeps the payload as it was serialised, received or to be sent, the latter without a copy where it is long;
 //! - tells what stands in the inline QoS of a received sample in front of the payload, since it is handed the packet: the hash of
 //!   its key, and the request that it belongs to;
-//! - puts the hash of a key into the inline QoS of what is sent, where Cyclone asks for it (`Internal/GenerateKeyhash`, off by default);
+//! - puts into the inline QoS of what is sent the hash of its key, and the request that it belongs to;
 //! - keeps the serialised key of a sample that has nothing else, for which Cyclone would look up the instance;
 //! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as memory allows
 //!   ([`crate::writer`]).
 //!
-//! Cyclone DDS 11 neither reads nor writes the parameter that says to which request a message belongs. Going out, it asks for the
-//! payload when the submessage's header is in the message and before its length is set, so parameters can still be added. That
-//! reaches into `struct ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0 builds; [`add_related`] says what it relies on, and leaves
-//! the message alone where that does not hold. Another version of `cyclors` does not compile: [`CYCLORS`].
+//! Cyclone DDS 11 writes the hash of a key for readers that ask for it in Cyclone's own way, and neither reads nor writes the parameter that says to
+//! which request a message belongs. [`crate::inline_qos`] adds both. Another version of `cyclors` does not compile: [`CYCLORS`].
 //!
 //! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
 
-use std::ffi::{c_char, c_int, c_ulong, c_void};
-use std::mem::offset_of;
+use std::ffi::{c_char, c_ulong, c_void};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use cyclors::{
-    DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, DDSI_STATUSINFO_DISPOSE, dds_create_topic_sertype, ddsi_keyhash,
-    ddsi_serdata, ddsi_serdata_init, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA,
-    ddsi_serdata_kind_SDK_KEY, ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini,
-    ddsi_sertype_init_flags, ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
+    DDSI_SERTYPE_FLAG_REQUEST_KEYHASH, DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY, DDSI_STATUSINFO_DISPOSE,
+    dds_create_topic_sertype, ddsi_keyhash, ddsi_serdata, ddsi_serdata_init, ddsi_serdata_kind,
+    ddsi_serdata_kind_SDK_DATA, ddsi_serdata_kind_SDK_KEY, ddsi_serdata_ops, ddsi_serdata_unref,
+    ddsi_sertype, ddsi_sertype_fini, ddsi_sertype_init_flags, ddsi_sertype_ops, ddsi_sertype_unref,
+    ddsrt_iovec_t,
 };
 use sgc_ros::{EndpointSpec, KeyHash, SampleKind};
 
 use crate::entity::{Entity, c_string};
 use crate::fragments::{self, ReceivedFragment};
 use crate::identity::{
-    CYCLONE, IDENTITY_BYTES, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity, key_hash,
+    CYCLONE, PID_KEY_HASH, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity, key_hash,
 };
+use crate::inline_qos::{self, DATA, FLAG_INLINE_QOS, INLINE_QOS_BASE, Parameter};
 use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 
 /// The requirement of `Cargo.toml` for the only version of `cyclors` whose C code this module was written for. Cargo builds
 /// no other version than the one that is written there with `=`, and whoever writes another one there meets the assertion
 /// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
-/// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), the callers of
-/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with the text here and in `fragments.rs`; and all that
-/// `first_messages.rs` names.
+/// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), `struct ddsi_sertype_plist`
+/// (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of `ddsi_serdata_to_ser_ref`, and the functions
+/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
@@ -89,6 +88,26 @@ pub(crate) struct Extra {
     pub(crate) related: Option<SampleIdentity>,
     /// The number of its instance at its writer.
     pub(crate) instance: u32,
+}
+
+impl Extra {
+    /// Adds what the inline QoS of a message is to say; false if the message is not as Cyclone makes it.
+    ///
+    /// # Safety
+    /// As of [`inline_qos::add`].
+    unsafe fn add_to(&self, view: *mut ddsrt_iovec_t) -> bool {
+        // No sample has both: services have no keys.
+        let related = self.related.map(SampleIdentity::to_bytes);
+        let parameters: &[Parameter<'_>] = match (&related, &self.key_hash) {
+            (Some(related), _) => {
+                &[(PID_RELATED, related), (PID_RELATED_FAST, related), (PID_NOT_FOR_CYCLONE, &[0; 4])]
+            }
+            (None, Some(hash)) => &[(PID_KEY_HASH, hash)],
+            (None, None) => return true,
+        };
+        // SAFETY: by contract.
+        unsafe { inline_qos::add(view, parameters) }
+    }
 }
 
 /// Shorter payloads are copied, so that they do not keep alive the larger block that they came in.
@@ -271,7 +290,8 @@ pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<En
     let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
     // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
     let mut sertype = Box::into_raw(Box::new(unsafe { std::mem::zeroed::<ddsi_sertype>() }));
-    let flags = if spec.keyless { DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY } else { 0 };
+    let flags =
+        if spec.keyless { DDSI_SERTYPE_FLAG_TOPICKIND_NO_KEY } else { DDSI_SERTYPE_FLAG_REQUEST_KEYHASH };
     // SAFETY: `sertype` has room, the name is copied, and both tables live for ever.
     unsafe { ddsi_sertype_init_flags(sertype, type_name.as_ptr(), &SERTYPE.0, &SERDATA.0, flags) };
     // SAFETY: the handle is checked by Cyclone, the name is copied; null means defaults, no listener and no
@@ -293,53 +313,25 @@ pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<En
     Entity::new(handle)
 }
 
-/// How many messages were sent without the identity that they should carry, since the Cyclone that this was linked with is
-/// not the one that it was written for. Always 0 with the version that `Cargo.toml` asks for.
+/// Returns the number of messages that were sent without the identity or the hash of the key that they should carry, since the Cyclone
+/// that this was linked with is not the one that it was written for. Always 0 with the version that `Cargo.toml` asks for.
 pub fn unidentified_messages() -> u64 {
     UNIDENTIFIED.load(Ordering::Relaxed)
 }
 
 static UNIDENTIFIED: AtomicU64 = AtomicU64::new(0);
 
-// Functions of Cyclone that `cyclors` has no binding for. `ddsi__xmsg.h`, `ddsi_serdata.h`.
+// A function of Cyclone that `cyclors` has no binding for. `ddsi_serdata.h`.
 #[allow(improper_ctypes)]
 unsafe extern "C" {
     fn ddsi_serdata_ref(sample: *const ddsi_serdata) -> *mut ddsi_serdata;
-    fn ddsi_xmsg_addpar(message: *mut Xmsg, pid: u16, bytes: usize) -> *mut c_void;
-    fn ddsi_xmsg_addpar_sentinel(message: *mut Xmsg);
-    fn ddsi_xmsg_submsg_from_marker(message: *mut Xmsg, marker: XmsgMarker) -> *mut c_void;
 }
-
-/// The beginning of `struct ddsi_xmsg` (`ddsi_xmsg.c`), a message under construction.
-#[repr(C)]
-struct Xmsg {
-    pool: *mut c_void,
-    bytes_max: usize,
-    bytes: usize,
-    have_parameters: c_int,
-    payload: *mut ddsi_serdata,
-    payload_view: ddsrt_iovec_t,
-}
-
-/// `struct ddsi_xmsg_marker`: where in a message a submessage begins.
-#[repr(C)]
-struct XmsgMarker {
-    offset: usize,
-}
-
-/// RTPS submessage kinds and their lengths up to the inline QoS, bytes (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
-const DATA: (u8, usize) = (0x15, 24);
-const DATA_FRAG: (u8, usize) = (0x16, 36);
-
-/// Where `octetsToInlineQos` ends, which it counts from: bytes from the beginning of the submessage.
-const INLINE_QOS_BASE: usize = 8;
 
 /// Where the sequence number is in either submessage: bytes from its beginning.
 const NUMBER_OFFSET: usize = 16;
 
-/// Flags of submessages (RTPS 2.5, 9.4.5.4.1).
+/// The flag of submessages in little endian (RTPS 2.5, 9.4.5.1.2).
 const FLAG_LITTLE_ENDIAN: u8 = 0x01;
-const FLAG_INLINE_QOS: u8 = 0x02;
 
 /// Length of the RTPS header, bytes (RTPS 2.5, 9.4.4).
 const RTPS_HEADER_BYTES: usize = 20;
@@ -390,55 +382,6 @@ impl Content {
         // SAFETY: what follows the struct, or what `shared` keeps; so many bytes of it are written and never change.
         unsafe { std::slice::from_raw_parts(self.payload, self.bytes) }
     }
-}
-
-/// Adds the identity to a message, into whose header the submessage of this sample has just been written. `view` is where
-/// the message keeps its payload.
-///
-/// # Safety
-/// `view` must be the `refd_payload_iov` of a `struct ddsi_xmsg` of Cyclone DDS 11 as `cyclors` =0.4.0 builds it:
-/// `ddsi_xmsg_serdata` is the only function there that asks for the payload of a sample of this sertype. (Others ask for
-/// keys, or copy samples for readers of the same participant with another sertype. Those of a proxy are ignored, and in any other
-/// network all endpoints of a service's topic are of one sertype: those that [`topic`] makes are equal, so that Cyclone keeps one
-/// of them.)
-unsafe fn add_related(view: *mut ddsrt_iovec_t, related: SampleIdentity) -> bool {
-    // SAFETY: by contract the view is that field of that struct.
-    let message = unsafe { view.cast::<u8>().sub(offset_of!(Xmsg, payload_view)).cast::<Xmsg>() };
-    // SAFETY: valid by contract.
-    let (bytes, busy) =
-        unsafe { ((*message).bytes, (*message).have_parameters != 0 || !(*message).payload.is_null()) };
-    if busy {
-        return false;
-    }
-    let Some(offset) = [DATA, DATA_FRAG].into_iter().find_map(|(kind, length)| {
-        let offset = bytes.checked_sub(length).filter(|at| at % 4 == 0)?;
-        // SAFETY: the offset is in the message, `length` bytes from its end.
-        let header = unsafe {
-            let at = ddsi_xmsg_submsg_from_marker(message, XmsgMarker { offset }).cast::<u8>();
-            at.cast::<[u8; INLINE_QOS_BASE]>().read()
-        };
-        let to_inline_qos = usize::from(u16::from_ne_bytes([header[6], header[7]]));
-        let plain = header[1] & FLAG_INLINE_QOS == 0;
-        (header[0] == kind && INLINE_QOS_BASE + to_inline_qos == length && plain).then_some(offset)
-    }) else {
-        return false;
-    };
-    let value = related.to_bytes();
-    for pid in [PID_RELATED, PID_RELATED_FAST] {
-        // SAFETY: returns room for as many bytes as asked for.
-        unsafe {
-            let place = ddsi_xmsg_addpar(message, pid, IDENTITY_BYTES).cast::<u8>();
-            place.copy_from_nonoverlapping(value.as_ptr(), IDENTITY_BYTES);
-        }
-    }
-    // SAFETY: as above; the header is looked up again, since adding may have moved the message.
-    unsafe {
-        ddsi_xmsg_addpar(message, PID_NOT_FOR_CYCLONE, 4).cast::<[u8; 4]>().write([0; 4]);
-        ddsi_xmsg_addpar_sentinel(message);
-        let header = ddsi_xmsg_submsg_from_marker(message, XmsgMarker { offset }).cast::<u8>();
-        *header.add(1) |= FLAG_INLINE_QOS;
-    }
-    true
 }
 
 /// Reads what the first fragment's message says of its origin.
@@ -625,11 +568,8 @@ unsafe extern "C" fn to_ser_ref(
     // message under construction asks a sample with an identity for its payload.
     unsafe {
         let content = &*sample.cast::<Content>();
-        // The first fragment carries it, as Cyclone has it for parameters of its own.
-        if offset == 0
-            && let Some(related) = content.extra.related
-            && !add_related(view, related)
-        {
+        // The first fragment carries them, as Cyclone has it for parameters of its own.
+        if offset == 0 && !content.extra.add_to(view) {
             UNIDENTIFIED.fetch_add(1, Ordering::Relaxed);
         }
         let offset = offset.min(content.bytes);

@@ -3,8 +3,9 @@
 //! Writes on the caller's thread, which may block for [`crate::qos::WRITE_BLOCK_MAX_MS`]; it must not be a
 //! thread of Cyclone's or of an async runtime.
 
-use std::sync::Arc;
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -13,12 +14,12 @@ use cyclors::{
     dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
     dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
-use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind};
+use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
 
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::network::Participant;
 use crate::payload::Frame;
-use crate::qos::Unacknowledged;
+use crate::qos::{Unacknowledged, keys_kept};
 use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
 
@@ -42,6 +43,8 @@ pub struct CycloneWriter {
     unacknowledged: Option<Unacknowledged>,
     /// Samples written so far, which wraps.
     written: AtomicU32,
+    /// The instances of keys, where those are kept apart.
+    keys: Option<Mutex<Keys>>,
     _counted: Counted,
 }
 
@@ -59,6 +62,37 @@ impl Counted {
 impl Drop for Counted {
     fn drop(&mut self) {
         self.0.writers().fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// The instance of each key that was written, up to a bound: then a new key takes that of the key not written for the longest time.
+#[derive(Debug)]
+struct Keys {
+    max: u32,
+    /// With the number of the latest write of each.
+    instances: HashMap<KeyHash, (u32, u64)>,
+    writes: u64,
+}
+
+impl Keys {
+    fn new(max: u32) -> Self {
+        Self { max, instances: HashMap::new(), writes: 0 }
+    }
+
+    fn instance(&mut self, hash: &KeyHash) -> u32 {
+        self.writes += 1;
+        if let Some((instance, last)) = self.instances.get_mut(hash) {
+            *last = self.writes;
+            return *instance;
+        }
+        let known = self.instances.len() as u32;
+        let oldest = self.instances.iter().min_by_key(|(_, (_, last))| *last).map(|(oldest, _)| *oldest);
+        let instance = match oldest.filter(|_| known >= self.max) {
+            Some(oldest) => self.instances.remove(&oldest).map_or(0, |(instance, _)| instance),
+            None => known,
+        };
+        self.instances.insert(*hash, (instance, self.writes));
+        instance
     }
 }
 
@@ -93,6 +127,7 @@ impl CycloneWriter {
             keyless: spec.keyless,
             unacknowledged,
             written: AtomicU32::new(0),
+            keys: keys_kept(&spec.qos, spec.keyless).map(|max| Mutex::new(Keys::new(max))),
             _counted: Counted::new(participant),
         })
     }
@@ -141,10 +176,18 @@ impl RosWriter for CycloneWriter {
             return Err(failed("a topic without key has no instances to dispose of".into()));
         }
 
+        let key_hash = key_hash.filter(|_| !self.keyless);
+        if key_hash.is_none() && !self.keyless {
+            return Err(RosError::KeyUnknown);
+        }
+        let instance = match (&self.keys, &key_hash) {
+            (Some(keys), Some(hash)) => keys.lock().unwrap_or_else(PoisonError::into_inner).instance(hash),
+            _ => self.written.fetch_add(1, Ordering::Relaxed) % self.instances(payload.len()),
+        };
+
         let mut sertype = std::ptr::null();
         // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
         check(unsafe { dds_get_entity_sertype(self.writer.handle(), &mut sertype) }).map_err(failed)?;
-        let instance = self.written.fetch_add(1, Ordering::Relaxed) % self.instances(payload.len());
         let extra = Extra { key_only, key_hash, related: None, instance };
         // SAFETY: the sertype of this writer, which keeps it alive.
         let sample = unsafe { SampleRef::build(sertype, &payload, &frame, extra, source_timestamp_ns) };
@@ -202,5 +245,19 @@ impl RosWriter for CycloneWriter {
                 return matched;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_share_instances_only_beyond_their_bound() {
+        let mut keys = Keys::new(2);
+        let mut instance = |key: u8| keys.instance(&[key; 16]);
+        assert_eq!([instance(1), instance(2), instance(1)], [0, 1, 0]);
+        assert_eq!([instance(3), instance(1)], [1, 0], "the key not written for the longest time gives way");
+        assert_eq!(instance(2), 1);
     }
 }

@@ -49,6 +49,7 @@ fn a_sample_is_one_allocation_where_it_is_taken_and_none_where_it_is_written() {
         topic: "rt/allocations".into(),
         type_name: "std_msgs::msg::dds_::ByteMultiArray_".into(),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: Qos::default(),
     };

@@ -45,6 +45,7 @@ fn spec(topic: &str) -> EndpointSpec {
         topic: format!("rt/{topic}"),
         type_name: "std_msgs::msg::dds_::String_".into(),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: Qos::default(),
     }
@@ -107,7 +108,10 @@ fn eventually(what: &str, mut done: impl FnMut() -> bool) {
 }
 
 fn write(writer: &CycloneWriter, payload: &Bytes) {
-    writer.write(SampleKind::Write, 1_000_000_000, payload.clone()).unwrap();
+    // Of a topic without keys nobody sends it.
+    let head = SampleHead { key_hash: Some([1; 16]), ..SampleHead::new(SampleKind::Write, 1_000_000_000) };
+    writer.write_ahead(head, payload.clone()).unwrap();
+    writer.flush();
 }
 
 fn next<T>(events: &Receiver<T>) -> T {
@@ -806,8 +810,14 @@ fn keyed_data_passes_in_both_directions_and_so_does_the_end_of_instances() {
     for (topic, from, to) in [("k0", &sgc, &ros), ("k1", &ros, &sgc)] {
         let (_reader, samples) = read(to, &with(keyed(topic), |q| q.history = History::KeepLast(1)));
         let writer = writer(from, &with(keyed(topic), |q| q.history = History::KeepLast(1)), 1);
+        let write = |kind, key_hash, text: &str| {
+            let head = SampleHead { key_hash, ..SampleHead::new(kind, 77) };
+            let written = writer.write_ahead(head, string_cdr(text));
+            writer.flush();
+            written
+        };
         for i in 0..100 {
-            write(&writer, &string_cdr(&i.to_string()));
+            write(SampleKind::Write, Some([7; 16]), &i.to_string()).unwrap();
         }
         for i in 0..100 {
             let sample = next(&samples);
@@ -822,12 +832,13 @@ fn keyed_data_passes_in_both_directions_and_so_does_the_end_of_instances() {
             (SampleKind::Write, "last"),
         ];
         for (kind, text) in said {
-            writer.write(kind, 77, string_cdr(text)).unwrap();
+            assert_eq!(write(kind, None, text), Err(RosError::KeyUnknown));
+            write(kind, Some([8; 16]), text).unwrap();
         }
         for (kind, text) in said {
             let sample = next(&samples);
             assert_eq!((sample.kind, &sample.payload[..]), (kind, &padded(&string_cdr(text))[..]));
-            assert_eq!(sample.source_timestamp_ns, 77);
+            assert_eq!((sample.source_timestamp_ns, sample.key_hash), (77, Some([8; 16])));
         }
     }
 
@@ -1062,35 +1073,36 @@ fn ids_are_as_long_as_those_of_the_network() {
 }
 
 #[test]
-fn the_hash_of_a_key_passes_where_it_is_asked_for() {
-    let uri = "<CycloneDDS><Domain><Internal><GenerateKeyhash>true</GenerateKeyhash></Internal></Domain></CycloneDDS>";
-    let config = DdsConfig {
-        domain: 151,
-        discovery: DiscoveryRange::LocalHost,
-        cyclonedds_uri: Some(uri.into()),
-        ..DdsConfig::default()
-    };
-    let sgc = CycloneNetwork::open(&DdsConfig { tag: Some("arm-1".into()), ..config.clone() }).unwrap();
-    let ros = CycloneNetwork::open(&config).unwrap();
-    let keyed = |topic| EndpointSpec { keyless: false, ..spec(topic) };
-    let (_reader, samples) = read(&ros, &keyed("h"));
-    let hashing = writer(&sgc, &keyed("h"), 1);
-    let hash = *b"sixteen bytes it";
-    // Long ones come in fragments, of which the first one says it.
-    let (short, long) = (string_cdr("a"), string_cdr(&"a".repeat(100_000)));
-    for (kind, payload) in
-        [(SampleKind::Write, &short), (SampleKind::Dispose, &short), (SampleKind::Write, &long)]
-    {
-        let head = SampleHead { key_hash: Some(hash), ..SampleHead::new(kind, 5) };
-        hashing.write_ahead(head, payload.clone()).unwrap();
-        hashing.flush();
-        let sample = next(&samples);
-        assert_eq!((sample.kind, sample.key_hash), (kind, Some(hash)));
+fn late_joiners_get_the_last_samples_of_each_key() {
+    let (ros, sgc) = (open(151, None), open(151, Some("arm-1")));
+    let keyed = with(EndpointSpec { keyless: false, ..spec("h") }, |qos| {
+        qos.durability = Durability::TransientLocal;
+        qos.history = History::KeepLast(2);
+    });
+    // Long ones come in fragments, of which the first one says the hash.
+    let text = |n: usize, key: u8| format!("{n} of {key}").repeat(if n == 3 { 10_000 } else { 1 });
+    let latched = writer(&sgc, &keyed, 0);
+    for n in 0..4 {
+        for key in 0..3 {
+            let head = SampleHead { key_hash: Some([key; 16]), ..SampleHead::new(SampleKind::Write, 5) };
+            latched.write_ahead(head, string_cdr(&text(n, key))).unwrap();
+        }
     }
+    latched.flush();
+    let (_reader, samples) = read(&ros, &keyed);
+    for n in 2..4 {
+        for key in 0..3 {
+            let sample = next(&samples);
+            assert_eq!(sample.key_hash, Some([key; 16]));
+            assert_eq!(sample.payload, padded(&string_cdr(&text(n, key))));
+        }
+    }
+    quiet(&samples);
     // A topic without keys has none.
     let (_reader, samples) = read(&ros, &spec("h0"));
     write(&writer(&sgc, &spec("h0"), 1), &string_cdr("a"));
     assert_eq!(next(&samples).key_hash, None);
+    assert_eq!(sgc_dds::unidentified_messages(), 0);
 }
 
 #[test]

@@ -39,6 +39,7 @@ fn spec() -> ServiceSpec {
         topic: half.dds_topic("/add"),
         type_name: half.dds_type("example_interfaces/srv/AddTwoInts"),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: service_qos(),
     };

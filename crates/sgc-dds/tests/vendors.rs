@@ -39,6 +39,7 @@ fn spec(service: &str, ros_type: &str) -> ServiceSpec {
         topic: half.dds_topic(service),
         type_name: half.dds_type(ros_type),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: service_qos(),
     };

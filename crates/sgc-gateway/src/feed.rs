@@ -313,6 +313,7 @@ impl Feed {
             topic: dds_topic(topic),
             type_name: dds_type(type_name),
             keyless: publishers.first().is_none_or(|publisher| publisher.keyless),
+            asks_key_hash: false,
             type_hash: info.and_then(|info| info.type_hash(type_name)).map(str::to_owned),
             qos,
         }

@@ -172,6 +172,7 @@ impl Publication {
                     topic: dds_topic(&topic),
                     type_name: dds_type(&type_name),
                     keyless: !is_keyed,
+                    asks_key_hash: false,
                     type_hash: Some(hash.map_or_else(|| layout.type_hash(), str::to_owned)),
                     qos,
                 };

@@ -44,6 +44,7 @@ fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
         topic: half.dds_topic(service),
         type_name: half.dds_type(type_name),
         keyless: true,
+        asks_key_hash: false,
         type_hash: Some(layout.type_hash()),
         qos: service_qos(),
     };

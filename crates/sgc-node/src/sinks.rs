@@ -892,6 +892,7 @@ pub(crate) fn failure_key(error: &RosError) -> &'static str {
         RosError::Payload { .. } => "write_payload",
         RosError::WriteTimeout { .. } => "write_timeout",
         RosError::NoPeer { .. } => "no_local_peer",
+        RosError::KeyUnknown => "key_unknown",
         _ => "write_failed",
     }
 }

@@ -27,6 +27,7 @@ fn service(name: &str) -> ServiceSpec {
         topic: half.dds_topic(name),
         type_name: half.dds_type(TYPE),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: service_qos(),
     };

@@ -174,6 +174,7 @@ impl Way {
             topic: dds_topic(TOPIC),
             type_name: dds_type("std_msgs/msg/ByteMultiArray"),
             keyless: true,
+            asks_key_hash: false,
             type_hash: None,
             qos: Qos { history: History::KeepAll, ..Qos::default() },
         };

@@ -82,7 +82,14 @@ impl Drop for Node {
 
 fn spec() -> EndpointSpec {
     let (topic, type_name) = (dds_topic(TOPIC), dds_type(TYPE));
-    EndpointSpec { topic, type_name, keyless: true, type_hash: None, qos: Qos::default() }
+    EndpointSpec {
+        topic,
+        type_name,
+        keyless: true,
+        asks_key_hash: false,
+        type_hash: None,
+        qos: Qos::default(),
+    }
 }
 
 fn reload(socket: &Path) -> String {

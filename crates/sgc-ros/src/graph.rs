@@ -91,6 +91,7 @@ pub fn graph_writer() -> EndpointSpec {
         topic: GRAPH_TOPIC.into(),
         type_name: GRAPH_TYPE.into(),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos: Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() },
     }

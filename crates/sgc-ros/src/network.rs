@@ -28,6 +28,11 @@ impl Guid {
         prefix
     }
 
+    /// True if the endpoint is of a participant of Cyclone DDS, by its [`Self::vendor`].
+    pub fn is_of_cyclone(&self) -> bool {
+        self.vendor() == [0x01, 0x10]
+    }
+
     /// Vendor of the DDS implementation, as RTPS 2.5 (9.3.1.1) asks it to begin its prefixes: `[1, 0x0f]` is Fast DDS,
     /// `[1, 0x10]` Cyclone, `[1, 0x12]` RustDDS.
     pub fn vendor(&self) -> [u8; 2] {
@@ -115,6 +120,9 @@ pub struct EndpointSpec {
     pub type_name: String,
     /// True if the type has no key; must agree with the remote side or nothing matches.
     pub keyless: bool,
+    /// True for a reader that asks writers for the hashes of keys (RTPS 2.5, 9.6.4.8), which those of Fast DDS 2 do not tell otherwise. Writers
+    /// of Cyclone tell theirs anyway, and do not match a reader that asks in this way.
+    pub asks_key_hash: bool,
     /// Type hash to put in USER_DATA, as rmw does from Iron on.
     pub type_hash: Option<String>,
     /// Quality of service to offer or request.
@@ -284,6 +292,11 @@ pub enum RosError {
         /// How long the write blocked.
         waited_ms: u64,
     },
+    /// A sample of a topic with a key whose hash nobody told: subscribers of ROS 2 Kilted end with a segmentation fault at one.
+    #[error(
+        "the hash of its key is not known, without which subscribers of Fast DDS 3 end with a segmentation fault"
+    )]
+    KeyUnknown,
     /// Nobody is there to hear a request or a reply.
     #[error("nobody on the local network was there to hear it for {waited_ms} ms")]
     NoPeer {

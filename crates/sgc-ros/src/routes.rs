@@ -593,10 +593,18 @@ fn also_called(here: &str, verb: &str, there: &str) -> String {
     if here == there { String::new() } else { format!("{verb} {there}, ") }
 }
 
+/// Returns `true` if the reader of a topic is to ask these writers for the hashes of keys: if all of them match it then.
+fn asks_key_hash<'a>(keyless: bool, mut writers: impl Iterator<Item = &'a Guid>) -> bool {
+    !keyless && !writers.any(Guid::is_of_cyclone)
+}
+
 /// A reader need not be made anew for a little more or less depth.
 fn same_reader(a: Option<&EndpointSpec>, b: Option<&EndpointSpec>) -> bool {
     let key = |s: &EndpointSpec| {
-        (s.qos.reliability, s.qos.durability, s.qos.partitions.clone(), s.keyless, s.type_name.clone())
+        (
+            (s.qos.reliability, s.qos.durability, s.qos.partitions.clone()),
+            (s.keyless, s.asks_key_hash, s.type_name.clone()),
+        )
     };
     a.map(key) == b.map(key)
 }

@@ -828,6 +828,26 @@ fn of_a_keyed_topic_as_much_is_kept_as_its_instances_may_have() {
 }
 
 #[test]
+fn readers_ask_for_hashes_of_keys_where_no_writer_is_of_cyclone() {
+    let mut b = bench(&[("/a", ""), ("/b", "")], &[]);
+    let asks = |commands: &[Command]| {
+        commands.iter().find_map(|c| {
+            if let Command::OpenReader { spec, .. } = c { Some(spec.asks_key_hash) } else { None }
+        })
+    };
+    let keyed = DiscoveredEndpoint { keyless: false, ..writer(1, "/a", latched()) };
+    assert_eq!(asks(&b.appears(keyed.clone())), Some(true));
+    let mut guid = Guid([2; 16]);
+    guid.0[..2].copy_from_slice(&[0x01, 0x10]);
+    assert_eq!(
+        asks(&b.appears(DiscoveredEndpoint { guid, ..keyed })),
+        Some(false),
+        "the reader is made anew"
+    );
+    assert_eq!(asks(&b.appears(writer(3, "/b", latched()))), Some(false), "there is no key");
+}
+
+#[test]
 fn what_an_owner_lists_makes_nobody_use_what_it_did_not_ask_for() {
     // This node may publish `/a`, uses `/used`, and shares `/own`.
     let uses = vec![publish_rule("/a"), use_of(OWNER, "/used", Some(STRING))];

@@ -69,6 +69,7 @@ pub(crate) fn spec(topic: &str, type_name: &str, qos: Qos) -> EndpointSpec {
         topic: dds_topic(topic),
         type_name: dds_type(type_name),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos,
     }

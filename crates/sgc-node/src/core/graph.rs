@@ -323,6 +323,7 @@ impl<N: RosNetwork> Core<N> {
             topic: dds_topic(&topic),
             type_name: dds_type(&type_name),
             keyless: first.keyless,
+            asks_key_hash: false,
             type_hash: first.type_hash.clone(),
             qos: reader_for(&offer, same.len()),
         };

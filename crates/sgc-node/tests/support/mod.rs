@@ -315,6 +315,7 @@ pub fn spec(topic: &str, qos: Qos) -> EndpointSpec {
         topic: dds_topic(topic),
         type_name: dds_type("std_msgs/msg/String"),
         keyless: true,
+        asks_key_hash: false,
         type_hash: None,
         qos,
     }

@@ -6,7 +6,7 @@
 use rand_core::RngCore;
 use sgc_wire::{History, Metadata, Name, Qos};
 
-use super::{Cause, Command, Direction, Routes, Shaping, same_reader};
+use super::{Cause, Command, Direction, Routes, Shaping, asks_key_hash, same_reader};
 use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
@@ -26,6 +26,7 @@ impl<R: RngCore> Routes<R> {
             topic: dds_topic(&share.local_name),
             type_name: share.type_name.clone(),
             keyless: share.keyless,
+            asks_key_hash: false,
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
             qos: Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() },
         });
@@ -121,6 +122,7 @@ impl<R: RngCore> Routes<R> {
             topic: dds_topic(&route.local_name),
             type_name: dds_type(&metadata.type_name),
             keyless: route.entry.keyless,
+            asks_key_hash: asks_key_hash(route.entry.keyless, route.local.keys()),
             type_hash: route.entry.type_hash.clone(),
             qos: reader_for(&offer, route.local.len()),
         });

@@ -29,6 +29,7 @@ fn service_spec(local_name: &str, type_name: &str, type_hash: Option<&str>) -> S
         topic: half.dds_topic(local_name),
         type_name: half.dds_type(type_name),
         keyless: true,
+        asks_key_hash: false,
         type_hash: type_hash.map(str::to_owned),
         qos: service_qos(),
     };

@@ -10,7 +10,7 @@ use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Name, Qos, SinkId, Sour
 use super::services::interface;
 use super::{
     Cause, Command, OwnSource, Problem, ROUTES_PER_WILDCARD_MAX, Routes, SINKLESS_HOLD, ShareRoute,
-    WRITERLESS_HOLD, describe, same_reader, source_of,
+    WRITERLESS_HOLD, asks_key_hash, describe, same_reader, source_of,
 };
 use crate::names::{dds_topic, is_topic_name, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid};
@@ -212,6 +212,7 @@ impl<R: RngCore> Routes<R> {
             topic: dds_topic(&share.local_name),
             type_name: share.type_name.clone(),
             keyless: share.keyless,
+            asks_key_hash: asks_key_hash(share.keyless, share.writers.keys()),
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
             qos: reader_for(&offer, share.writers.len()),
         });

@@ -275,6 +275,7 @@ impl<R: RngCore> Routes<R> {
             topic: dds_topic(&route.local_name),
             type_name: dds_type(&entry.metadata.type_name),
             keyless: entry.keyless,
+            asks_key_hash: false,
             type_hash: entry.type_hash.clone(),
             qos: qos.clone(),
         };

@@ -145,7 +145,14 @@ fn write(writer: &CycloneWriter, frame: &Frame) -> Result<(), RosError> {
 
 fn spec(topic: &str, history: History) -> EndpointSpec {
     let qos = Qos { history, ..Qos::default() };
-    EndpointSpec { topic: dds_topic(topic), type_name: dds_type(TYPE), keyless: true, type_hash: None, qos }
+    EndpointSpec {
+        topic: dds_topic(topic),
+        type_name: dds_type(TYPE),
+        keyless: true,
+        asks_key_hash: false,
+        type_hash: None,
+        qos,
+    }
 }
 
 #[cfg(test)]

@@ -114,6 +114,7 @@ impl Topic {
             topic: dds_topic(self.ros_name()),
             type_name: dds_type(self.type_name()),
             keyless: true,
+            asks_key_hash: false,
             type_hash: None,
             qos: Qos::default(),
         }

@@ -233,6 +233,12 @@ const CONTROL: &[Refusal] = &[
         "is it stopped?",
     ),
     counted("write_failed", "the local network did not take a message", DDS_LOG),
+    named("key_hash", "a message of a topic with keys is not what it claims", SAME_VERSION),
+    named(
+        "key_unknown",
+        "messages of a topic with keys came without the hashes of their keys, at which subscribers of ROS 2 Kilted crash",
+        "update `sgc` on the far side; its publishers of that topic should all use Cyclone DDS, or none of them",
+    ),
     named(
         "over_rate",
         "a peer sends more than `peer_rate` lets it: best-effort messages are dropped, reliable ones slowed",

@@ -5,9 +5,10 @@
 
 #![allow(clippy::unwrap_used)]
 
-mod calls;
 mod flow;
+mod graph;
 mod hosts;
+mod keyed;
 #[path = "../support/lab.rs"]
 mod lab;
 #[path = "../support/mod.rs"]

@@ -257,8 +257,14 @@ impl Lab {
         Peer::start(command)
     }
 
-    /// A Python program of `tests/peers/ros2` in the environment of a distribution.
-    pub(crate) fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
+    /// A program of `tests/peers/ros2` on the `rclpy` of a distribution, with its arguments.
+    pub(crate) fn rclpy(&self, site: Site, distribution: &str, program: &str, args: &[&str]) -> Peer {
+        let mut command = self.ros(site, distribution, program);
+        command.args(args);
+        Peer::start(command)
+    }
+
+    fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
         let python = Peer::program(distribution).join("bin/python");
         let mut command = support::command(self.namespace(site), self.dir(), &python);
         command.arg("-B").arg(support::repository("tests/peers/ros2").join(program));

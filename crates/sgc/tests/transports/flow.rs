@@ -35,6 +35,7 @@ impl Topic {
             topic: dds_topic(self.name),
             type_name: dds_type("std_msgs/msg/ByteMultiArray"),
             keyless: true,
+            asks_key_hash: false,
             type_hash: None,
             qos: Qos { reliability, history, ..Qos::default() },
         }

@@ -1,0 +1,279 @@
+//! Parameters that Cyclone leaves out where it announces endpoints (SEDP).
+//!
+//! - The participant of each endpoint: Fast DDS 3 shows an endpoint without it as one of no ROS node.
+//! - That a reader expects inline QoS, where [`asking`] made it: with it come the hashes of keys, which writers of Fast DDS 2 tell nobody
+//!   else. Writers of Cyclone refuse to match such a reader.
+//!
+//! An announcement is a sample of a built-in type, which makes it of a list of parameters. [`complete`] gives the two types of a domain
+//! another table of functions, which calls Cyclone's and adds to the result. It reaches into `struct ddsi_sertype_plist` of the Cyclone
+//! that `cyclors` =0.4.0 builds (`sample.rs`, `CYCLORS`), to find the types: where they are not found, announcements are as Cyclone
+//! makes them.
+
+use std::cell::Cell;
+use std::ffi::{CStr, c_void};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicPtr, Ordering};
+
+use cyclors::{
+    ddsi_domaingv, ddsi_keyhash, ddsi_rdata, ddsi_serdata, ddsi_serdata_kind, ddsi_serdata_kind_SDK_DATA,
+    ddsi_serdata_ops, ddsi_serdata_unref, ddsi_sertype, ddsi_sertype_fini, ddsi_sertype_init_flags,
+    ddsi_sertype_lookup_locked, ddsi_sertype_ops, ddsi_sertype_unref, ddsrt_iovec_t,
+};
+
+use crate::identity::{PID_SENTINEL, Parameters};
+use crate::payload::HEADER_BYTES;
+
+/// PID_PARTICIPANT_GUID, PID_ENDPOINT_GUID and PID_EXPECTS_INLINE_QOS (RTPS 2.5, table 9.14).
+const PID_PARTICIPANT_GUID: u16 = 0x0050;
+const PID_ENDPOINT_GUID: u16 = 0x005a;
+const PID_EXPECTS_INLINE_QOS: u16 = 0x0043;
+
+/// The entity id of every participant (RTPS 2.5, table 9.2).
+const ENTITYID_PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
+
+/// `DDSI_RTPS_CDR_ENC_FORMAT_PL`: lists of parameters.
+const ENCODING_FORMAT_PL: u16 = 2;
+
+/// The types that Cyclone announces readers and writers with (`ddsi_init.c`).
+const TYPES: [&CStr; 2] = [c"SubscriptionBuiltinTopicData", c"PublicationBuiltinTopicData"];
+
+// Of `ddsi__serdata_plist.h`: tables of functions that `cyclors` has no binding for.
+#[allow(improper_ctypes)]
+unsafe extern "C" {
+    static ddsi_sertype_ops_plist: ddsi_sertype_ops;
+    static ddsi_serdata_ops_plist: ddsi_serdata_ops;
+}
+
+/// `struct ddsi_sertype_plist`.
+#[repr(C)]
+struct ParameterListType {
+    common: ddsi_sertype,
+    encoding_format: u16,
+    key: u16,
+}
+
+thread_local! {
+    /// Whether the reader that this thread makes expects inline QoS.
+    static ASKS: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Makes a reader that expects inline QoS, if `asks`. Cyclone announces a reader on the thread that makes it.
+pub(crate) fn asking<T>(asks: bool, make: impl FnOnce() -> T) -> T {
+    let before = ASKS.replace(asks);
+    let made = make();
+    ASKS.set(before);
+    made
+}
+
+/// Completes the announcements of a domain from here on; false if its types are not as expected.
+///
+/// # Safety
+/// `sertype` must be registered in the domain, and no other thread may register types there meanwhile.
+pub(crate) unsafe fn complete(sertype: *const ddsi_sertype) -> bool {
+    // SAFETY: valid by contract.
+    let domain = unsafe { (*sertype).gv.v } as *mut ddsi_domaingv;
+    // SAFETY: by contract.
+    !domain.is_null() && TYPES.into_iter().all(|name| unsafe { complete_type(domain, name) })
+}
+
+/// # Safety
+/// `domain` must be valid, and no other thread may register types there meanwhile.
+unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
+    // SAFETY: all zeros is a valid value of this plain C struct, which the call fills; the name is copied, and both tables live for
+    // ever. What is looked up is compared with functions of the first table, which read no more than the struct has.
+    let found = unsafe {
+        let mut like = ParameterListType {
+            common: std::mem::zeroed(),
+            encoding_format: ENCODING_FORMAT_PL,
+            key: PID_ENDPOINT_GUID,
+        };
+        let (ops, original) = (&raw const ddsi_sertype_ops_plist, &raw const ddsi_serdata_ops_plist);
+        ddsi_sertype_init_flags(&raw mut like.common, name.as_ptr(), ops, original, 0);
+        let found = ddsi_sertype_lookup_locked(domain, &raw const like.common);
+        like.common.flags_refc.v = 0;
+        ddsi_sertype_fini(&raw mut like.common);
+        found
+    };
+    if found.is_null() {
+        return false;
+    }
+    // SAFETY: a type of the domain, of which the look-up gave a reference; threads of Cyclone's read the pointer meanwhile, and do
+    // alike with either table.
+    unsafe {
+        let table = std::ptr::from_ref(table()).cast_mut();
+        AtomicPtr::from_ptr((&raw mut (*found).serdata_ops).cast::<*mut ddsi_serdata_ops>())
+            .store(table, Ordering::Release);
+        ddsi_sertype_unref(found);
+    }
+    true
+}
+
+/// Cyclone's functions, but for those that make samples.
+fn table() -> &'static ddsi_serdata_ops {
+    struct Table(ddsi_serdata_ops);
+    // SAFETY: function pointers, which are never written to.
+    unsafe impl Send for Table {}
+    // SAFETY: as above.
+    unsafe impl Sync for Table {}
+    static TABLE: OnceLock<Table> = OnceLock::new();
+    let table = TABLE.get_or_init(|| {
+        Table(ddsi_serdata_ops {
+            from_ser: Some(from_ser),
+            from_keyhash: Some(from_keyhash),
+            from_sample: Some(from_sample),
+            ..original()
+        })
+    });
+    &table.0
+}
+
+/// Cyclone's own table.
+fn original() -> ddsi_serdata_ops {
+    // SAFETY: a constant of Cyclone's.
+    unsafe { ddsi_serdata_ops_plist }
+}
+
+/// Gives a received sample Cyclone's own table: Cyclone adds the sender's vendor to samples with that one only. Samples that are sent keep the table of
+/// their type, since Cyclone compares theirs with that of the sample that it makes to keep their key.
+///
+/// # Safety
+/// `sample` must be null, or valid and not shared yet.
+unsafe fn finish(sample: *mut ddsi_serdata) -> *mut ddsi_serdata {
+    // SAFETY: by contract.
+    unsafe {
+        if let Some(sample) = sample.as_mut() {
+            sample.ops = &raw const ddsi_serdata_ops_plist;
+        }
+    }
+    sample
+}
+
+// What follows is called by Cyclone, from its own threads, with arguments that are valid as its headers say.
+
+unsafe extern "C" fn from_ser(
+    sertype: *const ddsi_sertype,
+    kind: ddsi_serdata_kind,
+    fragments: *const ddsi_rdata,
+    bytes: usize,
+) -> *mut ddsi_serdata {
+    let Some(call) = original().from_ser else { return std::ptr::null_mut() };
+    // SAFETY: Cyclone's arguments for Cyclone's function.
+    unsafe { finish(call(sertype, kind, fragments, bytes)) }
+}
+
+unsafe extern "C" fn from_keyhash(
+    sertype: *const ddsi_sertype,
+    hash: *const ddsi_keyhash,
+) -> *mut ddsi_serdata {
+    let Some(call) = original().from_keyhash else { return std::ptr::null_mut() };
+    // SAFETY: Cyclone's arguments for Cyclone's function.
+    unsafe { finish(call(sertype, hash)) }
+}
+
+unsafe extern "C" fn from_sample(
+    sertype: *const ddsi_sertype,
+    kind: ddsi_serdata_kind,
+    sample: *const c_void,
+) -> *mut ddsi_serdata {
+    let Some(call) = original().from_sample else { return std::ptr::null_mut() };
+    // SAFETY: Cyclone's arguments for Cyclone's function, then a sample that it made.
+    unsafe {
+        let made = call(sertype, kind, sample);
+        if made.is_null() || kind != ddsi_serdata_kind_SDK_DATA {
+            return made;
+        }
+        completed(sertype, made).unwrap_or(made)
+    }
+}
+
+/// The announcement with what it lacks, in the place of another, which is given back.
+///
+/// # Safety
+/// `made` must be a sample of `sertype`, of Cyclone's own making.
+unsafe fn completed(sertype: *const ddsi_sertype, made: *mut ddsi_serdata) -> Option<*mut ddsi_serdata> {
+    let ops = original();
+    let (get_size, to_ser, from_ser_iov) = (ops.get_size?, ops.to_ser?, ops.from_ser_iov?);
+    // SAFETY: by contract; `list` has room for the sample, header included.
+    let mut list = unsafe {
+        let mut list = vec![0; get_size(made) as usize];
+        to_ser(made, 0, list.len(), list.as_mut_ptr().cast());
+        list
+    };
+    add_missing(&mut list, ASKS.get())?;
+    let piece = ddsrt_iovec_t { iov_base: list.as_mut_ptr().cast(), iov_len: list.len() };
+    let bytes = list.len() - HEADER_BYTES;
+    // SAFETY: one piece, which lives until the call returns, and its length without the header.
+    let completed = unsafe { from_ser_iov(sertype, ddsi_serdata_kind_SDK_DATA, 1, &raw const piece, bytes) };
+    if completed.is_null() {
+        return None;
+    }
+    // SAFETY: the only reference to a sample that nobody has seen.
+    unsafe { ddsi_serdata_unref(made) };
+    Some(completed)
+}
+
+/// Adds to the list of parameters of an announcement, in the byte order of this machine; none if there is nothing to add, or it is no
+/// such list.
+fn add_missing(list: &mut Vec<u8>, expects_inline_qos: bool) -> Option<()> {
+    let (mut endpoint, mut has_participant, mut bytes) = (None, false, HEADER_BYTES);
+    for parameter in Parameters::new(list.get(HEADER_BYTES..)?, cfg!(target_endian = "big")) {
+        let (pid, value) = parameter?;
+        match pid {
+            PID_ENDPOINT_GUID => endpoint = value.first_chunk::<16>().copied(),
+            PID_PARTICIPANT_GUID => has_participant = true,
+            _ => {}
+        }
+        bytes += 4 + value.len();
+    }
+    let mut participant = endpoint.filter(|_| !has_participant)?;
+    participant[12..].copy_from_slice(&ENTITYID_PARTICIPANT);
+    list.truncate(bytes);
+    let mut add = |pid: u16, value: &[u8]| {
+        list.extend_from_slice(&pid.to_ne_bytes());
+        list.extend_from_slice(&(value.len() as u16).to_ne_bytes());
+        list.extend_from_slice(value);
+    };
+    add(PID_PARTICIPANT_GUID, &participant);
+    if expects_inline_qos {
+        add(PID_EXPECTS_INLINE_QOS, &[1, 0, 0, 0]);
+    }
+    add(PID_SENTINEL, &[]);
+    Some(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parameter(pid: u16, value: &[u8]) -> Vec<u8> {
+        [&pid.to_ne_bytes()[..], &(value.len() as u16).to_ne_bytes(), value].concat()
+    }
+
+    fn list(parameters: &[Vec<u8>]) -> Vec<u8> {
+        [&[0, 3, 0, 0][..], &parameters.concat(), &parameter(PID_SENTINEL, &[])].concat()
+    }
+
+    #[test]
+    fn announcements_get_the_participant_and_what_is_asked() {
+        let endpoint = parameter(PID_ENDPOINT_GUID, &[7; 16]);
+        let participant = parameter(PID_PARTICIPANT_GUID, &[&[7; 12][..], &[0, 0, 1, 0xc1]].concat());
+        let asks = parameter(PID_EXPECTS_INLINE_QOS, &[1, 0, 0, 0]);
+        for expects in [false, true] {
+            let mut made = list(&[parameter(5, &[1; 8]), endpoint.clone()]);
+            assert!(add_missing(&mut made, expects).is_some());
+            let asks = if expects { asks.clone() } else { Vec::new() };
+            assert_eq!(made, list(&[parameter(5, &[1; 8]), endpoint.clone(), participant.clone(), asks]));
+        }
+    }
+
+    #[test]
+    fn other_lists_stay_as_they_are() {
+        let (endpoint, participant) =
+            (parameter(PID_ENDPOINT_GUID, &[7; 16]), parameter(PID_PARTICIPANT_GUID, &[8; 16]));
+        for mut made in [list(&[]), list(&[endpoint.clone(), participant]), vec![0, 3], endpoint] {
+            let before = made.clone();
+            assert!(add_missing(&mut made, true).is_none());
+            assert_eq!(made, before);
+        }
+    }
+}
