@@ -1624,6 +1624,24 @@ fn arguments_say_the_same_as_a_file() {
          to = ['group:vision', 'desk']\n[[use]]\nfrom = 'desk'\ntopic = '/cmd_vel'",
     );
     assert_eq!(from_args, from_file);
+    let of_kinds = args(&[
+        ("identity", "/etc/sgc/arm-1.identity"),
+        ("router", "quic://r:7447"),
+        ("share", "topic:/chatter"),
+        ("share", "service:/add_two_ints"),
+        ("share", "action:/fibonacci=ops"),
+        ("share", "parameters:/talker"),
+        ("to", "desk"),
+        ("use", "desk:service:/plan/**"),
+        ("use", "service:/status"),
+    ]);
+    let from_file = good(
+        "identity = 'arm-1.identity'\nnode.routers = ['quic://r:7447']\n[[share]]\ntopic = '/chatter'\nto = ['desk']\n\
+         [[share]]\nservice = '/add_two_ints'\nto = ['desk']\n[[share]]\naction = '/fibonacci'\nto = ['ops']\n\
+         [[share]]\nparameters = '/talker'\nto = ['desk']\n[[use]]\nfrom = 'desk'\nservice = '/plan/**'\n\
+         [[use]]\nfrom = 'service'\ntopic = '/status'",
+    );
+    assert_eq!(Config::from_args(&of_kinds, &no_env).unwrap(), from_file);
     let router = args(&[("identity", "r"), ("listen", "quic://0.0.0.0:7447")]);
     assert!(Config::from_args(&router, &no_env).unwrap().is_pure_router());
     let mesh = args(&[
@@ -1661,7 +1679,23 @@ fn mistakes_in_arguments_name_the_argument() {
         ),
         (
             &[("use", "/cmd_vel")],
-            &["`--use` is \"/cmd_vel\"; write NODE:/TOPIC: \"arm-1:/camera/image\", for example"],
+            &[
+                "`--use` is \"/cmd_vel\"; write NODE:/TOPIC: \"arm-1:/camera/image\" or \"arm-1:service:/add_two_ints\", for \
+               example",
+            ],
+        ),
+        (
+            &[("share", "servce:/add=c")],
+            &[
+                "`--share` is \"servce\"; did you mean \"service\"? It takes \"topic\", \"service\", \"action\", \"parameters\"",
+            ],
+        ),
+        (
+            &[("share", "service:/a=c"), ("use", "b:service:/a"), ("use", "b:action:/a")],
+            &[
+                "`--use service` is \"/a\", which a `--share service` shares: what is used here would be shared again, in a \
+               loop; keep one",
+            ],
         ),
         (
             &[("share", "/a"), ("share", "/a=c"), ("to", "b"), ("use", "b:/a")],

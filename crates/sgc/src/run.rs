@@ -59,15 +59,17 @@ pub(crate) struct RunArgs {
     /// (srv://lab.example), or any on the local network (mdns://); may be repeated
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
-    /// A topic to share, /TOPIC or /TOPIC=NODE,group:GROUP; may be repeated
-    #[arg(long, value_name = "/TOPIC")]
+    /// A topic to share, /TOPIC or /TOPIC=NODE,group:GROUP; with service:, action: or parameters: in front, that of such a
+    /// name; may be repeated
+    #[arg(long, value_name = "[KIND:]/NAME")]
     share: Vec<String>,
-    /// Who may subscribe to what is shared: NODE, group:GROUP or '*', which is every member of the fleet and the default;
+    /// Who may subscribe to what is shared, or call it: NODE, group:GROUP or '*', which is every member of the fleet and the default;
     /// may be repeated
     #[arg(long, value_name = "WHO")]
     to: Vec<String>,
-    /// A topic of another node to bring here; may be repeated
-    #[arg(long = "use", value_name = "NODE:/TOPIC")]
+    /// A topic of another node to bring here, or a service, an action or parameters, as in NODE:service:/NAME; may be
+    /// repeated
+    #[arg(long = "use", value_name = "NODE:[KIND:]/NAME")]
     uses: Vec<String>,
     /// Listen as a router, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL")]

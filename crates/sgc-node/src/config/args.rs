@@ -1,7 +1,8 @@
 //! Command line → draft: `sgc run --identity … --router … --share … --to … --use …` without a file.
 //!
 //! `--share /topic --to desk --to group:operators` shares with all that `--to` names;
-//! `--share /topic=desk,group:operators` says it for one topic. Where nobody is named, every member of the fleet may
+//! `--share /topic=desk,group:operators` says it for one topic. A word in front of a name tells its kind, as the keys of a
+//! file do: `--share service:/add_two_ints`, `--use arm-1:action:/fibonacci`. Where nobody is named, every member of the fleet may
 //! subscribe, nobody else; `sgc run` says so.
 
 use std::collections::BTreeSet;
@@ -12,6 +13,7 @@ use super::draft::{
     Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
+use super::schema::nearest;
 
 const WORDS: Words = Words {
     no_identity: "no `--identity`",
@@ -22,6 +24,15 @@ const WORDS: Words = Words {
     uses: "`--use`",
 };
 
+/// The words that tell the kind of an interface, each with the key of its share and of its use.
+const KINDS: [(&str, &str, &str); 4] = [
+    ("topic", "--share", "--use"),
+    ("service", "--share service", "--use service"),
+    ("action", "--share action", "--use action"),
+    ("parameters", "--share parameters", "--use parameters"),
+];
+const KIND_WORDS: [&str; KINDS.len()] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0];
+
 /// The arguments of `sgc run` that stand in for a file, as given.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ArgsConfig {
@@ -29,12 +40,12 @@ pub struct ArgsConfig {
     pub identity: Option<PathBuf>,
     /// `--router URL`, any number.
     pub routers: Vec<String>,
-    /// `--share /TOPIC` or `--share /TOPIC=NODE,group:GROUP`, any number.
+    /// `--share [KIND:]/NAME` or `--share [KIND:]/NAME=NODE,group:GROUP`, any number.
     pub shares: Vec<String>,
     /// `--to NODE`, `--to group:GROUP` or `--to '*'`, any number: who may subscribe to the shares that do not say it
     /// themselves. None is the whole fleet.
     pub to: Vec<String>,
-    /// `--use NODE:/TOPIC`, any number.
+    /// `--use NODE:[KIND:]/NAME`, any number.
     pub uses: Vec<String>,
     /// `--peer URL` of `sgc router`, any number: what `routers` is in a file.
     pub peers: Vec<String>,
@@ -68,8 +79,9 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
                 (share.as_str(), Some(located("--to", all("--to", &args.to))))
             }
         };
+        let named = named(topic, |(_, share, _)| share);
         shares.push(ShareDraft {
-            topic: Some(located("--share", topic.to_owned())),
+            topic: named.map_err(&mut record).ok(),
             to,
             ..ShareDraft::default()
         });
@@ -83,9 +95,10 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
             record(Mistake::UseArgument { value: one.clone() });
             continue;
         };
+        let named = named(topic, |(_, _, used)| used);
         uses.push(UseDraft {
             from: Some(located("--use", from.to_owned())),
-            topic: Some(located("--use", topic.to_owned())),
+            topic: named.map_err(&mut record).ok(),
             ..UseDraft::default()
         });
     }
@@ -124,6 +137,23 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         gateway: args.gateway.then(GatewayDraft::default),
     };
     (draft, errors)
+}
+
+/// Takes the word for the kind from the front of a name, a topic's if there is none.
+fn named(
+    text: &str,
+    key: fn((&'static str, &'static str, &'static str)) -> &'static str,
+) -> Result<Located<String>, Mistake> {
+    // A name may be wrong in itself; a word before a slash is none of it.
+    let (word, name) =
+        text.split_once(':').filter(|(word, _)| !word.contains('/')).unwrap_or(("topic", text));
+    match KINDS.into_iter().find(|(kind, ..)| *kind == word) {
+        Some(kind) => Ok(located(key(kind), name.to_owned())),
+        None => {
+            let (key, value) = (key(KINDS[0]), word.to_owned());
+            Err(Mistake::UnknownWord { key, value, nearest: nearest(word, &KIND_WORDS), known: &KIND_WORDS })
+        }
+    }
 }
 
 fn located<T>(key: &'static str, value: T) -> Located<T> {

@@ -622,7 +622,9 @@ pub enum Mistake {
         value: String,
     },
     /// An argument `--use` without its colon.
-    #[error("`--use` is {value:?}; write NODE:/TOPIC: \"arm-1:/camera/image\", for example")]
+    #[error(
+        "`--use` is {value:?}; write NODE:/TOPIC: \"arm-1:/camera/image\" or \"arm-1:service:/add_two_ints\", for example"
+    )]
     UseArgument {
         /// The value.
         value: String,

@@ -851,9 +851,9 @@ impl Resolver<'_> {
     }
 }
 
-/// What a table is about: the key that the name stands under says so. Arguments name topics.
+/// The kind of a table's interface, after the key of its name, or after the last word of an argument's key.
 fn interface_of(named: Option<&Located<String>>) -> Interface {
-    let key = named.map_or("", |named| named.key);
+    let key = named.and_then(|named| named.key.split(' ').next_back()).unwrap_or_default();
     let others = [Interface::Service, Interface::Action, Interface::Parameters];
     others.into_iter().find(|interface| interface.key() == key).unwrap_or_default()
 }
