@@ -27,5 +27,6 @@ pub use qos::{
 pub use routes::{
     Command, Direction, GLOBAL_TOPICS, LITERAL_TOPICS, Naming, OfferView, Problem, REDISCOVERY_HOLD,
     ROUTES_PER_WILDCARD_MAX, Rename, RouteStatus, Routes, SINKLESS_HOLD, Shaping, ShareRouteView, ShareRule,
-    ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseView, WRITERLESS_HOLD, is_pattern, matches,
+    ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseView, WRITERLESS_HOLD, is_for_wildcards,
+    is_pattern, matches,
 };

@@ -41,7 +41,8 @@ use settling::Settling;
 
 pub use command::{Command, Problem};
 pub use naming::{
-    GLOBAL_TOPICS, LITERAL_TOPICS, Naming, ROUTES_PER_WILDCARD_MAX, Rename, is_pattern, matches,
+    GLOBAL_TOPICS, LITERAL_TOPICS, Naming, ROUTES_PER_WILDCARD_MAX, Rename, is_for_wildcards, is_pattern,
+    matches,
 };
 pub use settling::REDISCOVERY_HOLD;
 pub use view::{OfferView, ShareRouteView, ShareView, UseRouteView, UseView};

@@ -114,7 +114,7 @@ pub fn matches(pattern: &str, name: &str) -> bool {
 
 /// Whether a wildcard shares it: not what every node publishes, nor what ROS 2 hides, of which the topics within an action
 /// are a part (`/_action/`).
-fn is_for_wildcards(name: &str) -> bool {
+pub fn is_for_wildcards(name: &str) -> bool {
     !LITERAL_TOPICS.contains(&name) && !name.split('/').any(|word| word.starts_with('_'))
 }
 

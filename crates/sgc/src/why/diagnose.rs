@@ -5,8 +5,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_node::alerts::Alert;
-use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Share, ShareRoute, Use, UseRoute};
-use sgc_ros::{is_pattern, matches};
+use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Offer, Share, ShareRoute, Use, UseRoute};
+use sgc_ros::{Naming, Rename, is_for_wildcards, is_pattern, matches};
 
 use super::near::{hint, near};
 use super::refusals;
@@ -47,22 +47,114 @@ pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
         ));
         return steps;
     }
-    let shares: Vec<_> =
-        graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, topic)).collect();
-    let uses: Vec<_> = graph.uses.iter().filter(|used| concerns(used, topic)).collect();
-    if shares.is_empty() && uses.is_empty() {
-        if !walk_parts(graph, topic, &mut steps) {
+    let mut walks = walks(graph, topic);
+    if walks.is_empty() && !walk_parts(graph, topic, &mut steps) {
+        walks.extend(pattern_walk(graph, topic));
+        if walks.is_empty() {
             steps.push(uncovered(graph, topic));
         }
-        return steps;
     }
-    for (_, share) in &shares {
+    steps.extend(merged(walks));
+    steps
+}
+
+/// The walk of one rule.
+struct RuleWalk {
+    steps: Walk,
+    /// Whether the rule may be wrong for this interface while the interface flows by another rule: its wildcard covers more
+    /// than its owner offers, or nobody here takes part in this direction.
+    is_optional: bool,
+}
+
+impl RuleWalk {
+    fn is_wrong(&self) -> bool {
+        self.steps.iter().any(|step| step.verdict == Verdict::Wrong)
+    }
+}
+
+/// The walks of all rules that name an interface or by which it runs.
+fn walks(graph: &Graph, topic: &str) -> Vec<RuleWalk> {
+    let shares = graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, topic));
+    let shares = shares.map(|(_, share)| {
+        let mut steps = Walk::new();
         walk_share(graph, share, topic, &mut steps);
-    }
-    for used in &uses {
+        RuleWalk { steps, is_optional: is_pattern(&share.topic) }
+    });
+    let uses = graph.uses.iter().filter(|used| concerns(used, topic)).map(|used| {
+        let mut steps = Walk::new();
         walk_use(graph, used, topic, &mut steps);
+        let (providers, consumers) = ends(graph, used.kind, topic);
+        let here = if used.publishes { providers } else { consumers };
+        RuleWalk { steps, is_optional: is_pattern(&used.topic) || here.is_empty() }
+    });
+    shares.chain(uses).collect()
+}
+
+/// One walk of several rules. Where the interface flows by one of them, the faults of optional rules are no faults of the
+/// interface; where it flows by none, the first fault is enough.
+fn merged(walks: Vec<RuleWalk>) -> Walk {
+    let (wrong, mut sound): (Vec<_>, Vec<_>) = walks.into_iter().partition(RuleWalk::is_wrong);
+    let (optional, required): (Vec<_>, Vec<_>) =
+        wrong.into_iter().partition(|walk| walk.is_optional && !sound.is_empty());
+    sound.extend(optional.into_iter().map(|walk| {
+        let doubted = walk.steps.into_iter().map(|step| match step.verdict {
+            Verdict::Wrong => Step { verdict: Verdict::Unknown, ..step },
+            _ => step,
+        });
+        RuleWalk { steps: doubted.collect(), ..walk }
+    }));
+    sound.extend(required.into_iter().next());
+    let mut steps = Walk::new();
+    for step in sound.into_iter().flat_map(|walk| walk.steps) {
+        // Rules have most of the way in common.
+        if step.verdict == Verdict::Wrong || !steps.contains(&step) {
+            steps.push(step);
+        }
     }
     steps
+}
+
+/// The walk of a rule whose wildcard covers an interface that does not run: the one whose owner offers it, else one that
+/// programs here wait for.
+fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
+    let covering =
+        graph.uses.iter().filter(|used| is_pattern(&used.topic) && matches(&used.local_topic, topic));
+    let is_offered = |used: &Use| {
+        let theirs = name_at_owner(used, topic);
+        let is_same = |offer: &Offer| offer.owner_id == used.owner_id && offer.topic == theirs;
+        graph.offers.iter().any(|offer| is_same(offer) && offer.kind == used.kind)
+    };
+    let is_here = |used: &Use| {
+        let (providers, consumers) = ends(graph, used.kind, topic);
+        !(if used.publishes { providers } else { consumers }).is_empty()
+    };
+    let used = covering.min_by_key(|used| (!is_offered(used), !is_here(used)))?;
+    let kinds = [Interface::Topic, Interface::Service, Interface::Action];
+    let has_ends = kinds.into_iter().any(|kind| {
+        let (providers, consumers) = ends(graph, kind, topic);
+        !providers.is_empty() || !consumers.is_empty()
+    });
+    // Programs here that the rule is not for are the question then.
+    if has_ends && !is_offered(used) && !is_here(used) {
+        return None;
+    }
+    let mut steps = Walk::new();
+    walk_use(graph, used, topic, &mut steps);
+    Some(RuleWalk { steps, is_optional: true })
+}
+
+/// The owner's name of an interface that a use calls `topic` here.
+fn name_at_owner(used: &Use, topic: &str) -> String {
+    if !is_pattern(&used.topic) {
+        return used.topic.clone();
+    }
+    match used.local_topic.strip_suffix(&used.topic) {
+        Some(namespace) => topic.strip_prefix(namespace).unwrap_or(topic).to_owned(),
+        None => {
+            let back = Naming { rename: Rename::As(used.topic.clone()), ..Naming::default() };
+            back.renamed(&used.local_topic, topic)
+        }
+    }
 }
 
 /// Walks what an action, or the parameters of a node, are made of, up to the part that is wrong; false if no rule is for any
@@ -71,12 +163,7 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let mut is_any = false;
     for part in kinds.into_iter().flat_map(|kind| kind.parts()) {
-        let name = part.name(topic);
-        let shares = graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, &name));
-        let mut of_part = Walk::new();
-        shares.for_each(|(_, share)| walk_share(graph, share, &name, &mut of_part));
-        let uses = graph.uses.iter().filter(|used| concerns(used, &name));
-        uses.for_each(|used| walk_use(graph, used, &name, &mut of_part));
+        let of_part = merged(walks(graph, &part.name(topic)));
         is_any |= !of_part.is_empty();
         // The parts have most of the way in common.
         let known: BTreeSet<String> = steps.iter().map(|step| step.found.clone()).collect();
@@ -142,10 +229,10 @@ fn covers(graph: &Graph, at: usize, share: &Share, topic: &str) -> bool {
     is_named || graph.endpoints.iter().any(|e| e.topic == topic && e.shared_by == Some(at))
 }
 
+/// Whether a use names this, or it runs by it. A wildcard promises nothing: its owner may offer no such interface.
 fn concerns(used: &Use, topic: &str) -> bool {
     let runs = used.routes.iter().any(|route| route.topic == topic);
-    let is_covered = is_pattern(&used.local_topic) && matches(&used.local_topic, topic);
-    runs || is_covered || used.routes.is_empty() && used.local_topic == topic
+    runs || used.routes.is_empty() && used.local_topic == topic
 }
 
 /// The local ends of an interface: who provides it, and who wants it.
@@ -184,11 +271,12 @@ fn uncovered(graph: &Graph, topic: &str) -> Step {
     let node = &graph.node;
     if let Some(offer) = graph.offers.iter().find(|offer| offer.topic == topic && !offer.is_used) {
         let owner = offer.owner.as_deref().unwrap_or("another node");
-        let line = if offer.subscribe { "" } else { ", publish = true" };
+        let line = if offer.subscribe || offer.kind != Interface::Topic { "" } else { ", publish = true" };
         return Step::wrong(
             format!("{owner} shares {topic} with this node, but no [[use]] asks for it"),
             format!(
-                "add [[use]] from = \"{owner}\", topic = \"{topic}\"{line} to the file of {node}, then `sgc reload`"
+                "add [[use]] from = \"{owner}\", {} = \"{topic}\"{line} to the file of {node}, then `sgc reload`",
+                offer.kind
             ),
         );
     }
@@ -384,7 +472,14 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
         return;
     }
     if route.is_written {
-        readers(graph, kind, topic, &route.type_name, None, route.matched, steps);
+        if !readers(graph, kind, topic, &route.type_name, None, route.matched, steps) {
+            // Local publishers flow all the same; others may publish here, and need not.
+            if let Some(last) = steps.last_mut().filter(|_| provides && ends(graph, kind, topic).1.is_empty()) {
+                last.verdict = Verdict::Unknown;
+                far_half(&route.granted.join(", "), topic, steps);
+            }
+            return;
+        }
         steps.push(Step::fine(format!(
             "{} messages of others were given to the local network",
             route.written
@@ -429,9 +524,7 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
     }
     let routes: Vec<_> = used.routes.iter().filter(|route| route.topic == topic).collect();
     if routes.is_empty() {
-        // Under a wildcard it is the one that was asked for.
-        let theirs = if is_pattern(&used.topic) { topic } else { &used.topic };
-        steps.push(unlisted(graph, used, theirs));
+        steps.push(unlisted(graph, used, &name_at_owner(used, topic)));
         return;
     }
     if !used.is_token {
@@ -501,6 +594,17 @@ fn unlisted(graph: &Graph, used: &Use, topic: &str) -> Step {
         return Step::wrong(
             format!("{owner} shares {topic} as a {}, and the [[use]] asks for a {}", offer.kind, used.kind),
             format!("write {} = \"{topic}\" in the [[use]]", offer.kind),
+        );
+    }
+    if used.kind != Interface::Action && !is_for_wildcards(topic) {
+        let (key, name) = match topic.split_once("/_action/") {
+            Some((action, _)) => ("action", action),
+            None if used.kind == Interface::Service => ("service", topic),
+            None => ("topic", topic),
+        };
+        return Step::wrong(
+            format!("{owner} is in reach and does not share {topic} with {node}"),
+            format!("on {owner}: no wildcard shares it; name it, [[share]] {key} = \"{name}\""),
         );
     }
     let meant = hint(&near(topic, of_owner.iter().map(|offer| offer.topic.as_str())));

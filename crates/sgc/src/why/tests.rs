@@ -466,6 +466,90 @@ fn wildcards_and_other_names_are_followed() {
     );
 }
 
+/// A use of all of a kind that `arm`, or another owner, shares.
+fn pattern(kind: Interface, owner: &str) -> Use {
+    Use {
+        kind,
+        topic: "/**".into(),
+        local_topic: "/**".into(),
+        owner: owner.into(),
+        owner_id: if owner == "arm" { "1d".into() } else { "2d".into() },
+        has_catalogue: true,
+        ..Use::default()
+    }
+}
+
+#[test]
+fn patterns_beside_that_of_a_healthy_topic_are_no_fault_of_it() {
+    let mut graph = user();
+    graph.uses[0].topic = "/**".into();
+    graph.uses[0].local_topic = "/**".into();
+    graph.uses.insert(0, pattern(Interface::Service, "arm"));
+    graph.uses.push(pattern(Interface::Topic, "leg"));
+    graph.uses.push(Use { publishes: true, ..pattern(Interface::Topic, "arm") });
+    // The arm lets this node publish as well, and nobody here does.
+    let mut there = graph.uses[1].routes[0].clone();
+    (there.publishers, there.is_granted) = (0, true);
+    graph.uses[3].routes.push(there);
+    assert_eq!(wrong(&graph, "/a"), "");
+    // A fault of the topic itself is still its fault.
+    graph.uses[1].routes[0].writers = 0;
+    assert!(wrong(&graph, "/a").contains("no writer for it is on the local network"));
+
+    let mut graph = owner();
+    graph.shares[0].topic = "/**".into();
+    let unasked = ShareRoute { granted: vec![], is_read: false, ..graph.shares[0].routes[0].clone() };
+    graph.shares.push(Share {
+        kind: Interface::Service,
+        topic: "/**".into(),
+        routes: vec![unasked],
+        ..Share::default()
+    });
+    assert_eq!(wrong(&graph, "/a"), "");
+}
+
+#[test]
+fn a_named_rule_that_does_not_hold_is_a_fault_beside_a_healthy_one() {
+    let mut graph = user();
+    let literal = |owner| Use { topic: "/a".into(), local_topic: "/a".into(), ..pattern(Interface::Topic, owner) };
+    graph.uses.push(literal("leg"));
+    assert!(wrong(&graph, "/a").contains("leg is in reach and does not share /a with here"));
+    // It is not if nobody here takes part in that direction.
+    let mut both_ways = user();
+    both_ways.uses.push(Use { publishes: true, ..literal("arm") });
+    assert_eq!(wrong(&both_ways, "/a"), "");
+    both_ways.uses.remove(0);
+    assert!(wrong(&both_ways, "/a").contains("no publisher of /a is on the local network"));
+    let mut shared = owner();
+    shared.shares[0].publish = [1, 0, 0];
+    shared.shares[0].routes[0].is_written = true;
+    assert_eq!(wrong(&shared, "/a"), "");
+}
+
+#[test]
+fn patterns_that_cover_what_does_not_flow_are_asked_by_kind() {
+    let patterns = |graph: &mut Graph| {
+        graph.uses = vec![pattern(Interface::Service, "arm"), pattern(Interface::Topic, "arm")];
+        graph.uses[1].topic = "/robot/**".into();
+        graph.uses[1].local_topic = "/**".into();
+    };
+    let mut graph = user();
+    patterns(&mut graph);
+    graph.offers[0].topic = "/robot/b".into();
+    let said = wrong(&graph, "/a");
+    assert!(said.contains("arm is in reach and does not share /robot/a with here; did you mean /robot/b?"), "{said}");
+    // Programs that no pattern is for are the question.
+    graph.endpoints = vec![end("/a", true)];
+    assert!(wrong(&graph, "/a").contains("1 local publishers have it, but no rule names it"));
+    graph.endpoints = vec![end("/rosout", false)];
+    let steps = diagnose::interface(&graph, "/rosout");
+    assert!(steps.last().unwrap().found.contains("does not share /robot/rosout"), "{steps:?}");
+    graph.uses[1].topic = "/**".into();
+    let steps = diagnose::interface(&graph, "/rosout");
+    let fix = steps.last().unwrap().fix.as_deref().unwrap_or_default();
+    assert!(fix.contains("no wildcard shares it; name it, [[share]] topic = \"/rosout\""), "{steps:?}");
+}
+
 #[test]
 fn some_subscribers_that_do_not_match_are_no_fault_of_the_way() {
     let mut graph = user();

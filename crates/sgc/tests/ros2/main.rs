@@ -13,6 +13,7 @@ mod keyed;
 mod lab;
 #[path = "../support/mod.rs"]
 mod support;
+mod why;
 
 use lab::Plan;
 use serde_json::Value;
