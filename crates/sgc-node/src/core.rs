@@ -49,6 +49,7 @@ use crate::graph::Graph;
 use crate::heart::{Heart, Patience};
 use crate::links::ControlTx;
 use crate::message_keys::MessageKeys;
+use crate::network_slot::NetworkSlot;
 use crate::operations::{OperationError, Operations};
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
@@ -148,6 +149,8 @@ pub(crate) enum CoreEvent {
         /// Either.
         end: ServiceEnd,
     },
+    /// The node joined the local network after its start; its rules follow.
+    NetworkJoined(Box<Routes<ChaCha20Rng>>),
     /// The user wants something else from now on; answered when it is under way.
     Reload {
         /// What is shared.
@@ -229,7 +232,7 @@ pub(crate) struct Core<N: RosNetwork> {
     router: Router,
     endpoint: Endpoint,
     routes: Option<Routes<ChaCha20Rng>>,
-    network: Option<Arc<N>>,
+    network: NetworkSlot<N>,
     data: Arc<DataPlane>,
     inbox: Inbox,
     links: BTreeMap<LinkId, LinkEntry>,
@@ -322,7 +325,7 @@ pub(crate) struct CoreParts<N> {
     /// The route machine, where there is a local network.
     pub routes: Option<Routes<ChaCha20Rng>>,
     /// The local network.
-    pub network: Option<Arc<N>>,
+    pub(crate) network: NetworkSlot<N>,
     /// Its own inbox.
     pub events: mpsc::WeakSender<CoreEvent>,
     /// Held by every thread and blocking task, for as long as it uses the runtime.
@@ -533,6 +536,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
             CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
             CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
+            CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
             CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
                 self.add_message_keys(message_keys);
                 self.reconfigure(shares, uses, anchors);

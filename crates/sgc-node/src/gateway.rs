@@ -58,7 +58,7 @@ pub(crate) struct Sockets {
 /// Programs without ROS at this node.
 pub(crate) struct Gateway {
     /// None where there is no local network.
-    open: Option<OpenLocalRos>,
+    open: std::sync::Mutex<Option<OpenLocalRos>>,
     types: Mutex<Option<Types>>,
     /// The SGC node's name.
     name: String,
@@ -84,14 +84,24 @@ impl Gateway {
             (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
         let (name, showing, shows_own) =
             (node_name.to_owned(), std::sync::Mutex::default(), AtomicBool::default());
+        let open = std::sync::Mutex::new(open);
         Arc::new(Self { open, types, name, node, hub, server, showing, shows_own })
+    }
+
+    /// Takes the way to a local network that the node joined after its start.
+    pub(crate) fn set_local_network(&self, open: Option<OpenLocalRos>) {
+        *self.lock_open() = open;
+    }
+
+    fn lock_open(&self) -> MutexGuard<'_, Option<OpenLocalRos>> {
+        self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The hub, which joins the local network if it has not yet.
     pub(crate) async fn hub(&self) -> Result<&Hub, GatewayError> {
         self.hub
             .get_or_try_init(|| async {
-                let open = self.open.clone().ok_or_else(|| {
+                let open = self.lock_open().clone().ok_or_else(|| {
                     let reason = "this node has no local ROS 2 network: it is only a router".to_owned();
                     GatewayError::Ros(RosError::Domain { domain: 0, reason })
                 })?;

@@ -34,6 +34,7 @@ mod labels;
 mod lanes;
 mod links;
 mod message_keys;
+mod network_slot;
 mod node;
 mod operations;
 mod operators;
@@ -65,7 +66,9 @@ pub use admin::{SocketError, default_socket_path};
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use gateway::{GatewayStartError, OpenLocalRos};
-pub use node::{NodeError, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on};
+pub use node::{
+    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on, run_opening,
+};
 pub use operations::OperationError;
 pub use operators::{roster_head, roster_row};
 pub use reload::{ConfigSource, ReloadReport};

@@ -6,6 +6,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
@@ -13,7 +14,7 @@ use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_dds::{CycloneNetwork, DdsConfig};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_gateway::LocalRos;
-use sgc_ros::{RosError, RosNetwork, Routes};
+use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Router, RouterConfig};
 use sgc_transport::{
     CloseReason, CredentialStore, Dialer, Link, LinkOptions, ListenAddr, Listener, TransportMetrics,
@@ -42,9 +43,10 @@ use crate::heart::Patience;
 use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
 use crate::message_keys;
+use crate::network_slot::NetworkSlot;
 use crate::peer_rate::PeerRates;
 use crate::policy::grantees;
-use crate::reload::{ConfigSource, Reloader, Running};
+use crate::reload::{ConfigSource, JoinNetwork, Reloader, Running};
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
 use crate::run_lock::{IdentityInUse, RunLock};
@@ -282,19 +284,37 @@ pub async fn run(
             identity.not_after()
         );
     }
-    let network = match &config.ros {
-        Some(ros) => Some(Arc::new(CycloneNetwork::open(&dds_config(ros, &identity))?)),
-        None => None,
-    };
-    if network.is_some() {
-        tokio::spawn(discovery_server::watch());
-    }
-    let gateway = config.ros.as_ref().map(|ros| -> OpenLocalRos {
+    let (opener, runtime) = (identity.clone(), tokio::runtime::Handle::current());
+    let open: OpenNetwork<CycloneNetwork> = Arc::new(move |ros| {
+        let config = dds_config(ros, &opener);
         // An ordinary participant, whose topics the node's own sees as any program's.
-        let config = DdsConfig { tag: None, ..dds_config(ros, &identity) };
-        Arc::new(move || CycloneNetwork::open(&config).map(|network| Arc::new(network) as Arc<dyn LocalRos>))
+        let of_gateway = DdsConfig { tag: None, ..config.clone() };
+        let gateway: OpenLocalRos = Arc::new(move || {
+            CycloneNetwork::open(&of_gateway).map(|network| Arc::new(network) as Arc<dyn LocalRos>)
+        });
+        let network = Arc::new(CycloneNetwork::open(&config)?);
+        runtime.spawn(discovery_server::watch());
+        Ok((network, Some(gateway)))
     });
-    run_on(config, identity, network, RunOptions { gateway, ..options }, shutdown).await
+    run_opening(config, identity, open, options, shutdown).await
+}
+
+/// Opens the local network that a configuration describes, and the gateway's part of it; may block.
+pub type OpenNetwork<N> =
+    Arc<dyn Fn(&RosConfig) -> Result<(Arc<N>, Option<OpenLocalRos>), RosError> + Send + Sync>;
+
+/// [`run`] with an identity that is there already. `open` is called at start if the configuration wants a local network, else
+/// at the first reload that does.
+pub async fn run_opening<N: RosNetwork>(
+    config: Config,
+    identity: Arc<Identity>,
+    open: OpenNetwork<N>,
+    options: RunOptions,
+    shutdown: impl Future<Output = ()> + Send,
+) -> Result<(), NodeError> {
+    let (network, gateway) = config.ros.as_ref().map(|ros| open(ros)).transpose()?.unzip();
+    let options = RunOptions { gateway: gateway.flatten().or(options.gateway), ..options };
+    run_with(config, identity, network, Some(open), options, shutdown).await
 }
 
 /// [`run`] with an identity and a local network that are there already.
@@ -302,6 +322,17 @@ pub async fn run_on<N: RosNetwork>(
     config: Config,
     identity: Arc<Identity>,
     network: Option<Arc<N>>,
+    options: RunOptions,
+    shutdown: impl Future<Output = ()> + Send,
+) -> Result<(), NodeError> {
+    run_with(config, identity, network, None, options, shutdown).await
+}
+
+async fn run_with<N: RosNetwork>(
+    config: Config,
+    identity: Arc<Identity>,
+    network: Option<Arc<N>>,
+    open: Option<OpenNetwork<N>>,
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
@@ -378,7 +409,7 @@ pub async fn run_on<N: RosNetwork>(
     };
     let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(&mut rng), now());
     endpoint.set_anchors(now(), Arc::new(anchors));
-    let routes = identity.fleet_secret().zip(network.as_ref()).map(|(secret, _)| {
+    let routes = network.as_ref().and_then(|_| {
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let mut followed = std::collections::BTreeSet::new();
         for rule in uses.iter().filter(|rule| rule.token.is_none()) {
@@ -386,9 +417,9 @@ pub async fn run_on<N: RosNetwork>(
                 endpoint.follow(now(), &rule.owner_name);
             }
         }
-        let secret = identity.naming_secrets().first().map_or(secret, |newest| &newest.secret);
-        Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(&mut rng))
+        local_routes(&identity, shares, uses, &mut rng)
     });
+    let network = NetworkSlot::new(network);
 
     let definitions = Definitions::from_env(config.ros.as_ref().map_or(&[], |ros| &ros.definitions));
     let types = options.types.unwrap_or_default();
@@ -448,13 +479,9 @@ pub async fn run_on<N: RosNetwork>(
         audit: audit.clone(),
     });
     let core = tokio::spawn(core.run(inbox, requested));
-    if let Some(network) = network.clone() {
+    if let Some(network) = network.get() {
         let events = events.clone();
-        let discover = move || {
-            network.discover(Box::new(move |event| {
-                let _ = events.blocking_send(CoreEvent::Discovery(event));
-            }))
-        };
+        let discover = move || discover(&*network, events);
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let mut tasks: Vec<JoinHandle<()>> = Vec::new();
@@ -479,7 +506,6 @@ pub async fn run_on<N: RosNetwork>(
     };
     let heard = local.clone().zip(nearby);
     tasks.extend(finding::start(&config.routers, &rules.routers, &holder, &board, heard, &mut rng));
-    drop(holder);
     let lanes = LaneDoor::default();
     let mut accepting = Vec::new();
     for listener in listeners {
@@ -495,16 +521,21 @@ pub async fn run_on<N: RosNetwork>(
         accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
+    let join = open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone()));
     let reloader = Arc::new(Reloader {
         source: options.source,
+        join,
+        holder,
+        board,
+        dialling: std::sync::Mutex::default(),
         identity: identity.clone(),
         credentials,
         state,
         audit: audit.clone(),
         events: events.clone(),
-        has_ros: network.is_some(),
+        has_ros: AtomicBool::new(network.get().is_some()),
         gateway: gateway.clone(),
-        running: Mutex::new(Running { config, rules, suites }),
+        running: Mutex::new(Running { config, dialled: rules.routers.clone(), rules, suites }),
         changed: Notify::new(),
     });
     let expiring = reloader.clone();
@@ -558,7 +589,7 @@ pub async fn run_on<N: RosNetwork>(
         let _ = tokio::time::timeout(GOODBYE_MAX, closed).await;
     };
     stop.await;
-    for task in tasks {
+    for task in tasks.into_iter().chain(reloader.take_dialling()) {
         task.abort();
     }
     // A successor may have the socket when it is removed.
@@ -580,11 +611,51 @@ pub async fn run_on<N: RosNetwork>(
         let _ = tokio::task::spawn_blocking(move || writer.finish()).await;
     }
     // Ends discovery, and waits for its threads; the runtime waits for the rest.
-    if let Some(network) = network {
+    if let Some(network) = network.take() {
         let _ = tokio::task::spawn_blocking(move || drop(network)).await;
     }
     drop(run_lock);
     Ok(())
+}
+
+/// The route machine of a member; a router's identity has none.
+fn local_routes(
+    identity: &Identity,
+    shares: Vec<ShareRule>,
+    uses: Vec<UseRule>,
+    rng: &mut ChaCha20Rng,
+) -> Option<Routes<ChaCha20Rng>> {
+    let oldest = identity.fleet_secret()?;
+    let secret = identity.naming_secrets().first().map_or(oldest, |newest| &newest.secret);
+    Some(Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(rng)))
+}
+
+/// Starts discovery, which the control task hears.
+fn discover<N: RosNetwork>(network: &N, events: mpsc::Sender<CoreEvent>) -> Result<(), RosError> {
+    network.discover(Box::new(move |event| {
+        let _ = events.blocking_send(CoreEvent::Discovery(event));
+    }))
+}
+
+/// The way to the local network for a node that began without one.
+fn join_late<N: RosNetwork>(
+    open: OpenNetwork<N>,
+    network: NetworkSlot<N>,
+    events: mpsc::Sender<CoreEvent>,
+    gateway: Arc<Gateway>,
+) -> JoinNetwork {
+    Arc::new(move |ros, identity| {
+        let mut rng = system_rng().map_err(|error| error.to_string())?;
+        let routes = local_routes(identity, Vec::new(), Vec::new(), &mut rng);
+        let routes = routes.ok_or_else(|| NodeError::RouterIdentity.to_string())?;
+        let (opened, of_gateway) = open(ros).map_err(|error| error.to_string())?;
+        network.put(opened.clone());
+        gateway.set_local_network(of_gateway);
+        // Ahead of what is discovered.
+        let stopping = |_| "the node is stopping".to_owned();
+        events.blocking_send(CoreEvent::NetworkJoined(Box::new(routes))).map_err(stopping)?;
+        discover(&*opened, events.clone()).map_err(|error| error.to_string())
+    })
 }
 
 /// The state directory, made if need be. A node whose user has no place for one runs without.

@@ -4,9 +4,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
+use rand_chacha::ChaCha20Rng;
+use rand_core::{OsRng, SeedableRng, TryRngCore};
 use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
@@ -16,13 +19,15 @@ use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_wire::{Kind, UnixMillis};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
+use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use crate::access::access_with;
 use crate::audit::{Audit, AuditEvent, AuditRecord};
-use crate::config::{Config, ConfigErrors, GatewayConfig};
+use crate::config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
 use crate::core::{CoreEvent, now};
 use crate::credentials::with_kept_crls;
+use crate::finding::{self, Board, Holder};
 use crate::gateway::{Gateway, ShownKey, key_of_files};
 use crate::message_keys::{MessageKeys, make_for};
 use crate::node::NodeError;
@@ -53,19 +58,30 @@ pub(crate) struct Reloader {
     pub(crate) state: Option<PathBuf>,
     pub(crate) audit: Audit,
     pub(crate) events: mpsc::Sender<CoreEvent>,
+    /// Joins the local network if the node began without one; blocks. `None` where there is no way to one.
+    pub(crate) join: Option<JoinNetwork>,
     /// True if there is a local network to share with.
-    pub(crate) has_ros: bool,
+    pub(crate) has_ros: AtomicBool,
+    /// What dials the routers of tokens that come later.
+    pub(crate) holder: Holder,
+    pub(crate) board: Board,
+    pub(crate) dialling: std::sync::Mutex<Vec<JoinHandle<()>>>,
     pub(crate) gateway: Arc<Gateway>,
     pub(crate) running: Mutex<Running>,
     /// Told when there is another time to wait for.
     pub(crate) changed: Notify,
 }
 
+/// Joins the local network that a configuration describes, as the node of an identity; blocks.
+pub(crate) type JoinNetwork = Arc<dyn Fn(&RosConfig, &Identity) -> Result<(), String> + Send + Sync>;
+
 /// What runs now.
 pub(crate) struct Running {
     /// What restart-only settings were at start, and the others are now.
     pub(crate) config: Config,
     pub(crate) rules: Rules,
+    /// Routers of tokens that are dialled; no task of them ends before the node does.
+    pub(crate) dialled: Vec<RouterUrl>,
     /// For which there are keys to sign with.
     pub(crate) suites: BTreeSet<Suite>,
 }
@@ -122,11 +138,45 @@ impl Reloader {
         }
         let has_rules = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
         let wants_ros = has_rules || config.gateway.is_some();
-        if wants_ros && !self.has_ros {
+        if wants_ros && !self.has_ros.load(Ordering::Relaxed) && self.join.is_none() {
             let why = "this node joined no ROS network when it started, so it can neither share nor use";
             return Err(format!("{why}: restart it"));
         }
         self.apply(&mut running, config).await
+    }
+
+    /// Joins the local network that a configuration describes, if the node began without one.
+    async fn join(&self, running: &mut Running, wanted: Option<&RosConfig>) -> Result<(), String> {
+        let join = self.join.clone().filter(|_| !self.has_ros.load(Ordering::Relaxed));
+        let Some((join, ros)) = join.zip(wanted.cloned()) else { return Ok(()) };
+        let (wanted, identity) = (ros.clone(), self.credentials.identity());
+        let joined = tokio::task::spawn_blocking(move || join(&wanted, &identity));
+        joined.await.map_err(|_| "joining the local network ended in a panic")??;
+        self.has_ros.store(true, Ordering::Relaxed);
+        info!("joined the local ROS 2 network of domain {}", ros.domain_id);
+        // Definitions are read at start alone.
+        running.config.ros = Some(RosConfig { definitions: Vec::new(), ..ros });
+        Ok(())
+    }
+
+    /// Dials the routers of tokens that are not dialled yet, and returns those.
+    fn dial(&self, running: &mut Running, of_tokens: &[RouterUrl]) -> Vec<RouterUrl> {
+        let is_new = |url: &&RouterUrl| !running.dialled.contains(url);
+        let new: Vec<_> = of_tokens.iter().filter(is_new).cloned().collect();
+        let mut seed = [0; 32];
+        if new.is_empty() || OsRng.try_fill_bytes(&mut seed).is_err() {
+            return Vec::new();
+        }
+        let mut rng = ChaCha20Rng::from_seed(seed);
+        let tasks = finding::start(&[], &new, &self.holder, &self.board, None, &mut rng);
+        self.dialling.lock().unwrap_or_else(PoisonError::into_inner).extend(tasks);
+        running.dialled.extend(new.iter().cloned());
+        new
+    }
+
+    /// Returns the tasks that dial the routers of later tokens.
+    pub(crate) fn take_dialling(&self) -> Vec<JoinHandle<()>> {
+        std::mem::take(&mut self.dialling.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Carries out `config`.
@@ -162,12 +212,15 @@ impl Reloader {
         let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
         let Prepared { rules, anchors, message_keys, gateway } =
             prepared.map_err(|error| error.to_string())?;
+        self.join(running, config.ros.as_ref()).await?;
         running.suites.extend(message_keys.keys().copied());
         let mut report = ReloadReport {
             changed: changes(&running.rules, &rules),
             needs_restart: needs_restart(running, &config, &rules),
             warnings: rules.warnings.clone(),
         };
+        let dialled = self.dial(running, &rules.routers);
+        report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
         // Before the control task looks at the links that are up.
         self.credentials.set_admitted(rules.partners.admitted.clone());
         let (reply, done) = oneshot::channel();
@@ -376,8 +429,9 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
     .filter(|(is_changed, _)| *is_changed)
     .map(|(_, what)| format!("{what} changed, which needs a restart"))
     .collect();
-    if running.rules.routers != rules.routers {
-        lines.push("tokens name other routers, which needs a restart".to_owned());
+    let is_wanted = |url: &&RouterUrl| rules.routers.contains(url) || config.routers.contains(url);
+    if let Some(url) = running.dialled.iter().find(|url| !is_wanted(url)) {
+        lines.push(format!("{url} is of a token that is not used any more, and is dialled until a restart"));
     }
     lines
 }

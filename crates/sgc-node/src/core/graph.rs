@@ -53,7 +53,7 @@ impl<N: RosNetwork> Core<N> {
         let mut graph = Graph {
             node: self.identity.node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            has_ros: self.network.is_some(),
+            has_ros: self.network.get().is_some(),
             drops: self.all_drops(),
             refused: self.all_refused(),
             alerts: self.alerts(),
@@ -306,7 +306,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Makes a reader on the local network that matches every publisher there is.
     fn tap_local(&mut self, topic: String, reply: oneshot::Sender<Result<Tap, TapError>>) {
-        let (Some(routes), Some(network)) = (&self.routes, self.network.clone()) else { return };
+        let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else { return };
         let writers: Vec<_> = routes
             .local_endpoints()
             .filter(|e| e.kind == EndpointKind::Writer && ros_topic(&e.topic) == Some(topic.as_str()))

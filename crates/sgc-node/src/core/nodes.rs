@@ -129,7 +129,7 @@ fn own_node(node: &str) -> Option<RosNode> {
 impl<N: RosNetwork> Core<N> {
     /// Has the local graph show what changed, on a thread where that may block.
     pub(super) fn show_graph(&mut self) {
-        let Some(network) = self.network.clone() else { return };
+        let Some(network) = self.network.get() else { return };
         let Some(nodes) = self.graph.changed() else { return };
         let (wanted, showing) = (self.graph.wanted.clone(), self.graph.showing.clone());
         let is_under_way = lock(&wanted).replace(nodes).is_some();

@@ -214,7 +214,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
-        let (Some(network), Some(share)) = (self.network.clone(), self.shares.get(&name).cloned()) else {
+        let (Some(network), Some(share)) = (self.network.get(), self.shares.get(&name).cloned()) else {
             return;
         };
         let Some(events) = self.events.upgrade() else { return };
@@ -238,7 +238,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
-        let Some(network) = self.network.clone() else { return };
+        let Some(network) = self.network.get() else { return };
         let Some(events) = self.events.upgrade() else { return };
         self.writers.insert((name, source), spec.clone());
         let alive = self.alive.clone();

@@ -178,7 +178,7 @@ impl<N: RosNetwork> Core<N> {
         spec: ServiceSpec,
         make: impl FnOnce(&N, &ServiceSpec) -> Result<ServiceEnd, sgc_ros::RosError> + Send + 'static,
     ) {
-        let (Some(network), Some(events)) = (self.network.clone(), self.events.upgrade()) else { return };
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         self.service_ends.insert(name, spec.clone());
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         tokio::task::spawn_blocking(move || {

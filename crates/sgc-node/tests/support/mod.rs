@@ -13,7 +13,7 @@ use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
 use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
-use sgc_node::{ConfigSource, RunOptions, run_on};
+use sgc_node::{ConfigSource, NodeError, OpenNetwork, RunOptions, run_on, run_opening};
 use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_transport::{ListenAddr, Scheme};
@@ -43,6 +43,9 @@ pub fn identity(name: &str, router: bool) -> Arc<Identity> {
     request.router = router;
     Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
 }
+
+/// The end of a node.
+type Stopped = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// A node in a runtime of its own.
 pub struct Node {
@@ -90,6 +93,19 @@ impl Node {
         Self::start_with(config, identity, Some(domain), options, unused)
     }
 
+    /// Without a local network, which it joins when a reload wants one.
+    pub fn start_apart(config: Config, identity: Arc<Identity>, domain: &FakeDomain) -> Self {
+        let file = Arc::new(Mutex::new(config.clone()));
+        let read = file.clone();
+        let source: ConfigSource = Arc::new(move || Ok(read.lock().unwrap().clone()));
+        let options = RunOptions { source: Some(source), ..RunOptions::default() };
+        let domain = domain.clone();
+        let open: OpenNetwork<FakeRos> = Arc::new(move |_| Ok((Arc::new(domain.join(true)), None)));
+        Self::start_by(config, options, file, |config, options, stopped| {
+            run_opening(config, identity, open, options, stopped)
+        })
+    }
+
     fn start_with(
         config: Config,
         identity: Arc<Identity>,
@@ -97,20 +113,35 @@ impl Node {
         options: RunOptions,
         file: Arc<Mutex<Config>>,
     ) -> Self {
+        let network = domain.map(|d| Arc::new(d.join(true)));
+        Self::start_by(config, options, file, |config, options, stopped| {
+            run_on::<FakeRos>(config, identity, network, options, stopped)
+        })
+    }
+
+    fn start_by<F>(
+        config: Config,
+        options: RunOptions,
+        file: Arc<Mutex<Config>>,
+        run: impl FnOnce(Config, RunOptions, Stopped) -> F,
+    ) -> Self
+    where
+        F: Future<Output = Result<(), NodeError>> + Send + 'static,
+    {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let (stop, stopped) = oneshot::channel::<()>();
         let (ready, is_ready) = oneshot::channel();
         let (done, ended) = channel();
-        let network = domain.map(|d| Arc::new(d.join(true)));
         let socket = config.admin_socket.clone().unwrap();
         let types = Arc::new(TypeStore::default());
         let options = RunOptions { ready: Some(ready), types: Some(types.clone()), ..options };
+        let stopped: Stopped = Box::pin(async move {
+            let _ = stopped.await;
+        });
+        let running = run(config, options, stopped);
         runtime.spawn(async move {
-            let stopped = async {
-                let _ = stopped.await;
-            };
-            run_on::<FakeRos>(config, identity, network, options, stopped).await.unwrap();
+            running.await.unwrap();
             let _ = done.send(());
         });
         let listening = runtime.block_on(is_ready).unwrap();
