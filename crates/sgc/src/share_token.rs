@@ -2,6 +2,7 @@
 //!
 //! It writes to the state directory, where the node finds it, and asks a running node to look there.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -15,6 +16,7 @@ use sgc_wire::{NodeId, UnixMillis};
 
 use crate::error::CliError;
 use crate::fleet::unix_now;
+use crate::topic::NodeArgs;
 use crate::{files, output, policy, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
@@ -32,7 +34,7 @@ pub(crate) struct ShareTokenArgs {
     /// The topic, which the configuration has to share
     #[arg(long, value_name = "/TOPIC", group = "what", requires = "to")]
     topic: Option<String>,
-    /// Its type, if the configuration does not say it
+    /// Its type, if the configuration does not say it and no node runs that knows it
     #[arg(long = "type", value_name = "TYPE", requires = "topic")]
     type_name: Option<String>,
     /// For whom: the partner's CA certificate, PEM; with :NODE-ID behind it, that node alone
@@ -78,7 +80,8 @@ fn give(
     state: &Path,
 ) -> Result<(), CliError> {
     let cannot = |reason: String| CliError::Cannot { reason };
-    let share = share(args, topic, config)?;
+    let seen = seen_types(config, identity.node_name().as_str(), topic);
+    let share = share(args, topic, config, seen.as_ref())?;
     let Some(secret) = naming_secret(identity) else {
         return Err(CliError::RouterCannotName { path: config.identity.clone() });
     };
@@ -103,6 +106,10 @@ fn give(
         expires: UnixMillis(now.0.saturating_add(valid)),
     };
     token.check()?;
+    let type_name = share.type_name.clone().unwrap_or_default();
+    if seen.is_some_and(|seen| !seen.is_empty() && !seen.contains(&type_name)) {
+        output::diagnostic(&format!("Programs here have {topic} as another type than {type_name}."));
+    }
     let record = TokenRecord {
         id: 0,
         topic: share.topic.clone(),
@@ -117,7 +124,7 @@ fn give(
     // On the disk before it is printed: a token that the owner does not know of is of no use.
     let id = TokenRecords::change(state, |records| records.add(record, now))?;
     output::diagnostic(&format!(
-        "Token {id} for {topic}, until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
+        "Token {id} for {topic} [{type_name}], until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
          There: sgc use -, which reads it from standard input. To take it back: sgc share-token --withdraw {id}",
         token.expires
     ));
@@ -130,8 +137,23 @@ fn give(
     told
 }
 
+/// The types that programs on the local network have for a topic, as the running node sees them; `None` if none runs.
+pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
+    let socket = sgc_node::admin_socket_path(config, node);
+    // Without its answer the type is asked of the user.
+    let graph = NodeArgs::at(&socket).graph(None).ok()?;
+    let shared = graph.shares.iter().flat_map(|share| &share.routes).filter(|route| route.topic == topic);
+    let seen = graph.endpoints.iter().filter(|end| end.is_ros_topic && end.topic == topic);
+    Some(shared.map(|route| &route.type_name).chain(seen.map(|end| &end.type_name)).cloned().collect())
+}
+
 /// The share as the token is for it: with a type.
-fn share(args: &ShareTokenArgs, topic: &str, config: &Config) -> Result<ShareConfig, CliError> {
+fn share(
+    args: &ShareTokenArgs,
+    topic: &str,
+    config: &Config,
+    seen: Option<&BTreeSet<String>>,
+) -> Result<ShareConfig, CliError> {
     let cannot = |reason: String| CliError::Cannot { reason };
     let named = |share: &&ShareConfig| share.topic == topic;
     let Some(share) = config.shares.iter().filter(named).min_by_key(|share| share.interface) else {
@@ -155,9 +177,22 @@ fn share(args: &ShareTokenArgs, topic: &str, config: &Config) -> Result<ShareCon
             return Err(cannot(reason));
         }
         (None, None) => {
+            let why = match seen.map(|seen| seen.iter().collect::<Vec<_>>()) {
+                Some(types) if types.len() == 1 => {
+                    share.type_name = types.first().map(ToString::to_string);
+                    return Ok(share);
+                }
+                Some(types) if types.is_empty() => {
+                    "no program on the network of the node that runs has it".to_owned()
+                }
+                Some(types) => {
+                    let all = types.iter().map(|one| one.as_str()).collect::<Vec<_>>().join(" and ");
+                    format!("programs here have it as {all}")
+                }
+                None => "no node runs that could know it".to_owned(),
+            };
             let reason = format!(
-                "the type of {topic} is part of its name and is not known here: add --type PACKAGE/msg/NAME, or `type` to \
-                 the [[share]]"
+                "the type of {topic} is part of its name, and {why}: add --type PACKAGE/msg/NAME, or `type` to the [[share]]"
             );
             return Err(cannot(reason));
         }

@@ -13,7 +13,7 @@ use zeroize::Zeroizing;
 
 use crate::error::CliError;
 use crate::fleet::unix_now;
-use crate::{files, output, policy, reload, run};
+use crate::{files, output, policy, reload, run, share_token};
 
 const TOKENS_DIR: &str = "tokens";
 
@@ -70,6 +70,13 @@ pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     if args.dry_run {
         output::line(format!("would write {} and add to {}:", file.display(), path.display()))?;
         return output::line(block.trim());
+    }
+    let (topic, type_name) = (&token.metadata.ros_name, &token.metadata.type_name);
+    let seen = share_token::seen_types(&config, node, topic).unwrap_or_default();
+    if let Some(other) = seen.iter().find(|seen| *seen != type_name) {
+        output::diagnostic(&format!(
+            "Programs here have {topic} as {other}: those get nothing of {type_name}."
+        ));
     }
     sgc_node::create_state_dir(&state)?;
     sgc_node::create_state_dir(&state.join(TOKENS_DIR))?;

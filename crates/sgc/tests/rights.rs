@@ -493,11 +493,11 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     let place = Place::new();
     let give = ["share-token", "-c", "arm-1.toml", "--topic", "/handoff/pose", "--to", "acme-ca.pem"];
     let said = place.bad(2, &give);
-    assert!(said.contains("add --type PACKAGE/msg/NAME"), "{said}");
+    assert!(said.contains("no node runs that could know it: add --type PACKAGE/msg/NAME"), "{said}");
     let ran = place.run(&[&give[..], &["--type", POSE, "--valid", "12h"]].concat());
     assert_eq!(ran.code, Some(0), "{}", ran.stderr);
     assert!(
-        ran.stderr.contains("Token 1 for /handoff/pose") && ran.stderr.contains("next start"),
+        ran.stderr.contains("Token 1 for /handoff/pose [geometry_msgs") && ran.stderr.contains("next start"),
         "{}",
         ran.stderr
     );
@@ -682,6 +682,22 @@ fn a_token_is_used_by_adding_three_lines() {
     place.write("cart.toml", &before);
     let said = place.good(&["reload", "--socket", "cart.sock"]);
     assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
+    node.end();
+    // A node that began without a rule takes one all the same, and dials the router that the token names.
+    let another = ["--router", "quic://127.0.0.1:10"];
+    place.write("pose.token", place.good(&[&args[..], &another].concat()).trim());
+    let node = place.start("cart.toml");
+    let said = place.good(&["use", "pose.token", "-c", "cart.toml"]);
+    assert!(said.contains("/handoff/pose of arm-1 is used (by token)"), "{said}");
+    assert!(said.contains("quic://127.0.0.1:10 is dialled, which a token names"), "{said}");
+    assert!(!said.contains("restart"), "{said}");
+    let status: Value =
+        serde_json::from_str(&place.good(&["status", "--socket", "cart.sock", "--json"])).unwrap();
+    assert_eq!(status["routes"][0]["topic"], "/handoff/pose");
+    assert!(status["routers"].to_string().contains("quic://127.0.0.1:10"), "{status}");
+    place.write("cart.toml", &before);
+    let said = place.good(&["reload", "--socket", "cart.sock"]);
+    assert!(said.contains("is dialled until a restart"), "{said}");
     node.end();
 }
 
