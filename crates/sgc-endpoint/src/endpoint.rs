@@ -175,6 +175,11 @@ pub enum Event {
         /// By whom and why.
         by: RefusedBy,
     },
+    /// A member asked to follow what this node shares. The event repeats with each request of that member.
+    Followed {
+        /// The member.
+        peer: Box<sgc_trust::VerifiedPeer>,
+    },
     /// A request to join a share was refused.
     SinkRefused {
         /// The share.

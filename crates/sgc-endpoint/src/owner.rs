@@ -675,6 +675,7 @@ impl Endpoint {
                 }
             }
         }
+        self.event(Event::Followed { peer: Box::new(asked.peer.clone()) });
         let serial = self.shares.followers.get(&(name, sink)).map_or(0, |f| f.serial);
         self.shares.followers.insert((name, sink), GrantedSink { serial, ..asked });
         self.tell_follower(name, sink);

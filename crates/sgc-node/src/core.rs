@@ -27,11 +27,11 @@ use sgc_ros::{
 };
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
-use sgc_trust::{CrlError, Identity, NodeName, TrustAnchors};
+use sgc_trust::{CrlError, Identity, NodeName, TrustAnchors, VerifiedPeer};
 use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Name, NodeId, Now, Operation, OperationAnswer, SourceId, UnixMillis};
 use tokio::sync::{Notify, mpsc, oneshot, watch};
-use tracing::debug;
+use tracing::{debug, warn};
 
 use crate::alerts::{Alerts, clock_alert};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
@@ -48,6 +48,7 @@ use crate::gateway::Gateway;
 use crate::graph::Graph;
 use crate::heart::{Heart, Patience};
 use crate::links::ControlTx;
+use crate::members::{MemberNames, Members};
 use crate::message_keys::MessageKeys;
 use crate::network_slot::NetworkSlot;
 use crate::operations::{OperationError, Operations};
@@ -161,6 +162,8 @@ pub(crate) enum CoreEvent {
         anchors: Option<TrustAnchors>,
         /// Keys for suites that were not in use.
         message_keys: MessageKeys,
+        /// The names of members in these rules.
+        member_names: MemberNames,
         /// Told when it is done.
         reply: oneshot::Sender<()>,
     },
@@ -296,6 +299,7 @@ pub(crate) struct Core<N: RosNetwork> {
     /// Who looks at the local network.
     local_taps: Vec<Arc<TapQueue>>,
     types: Types,
+    members: Members,
 }
 
 /// What a [`Core`] is made of.
@@ -342,6 +346,8 @@ pub(crate) struct CoreParts<N> {
     pub types: Arc<TypeStore>,
     /// Where definitions of them are.
     pub definitions: Definitions,
+    /// The names of members in rules.
+    pub(crate) member_names: MemberNames,
 }
 
 /// The present, by both clocks.
@@ -355,6 +361,7 @@ impl<N: RosNetwork> Core<N> {
     pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
         let (requests, requested) = mpsc::channel(INBOX_MAX);
         let graph = LocalGraph::new(parts.identity.node_name().as_str());
+        let members = Members::new(parts.member_names, &parts.identity);
         let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
         let core = Self {
             identity: parts.identity,
@@ -406,6 +413,7 @@ impl<N: RosNetwork> Core<N> {
             board: parts.board,
             refused: BTreeMap::new(),
             types: Types::new(parts.types, parts.definitions),
+            members,
             local_taps: Vec::new(),
         };
         (core, requested)
@@ -462,6 +470,7 @@ impl<N: RosNetwork> Core<N> {
                 let cost = set.map(|ms| ms.saturating_mul(1000));
                 let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
                 let remote = link.remote();
+                self.hear_of(link.peer());
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
                 let (flows, heart) = (HashMap::new(), self.heart_of(&link));
@@ -537,8 +546,9 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
             CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
             CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
-            CoreEvent::Reload { shares, uses, anchors, message_keys, reply } => {
+            CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply } => {
                 self.add_message_keys(message_keys);
+                self.members.set_names(member_names, &self.identity);
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());
                 self.answer_renewals();
@@ -677,6 +687,15 @@ impl<N: RosNetwork> Core<N> {
         }
         self.close_not_admitted();
         self.want_all_lanes();
+    }
+
+    /// Hears of a member, and says which names were misspelt that are meant for it.
+    fn hear_of(&mut self, peer: &VerifiedPeer) {
+        for (written, meant) in self.members.heard(peer, &self.identity) {
+            warn!(
+                "a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
+            );
+        }
     }
 
     /// Stops taking in; what is queued still leaves.

@@ -274,8 +274,20 @@ pub struct Share {
     pub to: [usize; 3],
     /// Likewise.
     pub publish: [usize; 3],
+    /// Nodes and groups among them of which no member was heard since the node started.
+    pub unheard: Vec<UnheardMember>,
     /// What runs of it.
     pub routes: Vec<ShareRoute>,
+}
+
+/// A node or a group that a rule names and of which no member was heard.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct UnheardMember {
+    /// Its name as the rule has it, behind `group:` if it is a group.
+    pub name: String,
+    /// The name of a member that was heard of, if that is nearly the same.
+    pub meant: Option<String>,
 }
 
 /// A shared interface.

@@ -33,6 +33,7 @@ mod hold;
 mod labels;
 mod lanes;
 mod links;
+mod members;
 mod message_keys;
 mod network_slot;
 mod node;
@@ -66,8 +67,10 @@ pub use admin::{SocketError, default_socket_path};
 pub use finding::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use gateway::{GatewayStartError, OpenLocalRos};
+pub use members::{UnknownMember, unknown_members};
 pub use node::{
-    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on, run_opening,
+    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on,
+    run_opening,
 };
 pub use operations::OperationError;
 pub use operators::{roster_head, roster_row};

@@ -455,6 +455,7 @@ async fn run_with<N: RosNetwork>(
     let (core, requested) = Core::new(CoreParts {
         types,
         definitions,
+        member_names: rules.members.clone(),
         board: board.clone(),
         patience,
         message_keys,

@@ -225,7 +225,8 @@ impl Reloader {
         self.credentials.set_admitted(rules.partners.admitted.clone());
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
-        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, reply };
+        let member_names = rules.members.clone();
+        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())?;

@@ -12,6 +12,8 @@ use sgc_wire::{Kind, NodeId, UnixMillis};
 
 use crate::audit::PeerNames;
 use crate::config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
+use crate::fleet_file::read_fleet;
+use crate::members::{MemberNames, unknown_members};
 use crate::partners::{PartnerError, Partners};
 use crate::{policy, state};
 
@@ -27,6 +29,7 @@ pub(crate) struct Rules {
     /// Routers of tokens that the configuration does not name.
     pub(crate) routers: Vec<RouterUrl>,
     pub(crate) names: PeerNames,
+    pub(crate) members: MemberNames,
     /// What is wrong and stops nothing.
     pub(crate) warnings: Vec<String>,
 }
@@ -57,6 +60,13 @@ impl Rules {
         let of_fleet = config.uses.iter().flat_map(|u| use_rules(u, identity));
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
+        rules.members = MemberNames::of(config, identity);
+        if let Some(authority) = &config.authority
+            && let Ok(fleet) = read_fleet(&authority.fleet)
+        {
+            // The authority says by itself where its file is of no use.
+            rules.warnings.extend(unknown_members(config, &fleet).iter().map(ToString::to_string));
+        }
         for grant in &rules.partners.tokens {
             let is_shared = |s: &crate::config::ShareConfig| {
                 (s.interface, &s.topic) == (Interface::Topic, &grant.topic)

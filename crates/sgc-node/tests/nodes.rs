@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_node::Status;
+use sgc_node::admin::AdminRequest;
+use sgc_node::config::{Recipient, RosConfig};
 use sgc_ros::{EndpointKind, Shaping};
 use sgc_trust::Suite;
 use sgc_wire::{History, Qos};
@@ -427,4 +429,44 @@ fn nothing_that_crosses_the_wire_tells_payload_topic_type_or_node() {
         assert!(!found, "{needle:?} is readable on the wire");
     }
     drop(cloud);
+}
+
+#[test]
+fn node_without_rules_joins_the_local_network_at_the_first_that_comes() {
+    let trio = Trio::new();
+    let _cloud = trio.cloud();
+    let robot = Node::start_apart(trio.config(), identity("robot", false), &trio.robot_net);
+    let desk = Node::start_apart(trio.config(), identity("desk", false), &trio.desk_net);
+    let talker = Talker::new(&trio.robot_net, "/chatter", latched());
+    let listener = Listener::new(&trio.desk_net, "/chatter", latched());
+    talker.say("1");
+    let graph = |node: &Node| node.ask(&AdminRequest::Graph(None))["ok"].clone();
+    assert_eq!((&graph(&robot)["has_ros"], &graph(&desk)["has_ros"]), (&false.into(), &false.into()));
+    let ros = || Some(RosConfig::default());
+    robot.reload(|config| (config.ros, config.shares) = (ros(), vec![shared_topic("/chatter")]));
+    let report = desk.reload(|config| (config.ros, config.uses) = (ros(), vec![used_topic("/chatter")]));
+    assert_eq!(report["needs_restart"], serde_json::json!([]));
+    listener.hears("1");
+    assert_eq!(graph(&desk)["has_ros"], true);
+    // Rules go and come as in any node.
+    desk.reload(|config| config.uses.clear());
+    desk.reload(|config| config.uses = vec![used_topic("/chatter")]);
+    talker.say("2");
+    listener.hears("2");
+    [robot, desk].into_iter().for_each(Node::stop);
+}
+
+#[test]
+fn owner_says_which_name_of_a_member_is_misspelt() {
+    let trio = Trio::new();
+    let _cloud = trio.cloud();
+    let robot = trio.robot(&["/chatter"], "deks");
+    let _talker = Talker::new(&trio.robot_net, "/chatter", latched());
+    let unheard = || robot.ask(&AdminRequest::Graph(None))["ok"]["shares"][0]["unheard"].clone();
+    assert_eq!(unheard(), serde_json::json!([{"name": "deks", "meant": null}]));
+    let _desk = trio.desk(&["/chatter"]);
+    wait("the desk is heard of", || unheard() == serde_json::json!([{"name": "deks", "meant": "desk"}]));
+    assert!(robot.status()["problems"].to_string().contains("\\\"desk\\\" is here and may be meant"));
+    robot.reload(|config| config.shares[0].to = vec![Recipient::Node("desk".parse().unwrap())]);
+    assert_eq!(unheard(), serde_json::json!([]));
 }

@@ -1,12 +1,13 @@
 //! `sgc check`: everything that is wrong with a configuration, or what a node with it would do.
 //!
-//! It looks at the configuration and the identity that it names and binds nothing. Whether routers and nodes of
-//! these names exist is not known here.
+//! It looks at the configuration and the identity that it names and binds nothing. Whether routers of these names exist is
+//! not known here; nodes and groups are, where the fleet's file is at hand.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use sgc_gateway::Anonymous;
+use sgc_node::UnknownMember;
 use sgc_node::alerts::clock_alert;
 use sgc_node::config::{
     self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
@@ -18,8 +19,8 @@ use sgc_types::Definitions;
 use sgc_wire::PayloadForm;
 
 use crate::error::CliError;
-use crate::fleet::unix_now;
-use crate::{name, output, run};
+use crate::fleet::{FLEET_EXTENSION, unix_now};
+use crate::{files, name, output, run};
 
 /// Say everything that is wrong with a configuration, or what a node with it would do. Binds nothing.
 ///
@@ -40,13 +41,13 @@ pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
     let identity = sgc_node::check_identity(&config)
         .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
     output::line(format!("{what}: no mistakes"))?;
-    for line in output::columns(&summary(&config, &identity)?) {
+    for line in output::columns(&summary(&config, &identity, &args.config)?) {
         output::line(line)?;
     }
     Ok(())
 }
 
-fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, CliError> {
+fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<String>>, CliError> {
     let mut rows = Vec::new();
     let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
     row("node", format!("{} of fleet {}", identity.node_name(), identity.fleet_name()));
@@ -151,11 +152,27 @@ fn summary(config: &Config, identity: &Identity) -> Result<Vec<Vec<String>>, Cli
             rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);
         }
     }
+    for unknown in unknown_members(config, identity, file) {
+        rows.push(vec!["warning".to_owned(), unknown.to_string()]);
+    }
     let state = sgc_node::state_dir(config, identity.node_name().as_str());
     if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {
         rows.push(vec!["warning".to_owned(), format!("{error}; the node does not start like that")]);
     }
     Ok(rows)
+}
+
+/// The members that rules name and that the fleet's file does not have, where that file is at hand: the authority's, or one
+/// in this directory, beside the configuration or beside the identity.
+fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<UnknownMember> {
+    let own = identity.as_peer().ca;
+    let dirs = [Some(Path::new("")), file.parent(), config.identity.parent()].into_iter().flatten();
+    let dirs = dirs.map(|dir| if dir == Path::new("") { Path::new(".") } else { dir });
+    let found = dirs.flat_map(|dir| files::with_extension(dir, FLEET_EXTENSION).unwrap_or_default());
+    let authority = config.authority.as_ref().map(|authority| authority.fleet.clone());
+    let fleets = authority.into_iter().chain(found).filter_map(|path| sgc_node::read_fleet(&path).ok());
+    let fleet = fleets.into_iter().find(|fleet| fleet.anchors().fingerprints().any(|ca| ca == own));
+    fleet.map_or_else(Vec::new, |fleet| sgc_node::unknown_members(config, &fleet))
 }
 
 /// Where programs without ROS connect, who they may be, and what of it an operator should know.

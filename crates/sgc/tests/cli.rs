@@ -282,9 +282,23 @@ fn a_good_configuration_is_summed_up() {
          shares    /camera/image [sensor_msgs/msg/Image] with desk, group:operators\n          \
          named {name}\
          shares    /tf with everyone in the fleet\n\
-         uses      /cmd_vel from desk\n"
+         uses      /cmd_vel from desk\n\
+         warning   `to` of /camera/image names \"group:operators\", and no node of the fleet is in that group\n"
     );
     assert_eq!(place.good(&["check", "-c", "node.toml"]), expected);
+    // A name that nobody has is nothing that the configuration alone could show.
+    let text = place.read("node.toml");
+    place.write("node.toml", &text.replace("\"desk\"", "\"deks\"").replace("operators", "arms"));
+    let said = place.good(&["check", "-c", "node.toml"]);
+    for key in ["`to` of /camera/image", "`from` of /cmd_vel"] {
+        let warning = format!(
+            "warning   {key} names \"deks\", and the fleet has no node of that name; did you mean \"desk\"?\n"
+        );
+        assert!(said.contains(&warning), "{said}");
+    }
+    assert_eq!(said.matches("warning").count(), 2, "{said}");
+    fs::remove_file(place.path().join("lab.fleet")).unwrap();
+    assert!(!place.good(&["check", "-c", "node.toml"]).contains("warning"), "nobody can say");
 }
 
 #[test]

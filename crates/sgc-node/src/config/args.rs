@@ -80,11 +80,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
             }
         };
         let named = named(topic, |(_, share, _)| share);
-        shares.push(ShareDraft {
-            topic: named.map_err(&mut record).ok(),
-            to,
-            ..ShareDraft::default()
-        });
+        shares.push(ShareDraft { topic: named.map_err(&mut record).ok(), to, ..ShareDraft::default() });
     }
     if !args.to.is_empty() && !to_taken {
         record(Mistake::ToWithoutShare);

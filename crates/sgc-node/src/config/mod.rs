@@ -50,6 +50,7 @@ pub use resolve::{
 pub use ros_env::{DOMAIN_ID_MAX, STATIC_PEERS_MAX};
 pub use router_url::{RouterUrl, RouterUrlError, SRV_SERVICE, SrvDomain, WAYS_MAX};
 pub use schema::Table;
+pub(crate) use schema::nearest;
 pub use sgc_ros::TOPIC_BYTES_MAX;
 
 /// The largest file that is read as a configuration: 1024 shares with all their metadata fit.

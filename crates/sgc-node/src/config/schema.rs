@@ -199,7 +199,7 @@ impl Table {
 
 /// The candidate that `word` was most likely meant to be: at most one edit in three characters away, or with the
 /// word as a part of it. Upper and lower case are alike.
-pub(super) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
+pub(crate) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
     const PART_CHARS_MIN: usize = 4;
     let word = word.to_lowercase();
     let chars = word.chars().count();

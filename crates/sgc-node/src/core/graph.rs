@@ -10,14 +10,14 @@ use sgc_ros::{
     dds_type, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_transport::Link as _;
-use sgc_trust::Grantees;
+use sgc_trust::{Grantees, Policy};
 use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm};
 use tokio::sync::oneshot;
 
 use super::Core;
 use crate::graph::{
-    Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side, Use,
-    UseRoute,
+    Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
+    UnheardMember, Use, UseRoute,
 };
 use crate::tap::{Tap, TapError, TapQueue, TapWish, Tapped, Taps};
 
@@ -111,6 +111,7 @@ impl<N: RosNetwork> Core<N> {
                 // Who may call a service publishes under its name; to its users that is no publishing.
                 to: count(if is_service { &view.policy.publish } else { &view.policy.subscribe }),
                 publish: if is_service { [0; 3] } else { count(&view.policy.publish) },
+                unheard: self.unheard(view.policy),
                 routes: Vec::new(),
             };
             for route in view.routes {
@@ -205,6 +206,17 @@ impl<N: RosNetwork> Core<N> {
         graph.offers = routes.offers().map(offer).collect();
     }
 
+    /// The members that a policy names and that were not heard of.
+    fn unheard(&self, policy: &Policy) -> Vec<UnheardMember> {
+        let mut all = self.members.unheard(&policy.subscribe);
+        for name in self.members.unheard(&policy.publish) {
+            if !all.contains(&name) {
+                all.push(name);
+            }
+        }
+        all.into_iter().map(|name| UnheardMember { name: name.written, meant: name.meant }).collect()
+    }
+
     /// Whether messages of an interface would be JSON, or come as JSON, and what they look like is not known here.
     fn lacks_definition(&self, name: &Name, form: PayloadForm) -> bool {
         let writes = form == PayloadForm::Json && self.shares.get(name).is_some_and(|s| s.lacks_definition());
@@ -227,6 +239,9 @@ impl<N: RosNetwork> Core<N> {
                 ));
             }
         }
+        problems.extend(self.members.misspelt().map(|(written, meant)| {
+            format!("a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant")
+        }));
         problems.extend(self.types.problems(|owner| self.called(owner)));
         problems
     }

@@ -149,6 +149,7 @@ impl<N: RosNetwork> Core<N> {
                 self.need_type_of_used(name);
                 self.ask_histories(name);
             }
+            Event::Followed { peer } => self.hear_of(&peer),
             event => self.route_event(now, event),
         }
     }
@@ -214,6 +215,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::OwnGrant { .. }
             | Event::Recover(_)
             | Event::Types { .. }
+            | Event::Followed { .. }
             | Event::Granted { .. } => {}
         }
     }

@@ -24,7 +24,7 @@ use zeroize::Zeroize;
 use crate::error::CliError;
 use crate::files;
 
-const FLEET_EXTENSION: &str = "fleet";
+pub(crate) const FLEET_EXTENSION: &str = "fleet";
 const DAY: Duration = Duration::from_secs(86_400);
 
 /// Make a fleet, and identities for its nodes; renew and revoke them.

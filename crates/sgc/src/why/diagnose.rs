@@ -367,6 +367,16 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
         }
     }
     steps.push(Step::fine(format!("a [[share]] covers it, for {}", whom(share.to))));
+    let is_granted = routes.iter().any(|route| !route.granted.is_empty());
+    for step in unheard(graph, share) {
+        // A misspelt name is why nobody has it, if nobody has it.
+        let is_misspelt = step.fix.is_some();
+        if is_misspelt && !is_granted {
+            steps.push(Step { verdict: Verdict::Wrong, ..step });
+            return;
+        }
+        steps.push(step);
+    }
     if routes.is_empty() {
         steps.push(Step::wrong(
             format!(
@@ -383,6 +393,32 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
     for route in &routes {
         walk_share_route(graph, share, route, !providers.is_empty(), steps);
     }
+}
+
+/// The members that a share names and of which this node has not heard; first those that are misspelt.
+fn unheard(graph: &Graph, share: &Share) -> Vec<Step> {
+    let misspelt = share.unheard.iter().filter_map(|member| Some((&member.name, member.meant.as_ref()?)));
+    let misspelt = misspelt.map(|(name, meant)| {
+        Step::unknown(format!(
+            "the [[share]] names \"{name}\", which nobody here is called; \"{meant}\" is here"
+        ))
+        .with_fix(format!(
+            "if \"{meant}\" is meant, correct it in the file of {}, then `sgc reload`",
+            graph.node
+        ))
+    });
+    let mut steps: Vec<_> = misspelt.collect();
+    let others = share.unheard.iter().filter(|member| member.meant.is_none());
+    let others: Vec<_> = others.map(|member| format!("\"{}\"", member.name)).collect();
+    if !others.is_empty() {
+        steps.push(Step::unknown(format!(
+            "the [[share]] names {}, and no member of that name has been heard of since {} started; `sgc fleet list` shows how \
+             names are spelt",
+            others.join(", "),
+            graph.node
+        )));
+    }
+    steps
 }
 
 fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, steps: &mut Walk) {
@@ -474,7 +510,8 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
     if route.is_written {
         if !readers(graph, kind, topic, &route.type_name, None, route.matched, steps) {
             // Local publishers flow all the same; others may publish here, and need not.
-            if let Some(last) = steps.last_mut().filter(|_| provides && ends(graph, kind, topic).1.is_empty()) {
+            if let Some(last) = steps.last_mut().filter(|_| provides && ends(graph, kind, topic).1.is_empty())
+            {
                 last.verdict = Verdict::Unknown;
                 far_half(&route.granted.join(", "), topic, steps);
             }

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use, UseRoute,
+    Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, UnheardMember, Use,
+    UseRoute,
 };
 
 use sgc_wire::{RefuseReason, RejectReason};
@@ -511,7 +512,8 @@ fn patterns_beside_that_of_a_healthy_topic_are_no_fault_of_it() {
 #[test]
 fn a_named_rule_that_does_not_hold_is_a_fault_beside_a_healthy_one() {
     let mut graph = user();
-    let literal = |owner| Use { topic: "/a".into(), local_topic: "/a".into(), ..pattern(Interface::Topic, owner) };
+    let literal =
+        |owner| Use { topic: "/a".into(), local_topic: "/a".into(), ..pattern(Interface::Topic, owner) };
     graph.uses.push(literal("leg"));
     assert!(wrong(&graph, "/a").contains("leg is in reach and does not share /a with here"));
     // It is not if nobody here takes part in that direction.
@@ -537,7 +539,10 @@ fn patterns_that_cover_what_does_not_flow_are_asked_by_kind() {
     patterns(&mut graph);
     graph.offers[0].topic = "/robot/b".into();
     let said = wrong(&graph, "/a");
-    assert!(said.contains("arm is in reach and does not share /robot/a with here; did you mean /robot/b?"), "{said}");
+    assert!(
+        said.contains("arm is in reach and does not share /robot/a with here; did you mean /robot/b?"),
+        "{said}"
+    );
     // Programs that no pattern is for are the question.
     graph.endpoints = vec![end("/a", true)];
     assert!(wrong(&graph, "/a").contains("1 local publishers have it, but no rule names it"));
@@ -617,4 +622,28 @@ fn mistakes_of_operators_come_first() {
         at_router.last().map(|step| (step.verdict, step.found.clone())),
         Some((Verdict::Wrong, clock.to_string()))
     );
+}
+
+#[test]
+fn names_of_members_that_nobody_has_are_pointed_out() {
+    let named =
+        |name: &str, meant: Option<&str>| UnheardMember { name: name.into(), meant: meant.map(Into::into) };
+    let mut graph = owner();
+    graph.shares[0].unheard = vec![named("lamp", None), named("deks", Some("desk"))];
+    assert_eq!(wrong(&graph, "/a"), "", "others have it");
+    let hints: Vec<_> = diagnose::interface(&graph, "/a")
+        .into_iter()
+        .filter(|step| step.verdict == Verdict::Unknown)
+        .map(|step| step.found)
+        .collect();
+    assert_eq!(hints[0], "the [[share]] names \"deks\", which nobody here is called; \"desk\" is here");
+    assert!(
+        hints[1].starts_with("the [[share]] names \"lamp\", and no member of that name has been heard of")
+    );
+    // Where nobody has it, that is why.
+    graph.shares[0].routes[0].granted.clear();
+    assert!(wrong(&graph, "/a").contains("names \"deks\", which nobody here is called"));
+    assert!(fix(&graph).contains("if \"desk\" is meant, correct it in the file of here"));
+    graph.shares[0].unheard.pop();
+    assert_eq!(wrong(&graph, "/a"), "nobody asked for it");
 }
