@@ -6,8 +6,8 @@
 //! thread, which may block for as long as it likes: no other reader waits for that, and nothing behind it is taken out of order.
 //!
 //! A writer that keeps all waits for acknowledgements, and those for the receiving thread. So where much has gathered of a reliable
-//! topic, that thread waits for the reader's, for moments and no more than half of the time: enough for a
-//! writer that is up to twice as fast, and no other reader is kept by one whose thread does not move at all.
+//! topic, that thread waits for the reader's: while a queue is crowded, for moments and no more than half of the time; while it is half
+//! full of short samples, until there is room. Other readers lose at most half of that thread's time to one whose way is too thin.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -40,11 +40,25 @@ pub const WAITING_BYTES_MAX: usize = 64 << 20;
 /// than this thread as a burst is long.
 const RELIABLE_WAITING_MIN: usize = 16_384;
 
-/// How long the receiving thread waits for a reader's at once.
+/// How long the receiving thread waits for a reader's at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
 
-/// It does once a queue is full to this part, and until it has sunk to half of that.
+/// How long it waits until there is room in a queue that is half full of samples. Fast DDS acknowledges late, and a way may stand still for
+/// that long.
+const ROOM_WAIT_MAX: Duration = Duration::from_millis(200);
+
+/// For so long it does not wait again after it waited for room in vain: the way is too thin for what is published.
+const ROOM_WAIT_PAUSE: Duration = Duration::from_millis(200);
+
+/// The receiving thread waits from time to time once a queue is full to this part, and until it has sunk to half of that.
 const CROWDED_PART: usize = 8;
+
+/// The receiving thread takes no more than the reader's thread does while so many samples wait, of those that may: short ones that come
+/// by the thousand. Long ones of a camera are not worth that other readers wait.
+const FULL_PART: usize = 2;
+
+/// The reader's thread takes at least so many samples before the receiving thread, which waits for room, is woken.
+const ROOM_SAMPLES: usize = 16;
 
 /// After handling a sample the receiving thread handles none for as long as that took, and for no less than this: what
 /// comes so fast is better handled by the reader's thread, several at a time.
@@ -143,10 +157,19 @@ struct Queue<S> {
     /// Whether the thread sleeps.
     is_waiting: bool,
     is_stopped: bool,
-    /// Whether the receiving thread waits for this one.
-    is_held: bool,
+    /// The receiving thread waits until no more than this is there.
+    held: Option<Level>,
     /// Whether it did so in vain, and nothing was taken since.
     is_stuck: bool,
+    /// Until then it does not wait for room.
+    no_wait_before: Option<Instant>,
+}
+
+/// An amount of samples in a queue.
+#[derive(Clone, Copy, Debug)]
+struct Level {
+    samples: usize,
+    bytes: usize,
 }
 
 impl<S: Taken> Queue<S> {
@@ -158,14 +181,24 @@ impl<S: Taken> Queue<S> {
             overrun: 0,
             is_waiting: false,
             is_stopped: false,
-            is_held: false,
+            held: None,
             is_stuck: false,
+            no_wait_before: None,
         }
     }
 
-    /// True if a part of what may wait does: of so many.
+    /// A part of what may wait: of so many.
+    fn level(&self, part: usize) -> Level {
+        Level { samples: self.depth / part, bytes: WAITING_BYTES_MAX / part }
+    }
+
+    /// Returns `true` if more than this waits.
+    fn is_above(&self, level: Level) -> bool {
+        self.arrivals.len() > level.samples || self.bytes > level.bytes
+    }
+
     fn is_full_to(&self, part: usize) -> bool {
-        self.arrivals.len() > self.depth / part || self.bytes > WAITING_BYTES_MAX / part
+        self.is_above(self.level(part))
     }
 
     /// Puts a sample behind the others; the oldest give way to what there is no room for.
@@ -190,9 +223,9 @@ impl<S: Taken> Queue<S> {
     fn next(&mut self) -> (Option<Arrival<S>>, bool) {
         let next = self.pop();
         self.is_stuck = false;
-        let may_go_on = self.is_held && !self.is_full_to(2 * CROWDED_PART);
+        let may_go_on = self.held.is_some_and(|level| !self.is_above(level));
         if may_go_on {
-            self.is_held = false;
+            self.held = None;
         }
         (next, may_go_on)
     }
@@ -265,6 +298,9 @@ impl<R: Receiver> Shared<R> {
             queue = lock(&self.queue);
         }
         let Some(arrival) = arrival.filter(|_| !queue.is_stopped) else { return };
+        if self.holds_back {
+            queue = self.wait_for_room(queue);
+        }
         queue.push(arrival);
         if std::mem::take(&mut queue.is_waiting) {
             drop(queue);
@@ -275,12 +311,38 @@ impl<R: Receiver> Shared<R> {
     }
 
     /// Waits for the reader's thread for a moment, and with it the writer.
-    fn hold_back(&self, mut queue: MutexGuard<'_, Queue<R::Sample>>) {
+    fn hold_back(&self, queue: MutexGuard<'_, Queue<R::Sample>>) {
         let Some(began) = self.participant.holds().begin() else { return };
-        (queue.is_held, queue.is_stuck) = (true, true);
-        let waited = self.eased.wait_timeout_while(queue, HOLD_MAX, |q| q.is_held && !q.is_stopped);
-        waited.unwrap_or_else(PoisonError::into_inner).0.is_held = false;
+        let until = queue.level(2 * CROWDED_PART);
+        drop(self.wait_until(queue, until, HOLD_MAX));
         self.participant.holds().end(began);
+    }
+
+    /// Waits until there is room for a sample among many.
+    fn wait_for_room<'a>(&self, queue: MutexGuard<'a, Queue<R::Sample>>) -> MutexGuard<'a, Queue<R::Sample>> {
+        let full = Level { bytes: usize::MAX, ..queue.level(FULL_PART) };
+        let waits = queue.no_wait_before.is_none_or(|at| Instant::now() >= at);
+        if !queue.is_above(full) || !waits || queue.is_stopped {
+            return queue;
+        }
+        let room = Level { samples: full.samples.saturating_sub(ROOM_SAMPLES), ..full };
+        let mut queue = self.wait_until(queue, room, ROOM_WAIT_MAX);
+        queue.no_wait_before = queue.is_above(room).then(|| Instant::now() + ROOM_WAIT_PAUSE);
+        queue
+    }
+
+    /// Waits until the reader's thread has left no more than this, for so long at most.
+    fn wait_until<'a>(
+        &self,
+        mut queue: MutexGuard<'a, Queue<R::Sample>>,
+        level: Level,
+        at_most: Duration,
+    ) -> MutexGuard<'a, Queue<R::Sample>> {
+        (queue.held, queue.is_stuck) = (Some(level), true);
+        let waited = self.eased.wait_timeout_while(queue, at_most, |q| q.held.is_some() && !q.is_stopped);
+        let mut queue = waited.unwrap_or_else(PoisonError::into_inner).0;
+        queue.held = None;
+        queue
     }
 
     /// Hands over what waits, and waits for more, until it is stopped. On the reader's thread.
@@ -488,11 +550,11 @@ mod tests {
             queue.is_full_to(CROWDED_PART)
         };
         assert!((0..16).all(|_| !push(&mut queue, 1)) && push(&mut queue, 1));
-        (queue.is_held, queue.is_stuck) = (true, true);
+        (queue.held, queue.is_stuck) = (Some(queue.level(2 * CROWDED_PART)), true);
         for _ in 0..8 {
             assert!(!queue.next().1);
         }
-        assert!(queue.next().1 && !queue.is_held && !queue.is_stuck);
+        assert!(queue.next().1 && queue.held.is_none() && !queue.is_stuck);
         assert!(!queue.next().1, "it was told");
         assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
     }
