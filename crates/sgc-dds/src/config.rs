@@ -142,7 +142,8 @@ fn participant_index_max(domain: u32) -> u32 {
     ((u32::from(u16::MAX) - first) / 2).min(PARTICIPANT_INDEX_MAX)
 }
 
-/// Cyclone's configuration for a network, the user's `CYCLONEDDS_URI` appended.
+/// Cyclone's configuration for a network, the user's `CYCLONEDDS_URI` appended. Key hashes are on because Fast DDS (2.14, 3.2) learns from
+/// nothing else which endpoint is gone: without them it keeps every writer and reader that was ever deleted.
 ///
 /// The discovery ranges mean what they mean to rmw_cyclonedds from Iron on: `Off` is a domain tag that
 /// nobody else has, `LocalHost` unicast to the participants of this host, `Subnet` multicast plus peers.
@@ -224,7 +225,8 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
          <Discovery>{discovery}</Discovery>\
          <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/>\
-         <MaxSampleSize>{PAYLOAD_BYTES_MAX}B</MaxSampleSize></Internal>\
+         <MaxSampleSize>{PAYLOAD_BYTES_MAX}B</MaxSampleSize>\
+         <GenerateKeyhash>true</GenerateKeyhash></Internal>\
          </Domain></CycloneDDS>"
     );
     if let Some(uri) = config.cyclonedds_uri.as_deref().map(str::trim).filter(|u| !u.is_empty()) {
@@ -382,6 +384,7 @@ mod tests {
             assert!(xml.contains("<FragmentSize>14000B</FragmentSize>"));
             assert!(xml.contains("<MaxMessageSize>14720B</MaxMessageSize>"));
             assert!(xml.contains("<HeartbeatInterval>5 ms</HeartbeatInterval>"));
+            assert!(xml.contains("<GenerateKeyhash>true</GenerateKeyhash>"));
             assert!(xml.contains("min=\"default\" max=\"8388608B\""));
         }
     }
