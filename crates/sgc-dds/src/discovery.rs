@@ -59,6 +59,7 @@ pub(crate) fn start(
     announcer: Option<Arc<Announcer>>,
 ) -> Result<Running, String> {
     let handler: SharedHandler = Arc::new(Mutex::new(handler));
+    participant.watch(&handler);
     let graph = announcer.map(|announcer| Listener::new(Arc::clone(&handler), announcer));
     let stop = Stop::new(&participant)?;
     let endpoints = [EndpointKind::Writer, EndpointKind::Reader].map(Told::Endpoint);

@@ -20,7 +20,8 @@ use std::time::{Duration, Instant};
 
 use cyclors::{
     DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
-    dds_instance_handle_t, dds_lset_data_available, dds_sample_info_t, dds_takecdr, ddsi_serdata,
+    dds_instance_handle_t, dds_liveliness_changed_status_t, dds_lset_data_available,
+    dds_lset_liveliness_changed, dds_sample_info_t, dds_takecdr, ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
 
@@ -39,6 +40,9 @@ pub const WAITING_BYTES_MAX: usize = 64 << 20;
 /// not announce whether a publisher keeps all: if it does, it loses nothing to a reader on its own network, and is as much faster
 /// than this thread as a burst is long.
 const RELIABLE_WAITING_MIN: usize = 16_384;
+
+/// Changes of writers' liveliness that may wait for one reader's thread; the oldest give way.
+const LIVELINESS_CHANGES_MAX: usize = 1024;
 
 /// How long the receiving thread waits for a reader's at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
@@ -90,6 +94,30 @@ pub(crate) struct Arrival<S> {
     pub(crate) source_timestamp_ns: i64,
 }
 
+/// A change of a writer's liveliness.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LivelinessChange {
+    pub(crate) writer: dds_instance_handle_t,
+    pub(crate) now: WriterState,
+}
+
+/// Whether a writer lives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum WriterState {
+    Alive,
+    /// Its lease ran out.
+    Lapsed,
+    /// It is not matched any more.
+    Gone,
+}
+
+/// An entry of a queue.
+#[derive(Debug)]
+enum Next<S> {
+    Sample(Arrival<S>),
+    Liveliness(LivelinessChange),
+}
+
 /// Receives what an intake takes, one sample after the other.
 pub(crate) trait Receiver: Send + 'static {
     /// What the reader's topic is made of.
@@ -101,6 +129,11 @@ pub(crate) trait Receiver: Send + 'static {
     /// Receives a sample if that needs neither waiting nor any call of Cyclone's, or gives it back.
     fn receive_at_once(&mut self, arrival: Arrival<Self::Sample>) -> Result<(), Arrival<Self::Sample>> {
         Err(arrival)
+    }
+
+    /// Receives a change of a writer's liveliness, behind the samples that came before it.
+    fn receive_liveliness(&mut self, reader: dds_entity_t, change: LivelinessChange) {
+        let _ = (reader, change);
     }
 
     /// Nothing more is at hand.
@@ -153,6 +186,11 @@ struct Queue<S> {
     bytes: usize,
     /// Samples that may wait.
     depth: usize,
+    /// Samples that came so far, and those that waited and do not any more.
+    pushed: u64,
+    popped: u64,
+    /// Changes of liveliness, each behind so many samples.
+    changes: VecDeque<(u64, LivelinessChange)>,
     overrun: u64,
     /// Whether the thread sleeps.
     is_waiting: bool,
@@ -178,6 +216,9 @@ impl<S: Taken> Queue<S> {
             arrivals: VecDeque::new(),
             bytes: 0,
             depth,
+            pushed: 0,
+            popped: 0,
+            changes: VecDeque::new(),
             overrun: 0,
             is_waiting: false,
             is_stopped: false,
@@ -210,18 +251,37 @@ impl<S: Taken> Queue<S> {
             self.overrun += 1;
         }
         self.bytes += bytes;
+        self.pushed += 1;
         self.arrivals.push_back(arrival);
+    }
+
+    /// Puts a change of liveliness behind the samples that wait.
+    fn push_change(&mut self, change: LivelinessChange) {
+        if self.changes.len() >= LIVELINESS_CHANGES_MAX {
+            self.changes.pop_front();
+            tracing::debug!("a change of liveliness is dropped: too many wait");
+        }
+        self.changes.push_back((self.pushed, change));
+    }
+
+    fn is_empty(&self) -> bool {
+        self.arrivals.is_empty() && self.changes.is_empty()
     }
 
     fn pop(&mut self) -> Option<Arrival<S>> {
         let arrival = self.arrivals.pop_front()?;
         self.bytes -= arrival.sample.bytes();
+        self.popped += 1;
         Some(arrival)
     }
 
     /// Takes the oldest to receive it, and says whether the receiving thread may go on.
-    fn next(&mut self) -> (Option<Arrival<S>>, bool) {
-        let next = self.pop();
+    fn next(&mut self) -> (Option<Next<S>>, bool) {
+        let is_due = self.changes.front().is_some_and(|(behind, _)| *behind <= self.popped);
+        if let Some((_, change)) = is_due.then(|| self.changes.pop_front()).flatten() {
+            return (Some(Next::Liveliness(change)), false);
+        }
+        let next = self.pop().map(Next::Sample);
         self.is_stuck = false;
         let may_go_on = self.held.is_some_and(|level| !self.is_above(level));
         if may_go_on {
@@ -285,7 +345,7 @@ impl<R: Receiver> Shared<R> {
     fn arrive(&self, arrival: Arrival<R::Sample>) {
         let mut queue = lock(&self.queue);
         let mut arrival = Some(arrival);
-        if queue.arrivals.is_empty()
+        if queue.is_empty()
             && !queue.is_stopped
             && let Some(began) = self.participant.pace().begin()
             && let Ok(mut receiver) = self.receiver.try_lock()
@@ -307,6 +367,19 @@ impl<R: Receiver> Shared<R> {
             self.filled.notify_one();
         } else if self.holds_back && queue.is_full_to(CROWDED_PART) && !queue.is_stuck {
             self.hold_back(queue);
+        }
+    }
+
+    /// Queues a change of liveliness. In the listener.
+    fn change_liveliness(&self, change: LivelinessChange) {
+        let mut queue = lock(&self.queue);
+        if queue.is_stopped {
+            return;
+        }
+        queue.push_change(change);
+        if std::mem::take(&mut queue.is_waiting) {
+            drop(queue);
+            self.filled.notify_one();
         }
     }
 
@@ -361,14 +434,16 @@ impl<R: Receiver> Shared<R> {
                         receiver.overrun(overrun);
                     }
                     match next {
-                        Some(arrival) if !is_stopped => receiver.receive(reader, arrival),
-                        _ => break,
+                        _ if is_stopped => break,
+                        Some(Next::Sample(arrival)) => receiver.receive(reader, arrival),
+                        Some(Next::Liveliness(change)) => receiver.receive_liveliness(reader, change),
+                        None => break,
                     }
                 }
                 receiver.rest();
             }
             let mut queue = lock(&self.queue);
-            while queue.arrivals.is_empty() && !queue.is_stopped {
+            while queue.is_empty() && !queue.is_stopped {
                 queue.is_waiting = true;
                 queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
             }
@@ -442,6 +517,7 @@ impl<R: Receiver> Intake<R> {
         let reader = unsafe {
             let listener = dds_create_listener(arg);
             dds_lset_data_available(listener, Some(arrived::<R>));
+            dds_lset_liveliness_changed(listener, Some(liveliness_changed::<R>));
             let reader = announced::asking(spec.asks_key_hash, || {
                 dds_create_reader(parent, topic.handle(), qos.as_ptr(), listener)
             });
@@ -503,6 +579,22 @@ unsafe extern "C" fn arrived<R: Receiver>(reader: dds_entity_t, arg: *mut c_void
     IS_LISTENING.set(false);
 }
 
+/// The listener of liveliness. Cyclone calls it for each change of one writer.
+unsafe extern "C" fn liveliness_changed<R: Receiver>(
+    _: dds_entity_t,
+    status: dds_liveliness_changed_status_t,
+    arg: *mut c_void,
+) {
+    // SAFETY: what the listener was made with, which lives until the reader is deleted.
+    let shared = unsafe { &*arg.cast::<Shared<R>>() };
+    let now = match (status.alive_count_change, status.not_alive_count_change) {
+        (1.., _) => WriterState::Alive,
+        (_, 1..) => WriterState::Lapsed,
+        _ => WriterState::Gone,
+    };
+    shared.change_liveliness(LivelinessChange { writer: status.last_publication_handle, now });
+}
+
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -557,6 +649,27 @@ mod tests {
         assert!(queue.next().1 && queue.held.is_none() && !queue.is_stuck);
         assert!(!queue.next().1, "it was told");
         assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
+    }
+
+    #[test]
+    fn changes_of_liveliness_keep_their_place_among_samples_and_have_a_bound() {
+        let mut queue = Queue::new(3);
+        let change = |writer| LivelinessChange { writer, now: WriterState::Lapsed };
+        let sample = |bytes| Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 };
+        queue.push_change(change(1));
+        (0..2).for_each(|bytes| queue.push(sample(bytes)));
+        queue.push_change(change(2));
+        // The first sample gives way.
+        (2..4).for_each(|bytes| queue.push(sample(bytes)));
+        let order = std::iter::from_fn(|| match queue.next().0? {
+            Next::Sample(arrival) => Some(format!("sample {}", arrival.sample)),
+            Next::Liveliness(change) => Some(format!("change {}", change.writer)),
+        });
+        assert_eq!(order.collect::<Vec<_>>(), ["change 1", "sample 1", "change 2", "sample 2", "sample 3"]);
+        let many = LIVELINESS_CHANGES_MAX as u64 + 7;
+        (0..many).for_each(|writer| queue.push_change(change(writer)));
+        assert_eq!(queue.changes.len(), LIVELINESS_CHANGES_MAX);
+        assert!(matches!(queue.next().0, Some(Next::Liveliness(c)) if c.writer == 7));
     }
 
     #[test]

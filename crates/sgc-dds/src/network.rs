@@ -5,7 +5,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use cyclors::{
     DDS_RETCODE_PRECONDITION_NOT_MET, dds_create_domain, dds_create_participant, dds_create_publisher,
@@ -13,8 +13,8 @@ use cyclors::{
 };
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{
-    DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError, RosNetwork,
-    SampleHandler, ServiceSpec,
+    DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError,
+    RosNetwork, SampleHandler, ServiceSpec,
 };
 
 use crate::announced;
@@ -23,7 +23,7 @@ use crate::config::{
 };
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
-use crate::graph::Announcer;
+use crate::graph::{Announcer, SharedHandler, lock};
 use crate::intake::Pace;
 use crate::log;
 use crate::qos::NativeQos;
@@ -68,6 +68,8 @@ pub(crate) struct Participant {
     pace: Pace,
     holds: Pace,
     writers: AtomicUsize,
+    /// Who discovery tells, while it is under way.
+    watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
 }
 
 impl CycloneNetwork {
@@ -97,6 +99,7 @@ impl CycloneNetwork {
             pace: Pace::new(),
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
+            watcher: Mutex::default(),
         };
         // Before there are endpoints to announce.
         if !participant.complete_announcements().map_err(refused)? {
@@ -205,6 +208,19 @@ impl Participant {
     /// Writers of samples that live.
     pub(crate) fn writers(&self) -> &AtomicUsize {
         &self.writers
+    }
+
+    /// Has readers tell this handler of writers' liveliness, for as long as discovery keeps it.
+    pub(crate) fn watch(&self, handler: &SharedHandler) {
+        *lock(&self.watcher) = Arc::downgrade(handler);
+    }
+
+    /// Tells whoever watches the network. May block.
+    pub(crate) fn tell(&self, event: DiscoveryEvent) {
+        let watcher = lock(&self.watcher).upgrade();
+        if let Some(watcher) = watcher {
+            lock(&watcher)(event);
+        }
     }
 
     /// How much they wait for readers' threads.

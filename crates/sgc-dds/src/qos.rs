@@ -46,6 +46,10 @@ pub const UNACKNOWLEDGED_BYTES_IN_ALL: usize = 256 << 20;
 /// DDS to a Fast DDS subscriber that stood still meanwhile, seven were lost, and with ten none are (`sgc/tests/peers.rs`).
 const UNSAID_DEPTH: i32 = 10;
 
+/// Shortest liveliness lease of an endpoint made here, nanoseconds. Cyclone says that writers live after each four fifths of the shortest
+/// lease, so that a lease of nothing would keep a processor and the network busy.
+const LEASE_MIN_NS: i64 = 1_000_000;
+
 /// Data representations by their numbers (XTypes 1.3, 7.6.3.1.1).
 const XCDR1: i16 = DDS_DATA_REPRESENTATION_XCDR1 as i16;
 const XCDR2: i16 = DDS_DATA_REPRESENTATION_XCDR2 as i16;
@@ -114,7 +118,7 @@ impl NativeQos {
                     }
                     Liveliness::ManualByTopic => dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC,
                 },
-                duration(qos.lease_ns),
+                duration(qos.lease_ns).max(LEASE_MIN_NS),
             );
             if kind == EndpointKind::Writer {
                 dds_qset_lifespan(native.0, duration(qos.lifespan_ns));
@@ -560,6 +564,14 @@ mod tests {
         let waits = Qos { history: History::KeepAll, ..Qos::default() };
         let best_effort = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
         assert_eq!([waits, best_effort].map(|qos| Unacknowledged::of(&qos, true)), [None, None]);
+    }
+
+    #[test]
+    fn a_lease_has_a_least_length() {
+        let leased = |ns| Qos { lease_ns: Some(ns), ..Qos::default() };
+        let least = LEASE_MIN_NS as u64;
+        assert_eq!(round_trip(EndpointKind::Writer, &leased(0), true), leased(least));
+        assert_eq!(round_trip(EndpointKind::Writer, &leased(least + 1), true), leased(least + 1));
     }
 
     #[test]

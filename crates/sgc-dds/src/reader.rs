@@ -1,17 +1,21 @@
 //! [`CycloneReader`]: a raw reader, whose samples go to a handler as they were serialised.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use cyclors::{dds_entity_t, ddsi_serdata};
-use sgc_ros::{EndpointSpec, Guid, KeyHash, Sample, SampleHandler, SampleKind};
+use cyclors::{dds_entity_t, dds_instance_handle_t, ddsi_serdata};
+use sgc_ros::{DiscoveryEvent, EndpointSpec, Guid, KeyHash, Sample, SampleHandler, SampleKind};
 use sgc_wire::History;
 
-use crate::intake::{Arrival, Intake, Receiver, Taken};
+use crate::intake::{Arrival, Intake, LivelinessChange, Receiver, Taken, WriterState};
 use crate::known_writers::{KnownWriter, KnownWriters};
 use crate::network::Participant;
 use crate::payload::HEADER_BYTES;
 use crate::sample::SampleRef;
+
+/// Bound on the writers of one reader that are remembered as lapsed.
+const LAPSED_MAX: usize = 1024;
 
 /// A raw reader; dropping it ends its thread, waits for a handler that is at work, and deletes the entities.
 #[derive(Debug)]
@@ -28,6 +32,8 @@ impl CycloneReader {
             ignores_tagged: participant.ignores_tagged(),
             newest_only: spec.qos.history == History::KeepLast(1),
             writers: KnownWriters::default(),
+            lapsed: HashSet::new(),
+            participant: Arc::clone(participant),
             held: None,
             handler,
         };
@@ -75,6 +81,9 @@ struct Samples {
     /// Only the newest counts.
     newest_only: bool,
     writers: KnownWriters,
+    /// Writers whose lease ran out.
+    lapsed: HashSet<dds_instance_handle_t>,
+    participant: Arc<Participant>,
     /// Handed over when it is known whether another follows: after the look that finds the next one, or none. That the
     /// handler hears of the last one is a promise.
     held: Option<Sample>,
@@ -86,6 +95,24 @@ impl Samples {
     /// sharing it again would send it round and round.
     fn is_ignored(&self, writer: Option<KnownWriter>) -> bool {
         self.ignores_tagged && writer.is_some_and(|w| w.tagged)
+    }
+
+    /// Tells discovery of a writer's liveliness where that is news.
+    fn tell_liveliness(&mut self, reader: dds_entity_t, LivelinessChange { writer, now }: LivelinessChange) {
+        let (is_news, is_alive) = match now {
+            WriterState::Alive => (self.lapsed.remove(&writer), true),
+            WriterState::Lapsed => (self.lapsed.len() < LAPSED_MAX && self.lapsed.insert(writer), false),
+            // Discovery tells of it by itself.
+            WriterState::Gone => {
+                self.lapsed.remove(&writer);
+                return;
+            }
+        };
+        let known = if is_news { self.writers.find(reader, writer) } else { None };
+        if let Some(KnownWriter { guid, .. }) = known.filter(|w| !self.is_ignored(Some(*w))) {
+            tracing::debug!(writer = ?guid, is_alive, "the liveliness of a writer changed");
+            self.participant.tell(DiscoveryEvent::Liveliness { guid, is_alive });
+        }
     }
 }
 
@@ -102,6 +129,13 @@ impl Receiver for Samples {
         if self.is_ignored(writer) {
             return;
         }
+        if self.lapsed.contains(&arrival.writer) {
+            // Cyclone may tell of two changes in the wrong order.
+            self.tell_liveliness(
+                reader,
+                LivelinessChange { writer: arrival.writer, now: WriterState::Alive },
+            );
+        }
         let next = sample(arrival.sample, writer, arrival.source_timestamp_ns);
         if self.newest_only {
             // None is held that a handler that blocks would make old.
@@ -114,7 +148,7 @@ impl Receiver for Samples {
     fn receive_at_once(&mut self, arrival: Arrival<Content>) -> Result<(), Arrival<Content>> {
         // To ask Cyclone who wrote it takes the lock under which this is called.
         let writer = self.writers.known(arrival.writer);
-        if writer.is_none() {
+        if writer.is_none() || self.lapsed.contains(&arrival.writer) {
             return Err(arrival);
         }
         if self.is_ignored(writer) {
@@ -126,6 +160,11 @@ impl Receiver for Samples {
             sample: Content { kind, key_hash, payload },
             ..arrival
         })
+    }
+
+    fn receive_liveliness(&mut self, reader: dds_entity_t, change: LivelinessChange) {
+        self.rest();
+        self.tell_liveliness(reader, change);
     }
 
     fn rest(&mut self) {

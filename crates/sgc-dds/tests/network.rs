@@ -902,6 +902,29 @@ fn a_write_that_nobody_acknowledges_ends_with_a_timeout() {
 }
 
 #[test]
+fn discovery_tells_of_a_lapsed_writer_and_of_its_return() {
+    let (ros, sgc) = (open(159, None), open(159, Some("arm-1")));
+    let leased = with(spec("leased"), |qos| qos.lease_ns = Some(300_000_000));
+    let events = discover(&sgc);
+    let (_reader, samples) = read(&sgc, &spec("leased"));
+    let (writer, endless) = (writer(&ros, &leased, 1), writer(&ros, &spec("leased"), 1));
+    let guids = [appeared(&events).guid, appeared(&events).guid];
+    assert!(guids.contains(&writer.guid()) && guids.contains(&endless.guid()));
+    write(&writer, &string_cdr("alive"));
+    next(&samples);
+    ros.set_deaf_mute(Duration::from_millis(1000));
+    let liveliness = |is_alive| DiscoveryEvent::Liveliness { guid: writer.guid(), is_alive };
+    assert_eq!(next(&events), liveliness(false));
+    // A lapsed writer lives again once it writes.
+    eventually("a message after the silence", || {
+        write(&writer, &string_cdr("again"));
+        samples.recv_timeout(Duration::from_millis(50)).is_ok()
+    });
+    assert_eq!(next(&events), liveliness(true));
+    quiet(&events);
+}
+
+#[test]
 fn rmw_cyclonedds_on_localhost_is_found() {
     // What rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (from Iron on), and of
     // ROS_LOCALHOST_ONLY=1 (up to Humble).

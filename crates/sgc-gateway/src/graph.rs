@@ -150,6 +150,8 @@ impl GraphState {
             DiscoveryEvent::Vanished { guid } => {
                 self.endpoints.remove(&guid);
             }
+            // The graph shows endpoints for as long as they are there, as in ROS 2.
+            DiscoveryEvent::Liveliness { .. } => {}
             DiscoveryEvent::Nodes { participant, nodes } if nodes.is_empty() => {
                 self.nodes.remove(&participant);
             }

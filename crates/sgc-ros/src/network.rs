@@ -102,6 +102,13 @@ pub enum DiscoveryEvent {
         /// Which.
         guid: Guid,
     },
+    /// A writer's lease ran out, or the writer lives again. Told of writers that a reader made here is matched with.
+    Liveliness {
+        /// The writer.
+        guid: Guid,
+        /// Whether it lives.
+        is_alive: bool,
+    },
     /// All nodes that a participant has from now on; none if it is gone. Their endpoints may appear before or after.
     Nodes {
         /// The participant.

@@ -211,6 +211,8 @@ struct OwnSource {
     /// Since when the writer is gone. A volatile one's source is kept a while: for what it wrote last, and for the
     /// program that is restarted, whose subscribers then notice nothing.
     gone: Option<Instant>,
+    /// Whether the writer's liveliness lease ran out.
+    is_lapsed: bool,
 }
 
 #[derive(Debug)]
@@ -415,6 +417,7 @@ impl<R: RngCore> Routes<R> {
                     self.writer_gone(now, &endpoint);
                 }
             }
+            DiscoveryEvent::Liveliness { guid, is_alive } => self.handle_liveliness(guid, is_alive),
             DiscoveryEvent::Nodes { participant, nodes } => self.handle_nodes(participant, nodes),
         }
     }

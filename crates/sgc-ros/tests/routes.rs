@@ -14,8 +14,8 @@ use sgc_ros::{
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
-    Catalogue, CatalogueEntry, CatalogueSource, Class, Durability, History, Kind, Metadata, Name, NodeId,
-    Qos, RefuseReason, Reliability, RosNode, SinkId, SourceId,
+    Catalogue, CatalogueEntry, CatalogueSource, Class, Durability, History, Kind, Liveliness, Metadata, Name,
+    NodeId, Qos, RefuseReason, Reliability, RosNode, SinkId, SourceId,
 };
 
 const ME: NodeId = NodeId([1; 32]);
@@ -135,6 +135,12 @@ impl Bench {
 
     fn vanishes(&mut self, n: u8) -> Vec<Command> {
         self.routes.handle_discovery(self.now, DiscoveryEvent::Vanished { guid: Guid([n; 16]) });
+        self.commands()
+    }
+
+    fn told_of_liveliness(&mut self, n: u8, is_alive: bool) -> Vec<Command> {
+        let event = DiscoveryEvent::Liveliness { guid: Guid([n; 16]), is_alive };
+        self.routes.handle_discovery(self.now, event);
         self.commands()
     }
 
@@ -1208,6 +1214,62 @@ fn a_restarted_volatile_publisher_takes_its_source_over_and_a_gone_one_is_listed
     assert_eq!(b.vanishes(1), []);
     assert_eq!(published(&b.appears(writer(2, "/a", Qos::default()))).0, alone.0);
     assert!(!has(&b.passes(WRITERLESS_HOLD), |c| matches!(c, Command::Unshare { .. })));
+}
+
+fn leased(liveliness: Liveliness) -> Qos {
+    Qos { liveliness, lease_ns: Some(2_000_000_000), ..Qos::default() }
+}
+
+#[test]
+fn a_lapsed_publisher_is_listed_as_such_until_it_lives_again() {
+    let mut b = bench(&[("/a", "")], &[]);
+    let alive = published(&b.appears(writer(1, "/a", leased(Liveliness::Automatic))));
+    assert!(!alive.0[0].source.is_lapsed());
+    let lapsed = published(&b.told_of_liveliness(1, false));
+    assert!(lapsed.0.len() == 1 && lapsed.0[0].source.is_lapsed());
+    assert_eq!((lapsed.0[0].source, &lapsed.1), (alive.0[0].source.lapsed(), &alive.1), "the same source");
+    assert_eq!(b.told_of_liveliness(1, false), [], "it is known");
+    assert_eq!(published(&b.told_of_liveliness(1, true)).0, alive.0);
+    // Its end is no return.
+    b.told_of_liveliness(1, false);
+    let other = published(&b.appears(writer(2, "/a", Qos::default())));
+    assert_eq!(other.0.iter().filter(|s| s.source.is_lapsed()).count(), 1);
+    let gone = published(&b.vanishes(1));
+    assert_eq!(gone.0, other.0);
+    // A restarted program takes the source over, and lives.
+    let back = published(&b.appears(writer(3, "/a", leased(Liveliness::Automatic))));
+    assert!(back.0.len() == 2 && !back.0.iter().any(|s| s.source.is_lapsed()), "{back:?}");
+    // Messages alone renew one that is manual by topic, on the far network as on its own.
+    b.appears(writer(4, "/a", leased(Liveliness::ManualByTopic)));
+    assert_eq!(b.told_of_liveliness(4, false), []);
+    assert_eq!(b.told_of_liveliness(9, false), [], "nobody's");
+}
+
+#[test]
+fn a_lapsed_far_publisher_has_no_writer_here() {
+    let mut b = bench(&[], &[("/a", None)]);
+    let name = theirs("/a", STRING);
+    let listed = |lapsed: [bool; 2]| {
+        let mut listed = entry("/a", STRING, leased(Liveliness::Automatic), &[1, 2]);
+        for (source, lapsed) in listed.sources.iter_mut().zip(lapsed) {
+            if lapsed {
+                source.source = source.source.lapsed();
+            }
+        }
+        vec![listed]
+    };
+    b.catalogue(listed([false, false]));
+    assert_eq!(b.granted(name, None).len(), 2);
+    let close = |n: u8| Command::CloseWriter { name, source: Some(SourceId([n; 16])) };
+    assert_eq!(b.catalogue(listed([true, false])), [close(1)]);
+    assert_eq!(b.catalogue(listed([true, true])), [close(2)], "and none for all others");
+    let back = b.catalogue(listed([true, false]));
+    let source = SourceId([2; 16]);
+    assert!(
+        matches!(&back[..], [Command::OpenWriter { source: Some(s), spec, .. }]
+            if *s == source && spec.qos == leased(Liveliness::Automatic)),
+        "{back:?}"
+    );
 }
 
 #[test]

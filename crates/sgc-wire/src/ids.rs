@@ -96,6 +96,9 @@ id!(
     LaneToken, 16, "lane token"
 );
 
+/// The second half of the id that a publisher is listed under whose liveliness lease ran out.
+const LAPSED: [u8; 8] = [0xff; 8];
+
 impl SourceId {
     /// In a catalogue: all publishers that are not told apart.
     pub const OTHERS: Self = Self([0; 16]);
@@ -103,6 +106,17 @@ impl SourceId {
     /// The source, unless it stands for all others.
     pub fn told_apart(self) -> Option<Self> {
         (self != Self::OTHERS).then_some(self)
+    }
+
+    /// What a publisher is listed under whose liveliness lease ran out. Nothing is ever sent under it.
+    pub fn lapsed(mut self) -> Self {
+        self.0[8..].copy_from_slice(&LAPSED);
+        self
+    }
+
+    /// Returns `true` if the publisher's lease ran out, so that it has no writer on other networks until it lives again.
+    pub fn is_lapsed(&self) -> bool {
+        self.0[8..] == LAPSED
     }
 
     /// A source of the publisher with this tag.

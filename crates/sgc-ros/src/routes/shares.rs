@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use rand_core::RngCore;
 use sgc_trust::derive_name;
-use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Name, Qos, SinkId, SourceId};
+use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Liveliness, Name, Qos, SinkId, SourceId};
 
 use super::services::interface;
 use super::{
@@ -145,6 +145,24 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
+    /// A local writer's lease ran out, or the writer lives again. The far writer of one that is manual by topic is renewed by its
+    /// messages alone, and so expires by itself; all others live for as long as this node's.
+    pub(super) fn handle_liveliness(&mut self, guid: Guid, is_alive: bool) {
+        let is_concerned = |own: &OwnSource| {
+            own.is_lapsed == is_alive && (is_alive || own.qos.liveliness != Liveliness::ManualByTopic)
+        };
+        let mut names = Vec::new();
+        for (name, share) in &mut self.shares {
+            if let Some(own) = share.own.get_mut(&guid).filter(|own| is_concerned(own)) {
+                own.is_lapsed = !is_alive;
+                names.push(*name);
+            }
+        }
+        for name in names {
+            self.refresh_share(name);
+        }
+    }
+
     /// Brings catalogue, sources and reader of a share in line with its writers and sinks.
     pub(super) fn refresh_share(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
@@ -165,7 +183,7 @@ impl<R: RngCore> Routes<R> {
                 // Another kind of source is another source.
                 Some(own) if own.gone.is_none() && same_kind(&own.qos, &qos) => own.qos = qos,
                 _ => {
-                    share.own.remove(guid);
+                    let is_lapsed = share.own.remove(guid).is_some_and(|own| own.is_lapsed);
                     let mut new = || source_of(&self.secret, guid, &mut self.rng);
                     let found = own_source(&mut share.own, &qos, &mut new);
                     if found.is_none() {
@@ -173,7 +191,7 @@ impl<R: RngCore> Routes<R> {
                     }
                     let source = found.or_else(|| share.own.values().map(|own| own.source).max());
                     let source = source.unwrap_or_else(new);
-                    share.own.insert(*guid, OwnSource { source, qos, gone: None });
+                    share.own.insert(*guid, OwnSource { source, qos, gone: None, is_lapsed });
                 }
             }
         }
@@ -242,6 +260,8 @@ impl<R: RngCore> Routes<R> {
             let qos = weakest(all.iter().map(|(_, own)| &own.qos))?;
             let node = self.node_of(all.first()?.0);
             let is_same = all.iter().all(|(guid, _)| self.node_of(guid) == node);
+            let is_lapsed = all.iter().all(|(_, own)| own.is_lapsed);
+            let source = if is_lapsed { source.lapsed() } else { source };
             Some(CatalogueSource { source, qos, node: node.filter(|_| is_same).cloned() })
         });
         listed.collect()

@@ -279,9 +279,11 @@ impl<R: RngCore> Routes<R> {
             type_hash: entry.type_hash.clone(),
             qos: qos.clone(),
         };
+        // One whose lease ran out is missed at once by who watches its liveliness.
+        let alive = entry.sources.iter().filter(|s| !s.source.is_lapsed());
         let mut wanted: BTreeMap<Option<SourceId>, EndpointSpec> =
-            entry.sources.iter().map(|s| (s.source.told_apart(), spec(&s.qos))).collect();
-        if wanted.is_empty() || entry.sources.len() >= ENTRY_SOURCES_MAX {
+            alive.map(|s| (s.source.told_apart(), spec(&s.qos))).collect();
+        if entry.sources.is_empty() || entry.sources.len() >= ENTRY_SOURCES_MAX {
             wanted.insert(None, spec(&entry.qos));
         }
         // A publisher whose node started anew has another source. To the local network it is the one that it was.
