@@ -5,6 +5,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod bugs;
+mod events;
 mod flow;
 mod graph;
 mod hosts;

@@ -264,7 +264,8 @@ impl Lab {
         Peer::start(command)
     }
 
-    fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
+    /// A Python program of `tests/peers/ros2` in the environment of a distribution; its arguments follow.
+    pub(crate) fn ros(&self, site: Site, distribution: &str, program: &str) -> Command {
         let python = Peer::program(distribution).join("bin/python");
         let mut command = support::command(self.namespace(site), self.dir(), &python);
         command.arg("-B").arg(support::repository("tests/peers/ros2").join(program));
