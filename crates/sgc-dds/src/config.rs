@@ -68,6 +68,10 @@ pub const MESSAGE_BYTES_MAX: u32 = 14_720;
 /// Milliseconds from a write to the heartbeat that asks for acknowledgement, the same reason.
 pub const HEARTBEAT_MS: u32 = 5;
 
+/// Milliseconds after which a reader asks again for a message that it lacks, without a heartbeat. A Fast DDS writer ignores a request
+/// for a message that it is about to send, and sends its next heartbeat after three seconds, Cyclone's default here.
+pub const ASK_AGAIN_MS: u32 = 500;
+
 /// Bytes of socket receive buffer asked for; the kernel's limit is accepted silently.
 pub const RECEIVE_BUFFER_BYTES: u32 = 8 << 20;
 
@@ -224,6 +228,7 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
          <FragmentSize>{FRAGMENT_BYTES}B</FragmentSize></General>\
          <Discovery>{discovery}</Discovery>\
          <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
+         <AutoReschedNackDelay>{ASK_AGAIN_MS} ms</AutoReschedNackDelay>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/>\
          <MaxSampleSize>{PAYLOAD_BYTES_MAX}B</MaxSampleSize>\
          <GenerateKeyhash>true</GenerateKeyhash></Internal>\
@@ -385,6 +390,7 @@ mod tests {
             assert!(xml.contains("<MaxMessageSize>14720B</MaxMessageSize>"));
             assert!(xml.contains("<HeartbeatInterval>5 ms</HeartbeatInterval>"));
             assert!(xml.contains("<GenerateKeyhash>true</GenerateKeyhash>"));
+            assert!(xml.contains("<AutoReschedNackDelay>500 ms</AutoReschedNackDelay>"));
             assert!(xml.contains("min=\"default\" max=\"8388608B\""));
         }
     }

@@ -27,6 +27,7 @@ use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
 
 use crate::announced;
 use crate::entity::{Entity, reason};
+use crate::first_messages;
 use crate::network::Participant;
 use crate::qos::history_of;
 
@@ -518,6 +519,9 @@ impl<R: Receiver> Intake<R> {
             let listener = dds_create_listener(arg);
             dds_lset_data_available(listener, Some(arrived::<R>));
             dds_lset_liveliness_changed(listener, Some(liveliness_changed::<R>));
+            if spec.qos.is_reliable() {
+                first_messages::listen(listener);
+            }
             let reader = announced::asking(spec.asks_key_hash, || {
                 dds_create_reader(parent, topic.handle(), qos.as_ptr(), listener)
             });

@@ -22,6 +22,7 @@ mod announced;
 pub mod config;
 mod discovery;
 mod entity;
+mod first_messages;
 mod fragments;
 mod graph;
 pub mod identity;

@@ -23,6 +23,7 @@ use crate::config::{
 };
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
+use crate::first_messages;
 use crate::graph::{Announcer, SharedHandler, lock};
 use crate::intake::Pace;
 use crate::log;
@@ -90,6 +91,12 @@ impl CycloneNetwork {
             Entity::new(unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) })
                 .map_err(refused)?;
         let guid = entity.guid().map_err(refused)?;
+        if let Err(reason) = first_messages::install(&domain.entity, &entity) {
+            tracing::warn!(
+                reason,
+                "this Cyclone DDS is another one: first messages of Fast DDS writers may be lost"
+            );
+        }
         let participant = Participant {
             entity,
             domain: domain.entity,
