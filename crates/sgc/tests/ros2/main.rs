@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod bugs;
+mod calls;
 mod events;
 mod flow;
 mod graph;

@@ -1,0 +1,197 @@
+//! Services, actions and parameters of real ROS 2: calls made in the moment in which a server is seen, slow servers, servers that are
+//! started again. And the first messages of publishers, which meet the same fault of the transport.
+
+use serde_json::Value;
+
+use super::lab::{Lab, Site, robot_to_desk};
+use super::support::{Peer, eventually};
+use super::{PAIRS, PLAN, count};
+
+const CLIENTS: u64 = 50;
+
+const DISTRIBUTIONS: [&str; 2] = ["jazzy", "kilted"];
+
+/// How many seconds a program tries before it says what it did not get.
+const TRIES_S: &str = "20";
+
+/// How long a first call may take, seconds. A Fast DDS writer sends heartbeats every three seconds: a call that waits for one takes
+/// longer.
+const FIRST_CALL_MAX_S: f64 = 2.0;
+
+fn program(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
+    let mut command = lab.ros(site, distribution, "calls.py");
+    command.args(args).args(["--timeout", TRIES_S]);
+    Peer::start(command)
+}
+
+fn serve(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
+    let life = [&["serve"], args, &["--timeout", PLAN.peer_life]].concat();
+    let mut command = lab.ros(site, distribution, "calls.py");
+    command.args(life);
+    let mut server = Peer::start(command);
+    server.wait("a server", |event| event["event"] == "ready");
+    server
+}
+
+fn call(lab: &Lab, site: Site, distribution: &str, clients: u64, args: &[&str]) -> Peer {
+    let clients = clients.to_string();
+    program(lab, site, distribution, &[&["call", "--count", &clients], args].concat())
+}
+
+/// Asserts that every call was answered with the right value.
+fn assert_answered(summary: &Value, calls: u64, of: &str) {
+    let counts = ["asked", "answered", "wrong"].map(|key| count(summary, key));
+    assert_eq!(counts, [calls, calls, 0], "{of}: {summary}");
+}
+
+fn assert_answered_at_once(summary: &Value, calls: u64, of: &str) {
+    assert_answered(summary, calls, of);
+    assert!(summary["slowest"].as_f64().unwrap() < FIRST_CALL_MAX_S, "{of}: {summary}");
+}
+
+#[test]
+fn calls_made_when_a_service_is_first_seen_are_answered() {
+    const PARTICIPANTS: u64 = 5;
+    let lab = Lab::real(PLAN, robot_to_desk("service", ["/jazzy", "/kilted"]));
+    let both = ["--service", "/jazzy", "--service", "/kilted"];
+    let serve_at =
+        |site, [d, name]: [&str; 2]| serve(&lab, site, d, &["--node", "server", "--service", name]);
+    let _servers = [["jazzy", "/jazzy"], ["kilted", "/kilted"]].map(|server| serve_at(Site::Robot, server));
+    let mut clients = DISTRIBUTIONS.map(|d| call(&lab, Site::Desk, d, CLIENTS, &both));
+    for (distribution, client) in DISTRIBUTIONS.into_iter().zip(&mut clients) {
+        assert_answered_at_once(&client.summary(), 2 * CLIENTS, distribution);
+    }
+    // And each as the first of its participant.
+    let participants = [&both[..], &["--participants"]].concat();
+    let mut clients = DISTRIBUTIONS.map(|d| call(&lab, Site::Desk, d, PARTICIPANTS, &participants));
+    for (distribution, client) in DISTRIBUTIONS.into_iter().zip(&mut clients) {
+        assert_answered(&client.summary(), 2 * PARTICIPANTS, distribution);
+    }
+    // The same with nothing in between.
+    let _native =
+        [["jazzy", "/native_jazzy"], ["kilted", "/native_kilted"]].map(|server| serve_at(Site::Desk, server));
+    let both = ["--service", "/native_jazzy", "--service", "/native_kilted"];
+    let mut clients = DISTRIBUTIONS.map(|d| call(&lab, Site::Desk, d, CLIENTS, &both));
+    for (distribution, client) in DISTRIBUTIONS.into_iter().zip(&mut clients) {
+        assert_answered(&client.summary(), 2 * CLIENTS, &format!("{distribution}, natively"));
+    }
+}
+
+#[test]
+fn parameters_and_goals_asked_for_when_first_seen_are_answered() {
+    let mut tables = robot_to_desk("parameters", DISTRIBUTIONS.map(|d| format!("/server_{d}")));
+    let actions = robot_to_desk("action", DISTRIBUTIONS.map(|d| format!("/act_{d}")));
+    tables.iter_mut().zip(actions).for_each(|(table, more)| *table += &more);
+    let lab = Lab::real(PLAN, tables);
+    let _servers = DISTRIBUTIONS.map(|d| {
+        let (node, action) = (format!("server_{d}"), format!("/act_{d}"));
+        serve(&lab, Site::Robot, d, &["--node", &node, "--action", &action])
+    });
+    let mut clients = PAIRS.map(|[serves, calls]| {
+        let (node, action) = (format!("/server_{serves}"), format!("/act_{serves}"));
+        call(&lab, Site::Desk, calls, CLIENTS, &["--parameters", &node, "--action", &action])
+    });
+    for (pair, client) in PAIRS.into_iter().zip(&mut clients) {
+        assert_answered(&client.summary(), 2 * CLIENTS, &format!("{pair:?}"));
+    }
+}
+
+/// eclipse-zenoh/zenoh-plugin-ros2dds #413 and #367: its queries end after five seconds.
+#[test]
+fn calls_and_goals_that_take_longer_than_five_seconds_are_answered() {
+    const GOALS: u64 = 1;
+    let mut tables = robot_to_desk("service", DISTRIBUTIONS.map(|d| format!("/{d}")));
+    let actions = robot_to_desk("action", DISTRIBUTIONS.map(|d| format!("/act_{d}")));
+    tables.iter_mut().zip(actions).for_each(|(table, more)| *table += &more);
+    let lab = Lab::real(PLAN, tables);
+    let _servers = DISTRIBUTIONS.map(|d| {
+        let (service, action) = (format!("/{d}"), format!("/act_{d}"));
+        let slow = ["--delay", "6", "--threads", "60"];
+        serve(&lab, Site::Robot, d, &[&["--service", &service, "--action", &action], &slow[..]].concat())
+    });
+    let mut clients = PAIRS.map(|[serves, calls]| {
+        let (service, action) = (format!("/{serves}"), format!("/act_{serves}"));
+        [(CLIENTS, ["--service", &*service]), (GOALS, ["--action", &action])]
+            .map(|(n, what)| (n, call(&lab, Site::Desk, calls, n, &[&what[..], &["--overlap"]].concat())))
+    });
+    for (pair, clients) in PAIRS.into_iter().zip(&mut clients) {
+        for (calls, client) in clients {
+            let summary = client.summary();
+            assert_answered(&summary, *calls, &format!("{pair:?}"));
+            assert!(summary["slowest"].as_f64().unwrap() > 5.0, "{summary}");
+        }
+    }
+}
+
+#[test]
+fn calls_of_a_server_that_was_started_again_are_answered() {
+    let lab = Lab::real(PLAN, robot_to_desk("service", ["/jazzy", "/kilted"]));
+    let start = |d| serve(&lab, Site::Robot, d, &["--node", "server", "--service", &format!("/{d}")]);
+    let call_all = |calls| {
+        let mut clients =
+            PAIRS.map(|[serves, d]| call(&lab, Site::Desk, d, calls, &["--service", &format!("/{serves}")]));
+        for (pair, client) in PAIRS.into_iter().zip(&mut clients) {
+            assert_answered(&client.summary(), calls, &format!("{pair:?}"));
+        }
+    };
+    let servers = DISTRIBUTIONS.map(start);
+    call_all(1);
+    for mut server in servers {
+        server.end();
+        server.summary();
+    }
+    let without = || {
+        let routes = lab.status(Site::Robot)["routes"].take();
+        let states = routes.as_array().into_iter().flatten().filter_map(|route| route["state"].as_str());
+        states.filter(|state| state.starts_with("0 local servers")).count()
+    };
+    eventually("both are gone", || without() == 2);
+    let _servers = DISTRIBUTIONS.map(start);
+    eventually("both are back", || without() == 0);
+    call_all(CLIENTS);
+}
+
+/// eclipse-zenoh/zenoh-plugin-ros2dds #382: a client that goes while there is no server stops everything.
+#[test]
+fn clients_that_leave_before_a_server_is_there_stop_nothing() {
+    let lab = Lab::real(PLAN, robot_to_desk("service", ["/early", "/other"]));
+    let _other = serve(&lab, Site::Robot, "jazzy", &["--node", "other", "--service", "/other"]);
+    for distribution in DISTRIBUTIONS {
+        let leave = ["leave", "--service", "/early", "--count", "20", "--delay", "0.05"];
+        program(&lab, Site::Desk, distribution, &leave).summary();
+    }
+    let mut client = call(&lab, Site::Desk, "kilted", 1, &["--service", "/other"]);
+    assert_answered(&client.summary(), 1, "another service");
+    let _server = serve(&lab, Site::Robot, "kilted", &["--node", "early", "--service", "/early"]);
+    for distribution in DISTRIBUTIONS {
+        let mut client = call(&lab, Site::Desk, distribution, 5, &["--service", "/early"]);
+        assert_answered(&client.summary(), 5, distribution);
+    }
+}
+
+#[test]
+fn first_messages_of_publishers_that_join_a_topic_reach_the_node() {
+    const PUBLISHERS: &str = "50";
+    let topics = DISTRIBUTIONS.map(|d| format!("/first_{d}"));
+    let lab = Lab::real(PLAN, robot_to_desk("topic", &topics));
+    for pair in PAIRS {
+        let topic = format!("/first_{}", pair[0]);
+        let common = ["--topic", &topic, "--count", PUBLISHERS];
+        let mut listener = program(&lab, Site::Desk, pair[1], &[&["listen"], &common[..]].concat());
+        listener.wait("a subscriber", |e| e["event"] == "ready");
+        let mut talker =
+            program(&lab, Site::Robot, pair[0], &[&["publish", "--pause", "0"], &common[..]].concat());
+        // The first opens the way.
+        talker.wait("the first", |e| e["event"] == "paused");
+        talker.go();
+        talker.wait("all", |e| e["event"] == "all_sent");
+        let taken = || {
+            let routes = lab.status(Site::Robot)["routes"].take();
+            let route = routes.as_array()?.iter().find(|route| route["topic"] == *topic)?;
+            route["messages"].as_u64()
+        };
+        eventually("all are taken", || taken() == PUBLISHERS.parse().ok());
+        talker.go();
+        talker.summary();
+    }
+}
