@@ -55,7 +55,6 @@ mod shaper;
 pub mod shell;
 mod sinks;
 mod sources;
-mod spacing;
 mod state;
 mod stats;
 mod status;

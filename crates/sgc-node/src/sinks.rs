@@ -5,7 +5,6 @@
 //! by who received it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -30,7 +29,6 @@ use crate::dataplane::DataPlane;
 use crate::hold::{Hold, Holds};
 use crate::queue::Queue;
 use crate::shaper::Shaper;
-use crate::spacing::Spacing;
 use crate::stats::{DataDrop, Drops};
 use crate::tap::{Tapped, Taps};
 
@@ -42,8 +40,6 @@ const WRITER_BYTES_MAX: usize = 64 << 20;
 const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
 /// How long nobody waits for a local reader that did not.
 const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
-/// How much later than asked a writer's thread may be woken; Linux's default is 50 µs.
-const TIMER_SLACK_NS: u64 = 1_000;
 /// Messages of a transient-local writer that are known again.
 const RECENT_MAX: usize = 4096;
 /// The longest message that is written by who received it.
@@ -705,8 +701,6 @@ impl WriterQueue {
         let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
         thread::Builder::new().name(thread_name.into()).spawn(move || {
             let _alive = alive;
-            // Without it the pauses of a burst are late by as much as they are long.
-            let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
             while runtime.block_on(task.queue.wait()) {
                 let mut take = task.take.lock().unwrap_or_else(PoisonError::into_inner);
                 let mut behind = None;
@@ -844,16 +838,12 @@ struct Room {
     unacknowledged: AtomicU32,
     /// When a message was written last, and when it was published.
     last: Mutex<Option<(Instant, i64)>>,
-    spacing: Mutex<Spacing>,
 }
 
 impl Room {
     /// Returns `true` if a message of so many bytes and this time may be written without taking the place of one that somebody may lack; does
     /// not wait.
     fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
-        if self.spacing().wait(Instant::now(), timestamp_ns).is_some() {
-            return false;
-        }
         let Some(kept) = writer.kept(bytes) else { return true };
         if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
             return true;
@@ -873,10 +863,6 @@ impl Room {
         apart.is_some_and(|ns| ns > 0 && written.elapsed() >= Duration::from_nanos(ns / 2))
     }
 
-    fn spacing(&self) -> MutexGuard<'_, Spacing> {
-        self.spacing.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn last(&self) -> MutexGuard<'_, Option<(Instant, i64)>> {
         self.last.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -886,12 +872,6 @@ impl Burst {
     /// Waits before a sample of so many bytes would take the place of one that somebody may lack. One that comes alone is written at
     /// once, as its publisher did.
     fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, bytes: usize, timestamp_ns: i64) {
-        let wait = self.room.spacing().wait(Instant::now(), timestamp_ns);
-        if let Some(wait) = wait {
-            writer.flush();
-            thread::sleep(wait);
-        }
-        self.room.spacing().note(Instant::now(), timestamp_ns);
         let Some(kept) = writer.kept(bytes) else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
         // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
