@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// One number.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Figure {
-    /// Which table it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`, `applications`, `fleet-step`, `fan-out`, `multi-hop`,
+    /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`, `applications`, `fleet-step`, `fan-out`, `multi-hop`,
     /// `teleop`, `roaming`, `footprint`.
     pub(crate) table: String,
     /// What was measured: `direct`, `wireguard`, `dds-security`, `zenoh-tcp`, `zenoh-tls`, `sgc-quic-group`,

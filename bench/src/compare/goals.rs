@@ -329,7 +329,7 @@ impl Run<'_> {
             PAIRS.map(|(name, path)| {
                 let place = (table, path, at, "lost");
                 let lost = self.number(place, ours).zip(self.number(place, "direct"));
-                // What is lost natively, too, is not the system's fault.
+                // Messages that are lost natively, too, are not the system's fault.
                 part(&format!("{what}, {name}"), lost.map(|(ours, theirs)| (ours - theirs).max(0.0)))
             })
         });

@@ -97,7 +97,7 @@ pub(crate) struct Lab {
     pub(crate) path: Option<TunLink>,
     /// What it is.
     pub(crate) kind: PathKind,
-    /// What systems connect.
+    /// The ROS networks that systems connect.
     pub(crate) networks: Networks,
     places: [Arc<Namespace>; 2],
     /// For all that is written while it is there.

@@ -148,7 +148,7 @@ unsafe fn finish(sample: *mut ddsi_serdata) -> *mut ddsi_serdata {
     sample
 }
 
-// What follows is called by Cyclone, from its own threads, with arguments that are valid as its headers say.
+// Cyclone calls the functions below, from its own threads, with arguments that are valid as its headers say.
 
 unsafe extern "C" fn from_ser(
     sertype: *const ddsi_sertype,

@@ -329,7 +329,7 @@ fn is_new_and_reliable(state: &ProxyWriterState) -> bool {
         && queues.iter().all(|queue| !queue.is_null())
 }
 
-/// What an event needs to ask for a heartbeat.
+/// The arguments of an event that asks for a heartbeat.
 #[derive(Clone, Copy)]
 #[repr(C)]
 struct Asking {

@@ -81,7 +81,7 @@ pub(crate) unsafe fn add(view: *mut ddsrt_iovec_t, parameters: &[Parameter<'_>])
         return false;
     };
     if has_list {
-        // What is added takes the place of the sentinel.
+        // The parameters that are added take the place of the sentinel.
         // SAFETY: valid by contract; the list is in the message and ends with it.
         unsafe { (*message).bytes -= SENTINEL_BYTES };
     }

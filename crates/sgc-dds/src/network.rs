@@ -69,7 +69,7 @@ pub(crate) struct Participant {
     pace: Pace,
     holds: Pace,
     writers: AtomicUsize,
-    /// Who discovery tells, while it is under way.
+    /// The handler that discovery tells, while it is under way.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
 }
 

@@ -459,7 +459,7 @@ static SERDATA: Table<ddsi_serdata_ops> = Table(ddsi_serdata_ops {
     from_psmx: None,
 });
 
-// What follows is called by Cyclone, from its own threads, with arguments that are valid as its headers say.
+// Cyclone calls the functions below, from its own threads, with arguments that are valid as its headers say.
 
 unsafe extern "C" fn sertype_free(sertype: *mut ddsi_sertype) {
     // SAFETY: the last reference to what `topic` made of a box.

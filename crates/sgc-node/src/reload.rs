@@ -62,7 +62,7 @@ pub(crate) struct Reloader {
     pub(crate) join: Option<JoinNetwork>,
     /// True if there is a local network to share with.
     pub(crate) has_ros: AtomicBool,
-    /// What dials the routers of tokens that come later.
+    /// The dialler for routers of tokens that come later.
     pub(crate) holder: Holder,
     pub(crate) board: Board,
     pub(crate) dialling: std::sync::Mutex<Vec<JoinHandle<()>>>,

@@ -108,7 +108,7 @@ impl SourceId {
         (self != Self::OTHERS).then_some(self)
     }
 
-    /// What a publisher is listed under whose liveliness lease ran out. Nothing is ever sent under it.
+    /// The id under which a publisher is listed whose liveliness lease ran out. Nothing is ever sent under it.
     pub fn lapsed(mut self) -> Self {
         self.0[8..].copy_from_slice(&LAPSED);
         self

@@ -1,4 +1,4 @@
-//! What users of other bridges suffer from, with programs of ROS 2: each scenario is that of a public report.
+//! Faults that users of other bridges suffer from, with programs of ROS 2: each scenario is that of a public report.
 
 use std::collections::BTreeSet;
 

@@ -172,7 +172,7 @@ fn far_subscriber_that_asks_for_too_much_is_told_as_a_near_one_is() {
     }
 }
 
-/// What is older than its lifespan reaches nobody who joins late, on either side.
+/// A message that is older than its lifespan reaches nobody who joins late, on either side.
 #[test]
 fn far_late_joiner_hears_nothing_that_is_older_than_its_lifespan() {
     const LIFESPAN: Duration = Duration::from_secs(1);
