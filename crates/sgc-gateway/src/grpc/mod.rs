@@ -120,7 +120,7 @@ impl Grpc {
     ///
     /// # Errors
     /// None but that the descriptor which this was built with is broken.
-    pub fn routes(&self) -> Result<Routes, Fault> {
+    pub async fn routes(&self) -> Result<Routes, Fault> {
         let gateway = GatewayServer::new(Service::default())
             .max_decoding_message_size(MESSAGE_BYTES_MAX)
             .max_encoding_message_size(MESSAGE_BYTES_MAX);
@@ -139,9 +139,10 @@ impl Grpc {
         let v1 = described().build_v1().map_err(broken)?;
         let v1alpha = described().build_v1alpha().map_err(broken)?;
         let (reporter, health) = tonic_health::server::health_reporter();
+        // Before the first request, which a client would otherwise see answered with NOT_FOUND.
+        reporter.set_serving::<GatewayServer<Service>>().await;
         let mut stopping = self.stopping.subscribe();
         self.clients.hub().shared.runtime.spawn(async move {
-            reporter.set_serving::<GatewayServer<Service>>().await;
             let _ = stopping.wait_for(|is_stopping| *is_stopping).await;
             reporter.set_not_serving::<GatewayServer<Service>>().await;
         });
@@ -167,7 +168,7 @@ impl Grpc {
         };
         let incoming = incoming.map(Ok::<_, std::convert::Infallible>);
         let served =
-            builder().add_routes(self.routes()?).serve_with_incoming_shutdown(incoming, stopped).await;
+            builder().add_routes(self.routes().await?).serve_with_incoming_shutdown(incoming, stopped).await;
         served.map_err(|error| Fault::Transport(error.to_string()))
     }
 
