@@ -35,7 +35,7 @@ pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
 pub use history::{RECOVERY_BYTES_MAX, RECOVERY_MESSAGES_MAX, RecoveryLimits};
 pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
 pub use marks::{MARK_AFTER, Marks};
-pub use parking::{PARKED_BYTES_MAX, PARKED_PACKETS_MAX};
+pub use parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
 pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};

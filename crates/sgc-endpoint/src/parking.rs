@@ -1,16 +1,19 @@
 //! Packets that came before the grant that explains them: of an epoch or a source that is not known yet.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use bytes::Bytes;
-use sgc_wire::Packet;
+use sgc_wire::{Packet, SourceId};
 
 /// Most packets parked at one sink.
 pub const PARKED_PACKETS_MAX: usize = 256;
 /// Most bytes parked at one sink.
 pub const PARKED_BYTES_MAX: usize = 4 << 20;
-/// Grants that a packet waits for. One may have been under way when the packet's source came to be.
-const LOOKS_MAX: u8 = 4;
+/// Grants that a packet waits for. Each source that comes to be has a grant of its own, so that as many may be under way when the
+/// packet's source did.
+pub const PARKED_LOOKS_MAX: u8 = 64;
+/// Looks for which a grant of a later epoch than the packet's counts: a source is announced in the epoch in which it came to be.
+const PAST_EPOCH_LOOKS: u8 = PARKED_LOOKS_MAX / 4;
 
 /// A packet and how often it was looked at in vain.
 pub(crate) struct Parked {
@@ -28,10 +31,10 @@ impl Parked {
         Self { packet, looks: 0 }
     }
 
-    /// Counts a look in vain; true if there was one too many.
-    pub(crate) fn looked_in_vain(&mut self) -> bool {
-        self.looks += 1;
-        self.looks >= LOOKS_MAX
+    /// Counts a look in vain at a grant of this epoch; true if there was one too many.
+    pub(crate) fn looked_in_vain(&mut self, epoch: u32) -> bool {
+        self.looks += if epoch > self.packet.header.epoch { PAST_EPOCH_LOOKS } else { 1 };
+        self.looks >= PARKED_LOOKS_MAX
     }
 }
 
@@ -53,6 +56,20 @@ impl Parking {
             self.bytes -= oldest.packet.encoded_bytes();
         }
         before - self.packets.len()
+    }
+
+    /// Drops the packets of the sources that are passed over; these sources.
+    pub(crate) fn drop_of(&mut self, is_passed_over: impl Fn(&SourceId) -> bool) -> BTreeSet<SourceId> {
+        let mut sources = BTreeSet::new();
+        for parked in self.take() {
+            let source = parked.packet.header.source;
+            if is_passed_over(&source) {
+                sources.insert(source);
+            } else {
+                self.push(parked);
+            }
+        }
+        sources
     }
 
     /// Takes all out.

@@ -6,7 +6,7 @@
 //! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed,
 //! first. A packet that is refused leaves no state.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -297,10 +297,11 @@ impl Sink {
             }
         }
         self.announce(grant.sources, Some(newest), moved, &mut deliver);
+        let latest = self.newest_epoch();
         for mut parked in self.parking.take() {
             let result = match self.handle(&parked.packet) {
                 Ok(Ok(delivery)) => Ok(delivery),
-                Ok(Err(unexplained)) if parked.looked_in_vain() => Err(match unexplained {
+                Ok(Err(unexplained)) if parked.looked_in_vain(latest) => Err(match unexplained {
                     Unexplained::Epoch => SinkDrop::UnknownEpoch,
                     Unexplained::Source => SinkDrop::UnknownSource,
                 }),
@@ -354,6 +355,12 @@ impl Sink {
     /// True if the messages of a source can be asked for again, so that none need be taken that can go nowhere.
     pub fn recovers(&self, source: &SourceId) -> bool {
         self.sources.get(source).is_some_and(|s| s.recovers)
+    }
+
+    /// Drops the packets that wait for a grant and are of sources whose messages can go nowhere yet; these sources. Each must be
+    /// [suspected](Self::suspect) once its messages can go somewhere.
+    pub fn pass_over(&mut self, can_go_nowhere: impl Fn(&SourceId) -> bool) -> BTreeSet<SourceId> {
+        self.parking.drop_of(can_go_nowhere)
     }
 
     /// Something of a source was not handed over: it must be asked for it, if it can be.

@@ -129,9 +129,17 @@ impl LocalSink {
     pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<DataPlane>) {
         let mut released = Vec::new();
         let turn = {
-            let mut state = self.lock();
+            let state = &mut *self.lock();
             match &mut state.sink {
-                Some(sink) => sink.regrant(id, grant, |result| released.push(result)),
+                Some(sink) => {
+                    // A new source has a grant before it has a writer.
+                    let recovering = grant.sources.iter().filter(|announced| announced.recover > 0);
+                    let sources: BTreeSet<_> = recovering.map(|announced| announced.source).collect();
+                    let is_writerless =
+                        |source: &SourceId| sources.contains(source) && !self.has_writer(source);
+                    state.missed.extend(sink.pass_over(is_writerless));
+                    sink.regrant(id, grant, |result| released.push(result));
+                }
                 sink => {
                     let limits = SinkLimits::default();
                     *sink = Some(Sink::new(self.name, id, grant, self.transient_local, limits));
@@ -140,7 +148,7 @@ impl LocalSink {
             if released.is_empty() {
                 return;
             }
-            self.begin_release(&mut state)
+            self.begin_release(state)
         };
         let (this, data) = (self.clone(), data.clone());
         self.release(turn, async move {

@@ -194,10 +194,7 @@ def publish(options) -> int:
         publishers.append(publisher)
         while publisher.get_subscription_count() < 1 and time.monotonic() < deadline:
             time.sleep(POLL_S)
-        publisher.publish(UInt64(data=number))
-        if number == options.pause:
-            say("paused")
-            wait_go()
+        publisher.publish(UInt64(data=options.first + number))
     say("all_sent", sent=options.count)
     wait_go()
     node.destroy_node()
@@ -239,12 +236,12 @@ def main() -> int:
     parser.add_argument("--parameters", action="append", default=[], help="the node whose parameters are read")
     parser.add_argument("--topic", default="/first")
     parser.add_argument("--count", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="the first number that is published")
     parser.add_argument("--delay", type=float, default=0, help="seconds that a server takes, or a client waits")
     parser.add_argument("--threads", type=int, default=8)
     parser.add_argument("--timeout", type=float, default=60)
     parser.add_argument("--participants", action="store_true", help="a participant for each call")
     parser.add_argument("--overlap", action="store_true", help="call again before the answer is there")
-    parser.add_argument("--pause", type=int, default=-1, help="wait for a line on standard input at this number")
     options = parser.parse_args()
     return roles[options.role](options)
 

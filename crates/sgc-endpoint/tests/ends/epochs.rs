@@ -1,6 +1,6 @@
 //! Epochs, announcements, parking, and what a replay comes to.
 
-use sgc_endpoint::{EPOCHS_MAX, PARKED_PACKETS_MAX};
+use sgc_endpoint::{EPOCHS_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 use sgc_trust::OpenError;
 
 use super::*;
@@ -123,12 +123,30 @@ fn what_no_grant_explains_is_given_up() {
     sink.handle_packet(&published(&mut unknown, bytes(1), false)[0]).unwrap();
     rekeyed(&mut later, 9);
     sink.handle_packet(&published(&mut later, bytes(1), false)[0]).unwrap();
-    for _ in 0..3 {
+    for _ in 1..PARKED_LOOKS_MAX {
         assert_eq!(regranted(&mut sink, SINK, grant_of(1, &[&known])), []);
     }
     let released = regranted(&mut sink, SINK, grant_of(1, &[&known]));
     assert_eq!(released, [Err(SinkDrop::UnknownSource), Err(SinkDrop::UnknownEpoch)]);
     assert_eq!(sink.parked(), 0);
+}
+
+#[test]
+fn a_parked_message_that_is_passed_over_is_asked_for_later() {
+    let (mut early, mut other) = (source(SUITE, 0), source_with(SUITE, config(6, 0)));
+    let before = [early.announce(), other.announce()];
+    let mut sink = sink(SUITE, &[]);
+    for source in [&mut early, &mut other] {
+        assert_eq!(sink.handle_packet(&published(source, bytes(1), false)[0]), Ok(Delivery::Parked));
+    }
+    let passed_over = sink.pass_over(|source| *source == early.id());
+    assert_eq!(Vec::from_iter(passed_over), [early.id()]);
+    let released = regranted(&mut sink, SINK, grant(SUITE, 1, &before));
+    assert_eq!(released.into_iter().filter_map(payload).collect::<Vec<_>>(), [bytes(1)], "of the other");
+    sink.suspect(&early.id());
+    assert_eq!(Vec::from_iter(sink.unsynced()), [early.id()]);
+    let from = sink.ask(early.id()).expect("it can be asked");
+    assert_eq!(delivered(&mut sink, &replayed_to(&mut early, SINK, from)), [bytes(1)]);
 }
 
 #[test]

@@ -1,6 +1,9 @@
 //! Services, actions and parameters of real ROS 2: calls made in the moment in which a server is seen, slow servers, servers that are
 //! started again. And the first messages of publishers, which meet the same fault of the transport.
 
+use std::thread;
+use std::time::Duration;
+
 use serde_json::Value;
 
 use super::lab::{Lab, Site, robot_to_desk};
@@ -174,28 +177,40 @@ fn clients_that_leave_before_a_server_is_there_stop_nothing() {
 }
 
 #[test]
-fn first_messages_of_publishers_that_join_a_topic_reach_the_node() {
+fn first_messages_of_publishers_reach_far_subscribers() {
     const PUBLISHERS: &str = "50";
+    const LONE_PUBLISHERS: u64 = 3;
     let topics = DISTRIBUTIONS.map(|d| format!("/first_{d}"));
     let lab = Lab::real(PLAN, robot_to_desk("topic", &topics));
     for pair in PAIRS {
         let topic = format!("/first_{}", pair[0]);
-        let common = ["--topic", &topic, "--count", PUBLISHERS];
-        let mut listener = program(&lab, Site::Desk, pair[1], &[&["listen"], &common[..]].concat());
-        listener.wait("a subscriber", |e| e["event"] == "ready");
-        let mut talker =
-            program(&lab, Site::Robot, pair[0], &[&["publish", "--pause", "0"], &common[..]].concat());
-        // The first opens the way.
-        talker.wait("the first", |e| e["event"] == "paused");
-        talker.go();
-        talker.wait("all", |e| e["event"] == "all_sent");
-        let taken = || {
-            let routes = lab.status(Site::Robot)["routes"].take();
-            let route = routes.as_array()?.iter().find(|route| route["topic"] == *topic)?;
-            route["messages"].as_u64()
+        let listen = |count: &str| {
+            let args = ["listen", "--topic", &topic, "--count", count];
+            let mut listener = program(&lab, Site::Desk, pair[1], &args);
+            listener.wait("a subscriber", |e| e["event"] == "ready");
+            listener
         };
-        eventually("all are taken", || taken() == PUBLISHERS.parse().ok());
+        let publish = |count: &str, first: &str| {
+            let args = ["publish", "--topic", &topic, "--count", count, "--first", first];
+            let mut talker = program(&lab, Site::Robot, pair[0], &args);
+            talker.wait("all", |e| e["event"] == "all_sent");
+            talker
+        };
+        let mut listener = listen(PUBLISHERS);
+        let mut talker = publish(PUBLISHERS, "0");
+        let heard = listener.summary();
+        assert_eq!([count(&heard, "received"), count(&heard, "duplicated")], [50, 0], "{pair:?}: {heard}");
         talker.go();
         talker.summary();
+        // As `ros2 topic pub --once` does, which ends a tenth of a second after its only message.
+        let mut listener = listen(&LONE_PUBLISHERS.to_string());
+        for number in 0..LONE_PUBLISHERS {
+            let mut talker = publish("1", &number.to_string());
+            thread::sleep(Duration::from_millis(100));
+            talker.go();
+            talker.summary();
+        }
+        let heard = listener.summary();
+        assert_eq!(count(&heard, "received"), LONE_PUBLISHERS, "{pair:?}: {heard}");
     }
 }
