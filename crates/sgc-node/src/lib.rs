@@ -55,6 +55,7 @@ mod shaper;
 pub mod shell;
 mod sinks;
 mod sources;
+mod spacing;
 mod state;
 mod stats;
 mod status;

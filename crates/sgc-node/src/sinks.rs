@@ -5,6 +5,7 @@
 //! by who received it.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
@@ -29,6 +30,7 @@ use crate::dataplane::DataPlane;
 use crate::hold::{Hold, Holds};
 use crate::queue::Queue;
 use crate::shaper::Shaper;
+use crate::spacing::Spacing;
 use crate::stats::{DataDrop, Drops};
 use crate::tap::{Tapped, Taps};
 
@@ -40,6 +42,10 @@ const WRITER_BYTES_MAX: usize = 64 << 20;
 const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
 /// How long nobody waits for a local reader that did not.
 const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
+/// How long what comes for a topic waits until a writer that was closed has written its queue.
+const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
+/// How much later than asked a writer's thread may be woken; Linux's default is 50 µs.
+const TIMER_SLACK_NS: u64 = 1_000;
 /// Messages of a transient-local writer that are known again.
 const RECENT_MAX: usize = 4096;
 /// The longest message that is written by who received it.
@@ -227,13 +233,15 @@ impl LocalSink {
         self.lock().sink.as_mut().map_or(AskAgain::No, |sink| sink.ask_again(source))
     }
 
-    /// Adds, replaces or removes a writer; the old one ends after what is queued.
-    pub(crate) fn set_writer(&self, source: Option<SourceId>, writer: Option<Arc<WriterQueue>>) {
+    /// Adds, replaces or removes a writer; the old one ends after what is queued. Messages that come from here on are written after
+    /// that, since their source may have taken over from the old writer's.
+    pub(crate) fn set_writer(self: &Arc<Self>, source: Option<SourceId>, writer: Option<Arc<WriterQueue>>) {
+        let mut state = self.lock();
         let mut writers = BTreeMap::clone(&self.writers.load());
         let old = match writer {
             Some(writer) => writers.insert(source, writer),
             None => {
-                if let (Some(source), Some(sink)) = (source, &mut self.lock().sink) {
+                if let (Some(source), Some(sink)) = (source, &mut state.sink) {
                     sink.forget(&source);
                 }
                 writers.remove(&source)
@@ -242,11 +250,14 @@ impl LocalSink {
         let opened = writers.contains_key(&source);
         self.writers.store(Arc::new(writers));
         if opened {
-            self.ask_for_missed(&mut self.lock());
+            self.ask_for_missed(&mut state);
         }
-        if let Some(old) = old {
-            old.queue.close();
-        }
+        let Some(old) = old else { return };
+        old.close();
+        let (turn, deadline) = (self.begin_release(&mut state), Instant::now() + LAST_WRITES_MAX);
+        self.release(turn, async move {
+            let _ = timeout_at(deadline.into(), old.ended()).await;
+        });
     }
 
     /// Gives a writer to another source of the same publisher; false if there is none. What it wrote already and the new
@@ -461,7 +472,7 @@ impl LocalSink {
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes a while, and may have to wait for its type.
         let at_once = head.form != PayloadForm::Json;
-        let at_once = at_once.then(|| writer.at_once(bytes, head.source_timestamp_ns)).flatten();
+        let at_once = at_once.then(|| writer.at_once(&message)).flatten();
         if let Some(mut take) = at_once {
             take(message, Next::Nothing);
         } else if message.reliable {
@@ -505,6 +516,13 @@ impl LocalSink {
     }
 }
 
+impl Drop for LocalSink {
+    /// Ends the writers, which nothing else ends where a node goes without leaving its topics.
+    fn drop(&mut self) {
+        self.close();
+    }
+}
+
 /// Counts a release that is under way; the count holds whatever becomes of who waits.
 struct Releasing<'a>(&'a LocalSink);
 
@@ -523,6 +541,15 @@ pub(crate) enum Next {
     Later,
     /// A message, at once.
     AtOnce,
+    /// A message, at once, of a queue that is closed: those of another writer wait for it.
+    Last,
+}
+
+impl Next {
+    /// Returns `true` if the next message is taken without a pause.
+    fn is_at_once(self) -> bool {
+        matches!(self, Self::AtOnce | Self::Last)
+    }
 }
 
 /// Takes messages, one after the other.
@@ -538,6 +565,8 @@ pub(crate) struct WriterQueue {
     /// overtakes what was queued.
     take: Mutex<Take>,
     behind: Behind,
+    /// Closed once the thread has nothing more to take.
+    thread: mpsc::Sender<()>,
 }
 
 /// What is known of who takes the messages of a queue.
@@ -546,14 +575,13 @@ pub(crate) struct Behind {
     recent: Option<Mutex<Recent>>,
     /// Local readers that it is matched with.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
-    /// Returns `true` if a short message of so many bytes and that time, taken now, waits for nobody, and overwrites none that a reader may
-    /// lack.
-    is_free: Box<dyn Fn(usize, i64) -> bool + Send + Sync>,
+    /// Returns `true` if a short message, taken now, waits for nobody, and overwrites none that a reader may lack.
+    is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_, _| false) }
+        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_| false) }
     }
 }
 
@@ -598,9 +626,11 @@ impl WriterQueue {
         // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
-        let is_free = Box::new(move |bytes, timestamp_ns| {
+        let is_free = Box::new(move |message: &Message| {
+            let (bytes, published_ns) = (message.payload.len(), message.head.source_timestamp_ns);
             never_blocks
-                && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, timestamp_ns))
+                && room.spacing().wait(Instant::now(), message.source, published_ns).is_none()
+                && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, published_ns))
         });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
@@ -669,14 +699,18 @@ impl WriterQueue {
         };
         let refused = failures.clone();
         Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, next| {
+            let source = message.source;
             let Some((head, payload)) = prepare(message) else {
-                return if next != Next::AtOnce {
+                return if !next.is_at_once() {
                     writer.flush()
                 };
             };
+            if next != Next::Last {
+                burst.room.space(&*writer, source, head.source_timestamp_ns);
+            }
             burst.before_next(&*writer, next == Next::Nothing, payload.len(), head.source_timestamp_ns);
             let written = writer.write_ahead(head, payload);
-            if next != Next::AtOnce {
+            if !next.is_at_once() {
                 writer.flush();
             }
             if let Err(error) = written
@@ -699,28 +733,34 @@ impl WriterQueue {
     ) -> std::io::Result<Arc<Self>> {
         let mut shaper = Shaper::default();
         shaper.set(shaping);
+        let (running, in_thread) = mpsc::channel(1);
         let this = Arc::new(Self {
             queue: Queue::new(WRITER_MESSAGES_MAX),
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
             behind,
+            thread: running,
         });
         let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
         thread::Builder::new().name(thread_name.into()).spawn(move || {
             let _alive = alive;
+            // Without it the pauses of a burst are late by as much as they are long.
+            let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
             while runtime.block_on(task.queue.wait()) {
                 let mut take = task.take.lock().unwrap_or_else(PoisonError::into_inner);
                 let mut behind = None;
                 while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
                     let next = match behind.is_none() && task.queue.is_empty() {
                         true => Next::Nothing,
+                        false if task.queue.is_closed() => Next::Last,
                         false if task.is_unshaped.load(Relaxed) => Next::AtOnce,
                         false => Next::Later,
                     };
                     take(message, next);
                 }
             }
+            drop(in_thread);
             // What it holds, a writer, may block when it goes.
             let end: Take = Box::new(|_, _| ());
             drop(std::mem::replace(&mut *task.take.lock().unwrap_or_else(PoisonError::into_inner), end));
@@ -728,14 +768,11 @@ impl WriterQueue {
         Ok(this)
     }
 
-    /// Who takes a message of so many bytes and that time now: if that does not block, and nothing is ahead of it. Only for who
-    /// queues, while nobody else does.
-    fn at_once(&self, bytes: usize, timestamp_ns: i64) -> Option<MutexGuard<'_, Take>> {
-        let may = bytes <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
+    /// Who takes a message now: if that does not block, and nothing is ahead of it. Only for who queues, while nobody else does.
+    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, Take>> {
+        let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| {
-            self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(bytes, timestamp_ns)
-        })
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(message))
     }
 
     /// The writer's.
@@ -829,6 +866,11 @@ impl WriterQueue {
     pub(crate) fn close(&self) {
         self.queue.close();
     }
+
+    /// Waits until all that was queued before it was closed is taken.
+    async fn ended(&self) {
+        self.thread.closed().await;
+    }
 }
 
 /// Keeps what comes at once, after a way was interrupted, from overwriting itself in a reliable writer that keeps the last
@@ -846,6 +888,7 @@ struct Room {
     unacknowledged: AtomicU32,
     /// When a message was written last, and when it was published.
     last: Mutex<Option<(Instant, i64)>>,
+    spacing: Mutex<Spacing>,
 }
 
 impl Room {
@@ -869,6 +912,20 @@ impl Room {
         let Some((written, published_ns)) = *self.last() else { return false };
         let apart = timestamp_ns.checked_sub(published_ns).and_then(|ns| u64::try_from(ns).ok());
         apart.is_some_and(|ns| ns > 0 && written.elapsed() >= Duration::from_nanos(ns / 2))
+    }
+
+    /// Waits until a message may be written, and notes that it is.
+    fn space(&self, writer: &impl RosWriter, source: SourceId, published_ns: i64) {
+        let wait = self.spacing().wait(Instant::now(), source, published_ns);
+        if let Some(wait) = wait {
+            writer.flush();
+            thread::sleep(wait);
+        }
+        self.spacing().note(Instant::now(), source, published_ns);
+    }
+
+    fn spacing(&self) -> MutexGuard<'_, Spacing> {
+        self.spacing.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn last(&self) -> MutexGuard<'_, Option<(Instant, i64)>> {
@@ -1004,17 +1061,19 @@ mod tests {
 
     /// A queue whose messages are noted with the thread that took them; each takes as long as the gate is closed.
     fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
-        let taken = Arc::<Mutex<Vec<_>>>::default();
+        let taken = Written::default();
         let (note, gate) = (taken.clone(), gate.clone());
-        let behind = Behind { is_free: Box::new(|_, _| true), ..Behind::default() };
-        let (alive, _) = mpsc::channel(1);
-        let take = move |message: Message, _| {
+        let queue = taking(move |message, _| {
             drop(gate.lock().unwrap());
             note.lock().unwrap().push((message.seq, thread::current().id()));
-        };
-        let shaping = Shaping::default();
-        let queue = WriterQueue::spawn_with("test", behind, shaping, Arc::default(), alive, take).unwrap();
+        });
         (queue, taken)
+    }
+
+    fn taking(take: impl FnMut(Message, Next) + Send + 'static) -> Arc<WriterQueue> {
+        let behind = Behind { is_free: Box::new(|_| true), ..Behind::default() };
+        let (alive, _) = mpsc::channel(1);
+        WriterQueue::spawn_with("test", behind, Shaping::default(), Arc::default(), alive, take).unwrap()
     }
 
     fn message(seq: u64, bytes: usize) -> Message {
@@ -1025,7 +1084,7 @@ mod tests {
     /// As a sink does.
     fn give(queue: &WriterQueue, message: Message) {
         let bytes = message.payload.len();
-        match queue.at_once(bytes, 1) {
+        match queue.at_once(&message) {
             Some(mut take) => take(message, Next::Nothing),
             None => queue.queue.try_push(message, bytes, WRITER_BYTES_MAX).unwrap(),
         }
@@ -1103,6 +1162,56 @@ mod tests {
             assert_eq!(sink.delivered(), left as u64);
             sink.close();
         }
+    }
+
+    #[tokio::test]
+    async fn messages_of_a_successor_are_written_after_the_backlog_of_its_predecessor() {
+        let taken = Arc::<Mutex<Vec<_>>>::default();
+        let noted = |before: Box<dyn Fn() + Send>| {
+            let taken = taken.clone();
+            taking(move |message, next| {
+                before();
+                taken.lock().unwrap().push((message.seq, next));
+            })
+        };
+        let write = |sink: &Arc<LocalSink>, message| {
+            let written = sink.write_now(message, &mut sink.lock().held);
+            assert_eq!(written.ok(), Some(None));
+        };
+        let (sink, _, _) = sink(false);
+        let [killed, restarted] = [[1; 16], [2; 16]].map(SourceId);
+        // Stuck until the sender is gone.
+        let (stuck, gate) = std::sync::mpsc::channel::<()>();
+        let wait = move || {
+            let _ = gate.recv();
+        };
+        sink.set_writer(Some(killed), Some(noted(Box::new(wait))));
+        // The long one keeps the thread busy, and the others wait behind it.
+        write(&sink, message(0, AT_ONCE_BYTES_MAX + 1));
+        (1..50).for_each(|seq| write(&sink, message(seq, 16)));
+        sink.set_writer(Some(killed), None);
+        sink.set_writer(Some(restarted), Some(noted(Box::new(|| ()))));
+        for _ in 0..10 {
+            tokio::task::yield_now().await;
+            assert_eq!(sink.lock().releases, 1, "messages that come now wait");
+        }
+        drop(stuck);
+        wait_until(|| sink.lock().releases == 0).await;
+        write(&sink, Message { source: restarted, ..message(50, 16) });
+        let taken = taken.lock().unwrap();
+        assert!(taken.iter().map(|(seq, _)| *seq).eq(0..=50), "{taken:?}");
+        // The first may have been taken before the queue was closed, and behind the last there is nothing.
+        assert!(taken[1..49].iter().all(|(_, next)| *next == Next::Last), "{taken:?}");
+        sink.close();
+    }
+
+    #[tokio::test]
+    async fn writers_end_with_their_sink() {
+        let (sink, _, _) = sink(false);
+        let writer = sink.writer(&SourceId([1; 16])).unwrap();
+        drop(sink);
+        let ended = tokio::time::timeout(Duration::from_secs(20), writer.ended()).await;
+        assert!(ended.is_ok(), "its thread goes on");
     }
 
     #[tokio::test]

@@ -49,8 +49,9 @@ impl<N: RosNetwork> Core<N> {
             Err(why) => return error!(%why, "a service has no thread and cannot be used"),
         };
         let sink = LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone());
+        let sink = Arc::new(sink);
         sink.set_writer(None, Some(queue));
-        self.sinks.insert(name, Arc::new(sink));
+        self.sinks.insert(name, sink);
         self.calls.insert(name, calls);
     }
 

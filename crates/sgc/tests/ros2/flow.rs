@@ -1,5 +1,8 @@
 //! Messages at full speed, large ones, and subscribers that stand still.
 
+use std::thread;
+use std::time::Duration;
+
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -58,6 +61,39 @@ fn large_messages_of_real_ros_2_arrive_whole() {
     }
 }
 
+/// A subscriber with default QoS keeps ten messages. Hundreds that come at once, because a router stood still, would overwrite each
+/// other there.
+#[test]
+fn subscriber_with_default_qos_receives_a_burst() {
+    const MESSAGES: u64 = 2_000;
+    const PAUSE: Duration = Duration::from_millis(400);
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let common = ["--topic", "/load", "--timeout", PLAN.peer_life];
+    let (last, mut lost) = (MESSAGES.to_string(), 0);
+    for [talks, listens] in PAIRS {
+        let listen = [&["sub", "--last", &last, "--linger", "0.5"][..], &common].concat();
+        let mut listener = lab.load(Site::Desk, listens, &listen);
+        let talk = [&["pub", "--count", &last, "--rate", "1000", "--wait-go", "--begin", "0.5"][..], &common]
+            .concat();
+        let mut talker = lab.load(Site::Robot, talks, &[&talk[..], &["--hold", "1"]].concat());
+        talker.wait_matched("a match at the publisher");
+        listener.wait_matched("a match at the subscriber");
+        talker.go();
+        thread::sleep(Duration::from_secs(1));
+        let router = lab.node(Site::Cloud);
+        router.signal(Signal::STOP);
+        thread::sleep(PAUSE);
+        router.signal(Signal::CONT);
+        let summary = listener.summary();
+        talker.summary();
+        assert_eq!(["duplicated", "reordered"].map(|key| count(&summary, key)), [0, 0], "{summary}");
+        lost += count(&summary, "lost");
+    }
+    // A message each millisecond. Written without pauses, a fifth to a half of each burst were lost.
+    let gathered = u64::try_from(PAUSE.as_millis()).unwrap() * PAIRS.len() as u64;
+    assert!(lost < gathered / 10, "{lost} of {gathered}");
+}
+
 /// A subscriber that stands still holds up nobody else, and what its publisher keeps is there when it goes on.
 #[test]
 fn a_subscriber_that_stands_still_holds_up_nobody_else() {
@@ -91,7 +127,7 @@ fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     frozen.wait_matched("another match at the desk");
     talker.go();
     // Once it has the first.
-    std::thread::sleep(std::time::Duration::from_millis(300));
+    thread::sleep(Duration::from_millis(300));
     frozen.signal(Signal::STOP);
     assert_whole(&quick.summary(), MESSAGES, "the other");
     frozen.signal(Signal::CONT);

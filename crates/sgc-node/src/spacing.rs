@@ -1,0 +1,148 @@
+//! [`Spacing`]: the pace at which messages that came at once are written.
+//!
+//! Packets are gathered on their way, and every pause of a process or of a link makes a burst. A subscriber of ROS 2 keeps its last ten
+//! messages by default and needs some time to wake up, so it loses of a burst whatever is more than it keeps. Its publisher let it
+//! have that time. A burst is therefore written twice as fast as it was published: few messages at once, then a pause. A message that
+//! comes as late after the one before as it was published is never held up.
+
+use std::time::{Duration, Instant};
+
+use sgc_wire::SourceId;
+
+/// Messages of a burst are written so many times as fast as they were published.
+const CATCH_UP: u64 = 2;
+
+/// A message is written ahead of its time by so many of its intervals: half of what a subscription with the default of ROS 2 for
+/// sensor data keeps (`rmw_qos_profile_sensor_data`, depth 5), and the one that is due.
+const AHEAD: u32 = 2;
+
+/// The longest interval: what gathered of a slow topic while a link was down is written within moments.
+const INTERVAL_MAX: Duration = Duration::from_micros(500);
+
+/// By so much a message that is written late is made up for by those behind it: about as much as sleeping takes too long.
+const LATE_MAX: Duration = Duration::from_micros(100);
+
+/// A shorter wait costs more than it gives: about the time that sleeping takes.
+const WAIT_MIN: Duration = Duration::from_micros(20);
+
+/// The times of one writer's messages.
+#[derive(Debug, Default)]
+pub(crate) struct Spacing {
+    last: Option<Last>,
+}
+
+#[derive(Debug)]
+struct Last {
+    source: SourceId,
+    /// When it was published, ns since the epoch by the publisher's clock.
+    published_ns: i64,
+    /// When it was to be written.
+    scheduled: Instant,
+}
+
+impl Spacing {
+    /// Returns how long a message waits before it is written, nothing if it does not.
+    pub(crate) fn wait(&self, now: Instant, source: SourceId, published_ns: i64) -> Option<Duration> {
+        let (scheduled, interval) = self.schedule(now, source, published_ns);
+        let ahead = scheduled.checked_sub(interval * AHEAD)?;
+        if ahead.saturating_duration_since(now) < WAIT_MIN {
+            return None;
+        }
+        // Those behind it that are due by then need no wait of their own.
+        Some(scheduled.saturating_duration_since(now))
+    }
+
+    /// Notes that a message is written now.
+    pub(crate) fn note(&mut self, now: Instant, source: SourceId, published_ns: i64) {
+        let (scheduled, _) = self.schedule(now, source, published_ns);
+        self.last = Some(Last { source, published_ns, scheduled });
+    }
+
+    /// Returns when a message is to be written, and how long after the one before.
+    fn schedule(&self, now: Instant, source: SourceId, published_ns: i64) -> (Instant, Duration) {
+        // Clocks of two publishers say nothing about each other.
+        let last = self.last.as_ref().filter(|last| last.source == source);
+        let Some(last) = last else { return (now, Duration::ZERO) };
+        let apart_ns = published_ns.checked_sub(last.published_ns).and_then(|ns| u64::try_from(ns).ok());
+        let interval = Duration::from_nanos(apart_ns.unwrap_or(0) / CATCH_UP).min(INTERVAL_MAX);
+        let earliest = now.checked_sub(LATE_MAX).unwrap_or(now);
+        (earliest.max(last.scheduled + interval), interval)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS_NS: i64 = 1_000_000;
+    const A: SourceId = SourceId([1; 16]);
+    const B: SourceId = SourceId([2; 16]);
+
+    /// Writes messages, all at hand at once, and returns when each was written. Writing one takes so long.
+    fn burst(published_ns: impl IntoIterator<Item = i64>, takes: Duration) -> Vec<Duration> {
+        let (mut spacing, begun) = (Spacing::default(), Instant::now());
+        let mut now = begun;
+        let mut written = Vec::new();
+        for published_ns in published_ns {
+            now += spacing.wait(now, A, published_ns).unwrap_or_default();
+            spacing.note(now, A, published_ns);
+            written.push(now - begun);
+            now += takes;
+        }
+        written
+    }
+
+    #[test]
+    fn a_burst_is_written_in_half_the_time_in_which_it_was_published() {
+        let written = burst((0..100).map(|n| n * MS_NS / 5), Duration::ZERO);
+        let most_at_once = written.iter().map(|at| written.iter().filter(|other| *other == at).count()).max();
+        assert_eq!(most_at_once, Some(AHEAD as usize + 1));
+        let (last, half) = (*written.last().unwrap(), Duration::from_micros(99 * 100));
+        assert!(last <= half && last + Duration::from_micros(300) >= half, "{last:?}");
+    }
+
+    #[test]
+    fn messages_in_their_time_and_those_published_at_once_do_not_wait() {
+        let (mut spacing, begun) = (Spacing::default(), Instant::now());
+        for n in 0..100 {
+            // Each half an interval early or late.
+            let now = begun + Duration::from_micros(1000 * n + 500 * (n % 2));
+            assert_eq!(spacing.wait(now, A, n as i64 * MS_NS), None);
+            spacing.note(now, A, n as i64 * MS_NS);
+        }
+        const TAKES: Duration = Duration::from_micros(5);
+        for apart_ns in [0, 1_000, 10_000] {
+            let written = burst((0..100).map(|n| n * apart_ns), TAKES);
+            assert_eq!(written.last(), Some(&(99 * TAKES)), "{apart_ns} ns apart");
+        }
+    }
+
+    #[test]
+    fn a_message_after_silence_holds_up_none_behind_it() {
+        let (mut spacing, begun) = (Spacing::default(), Instant::now());
+        spacing.note(begun, A, 0);
+        let now = begun + Duration::from_secs(2);
+        for n in 0..3 {
+            let published_ns = 2_000 * MS_NS + n * 50_000;
+            assert_eq!(spacing.wait(now, A, published_ns), None);
+            spacing.note(now, A, published_ns);
+        }
+    }
+
+    #[test]
+    fn messages_of_two_publishers_do_not_wait_for_the_difference_of_their_clocks() {
+        let (mut spacing, now) = (Spacing::default(), Instant::now());
+        for n in 0..100 {
+            for (source, published_ns) in [(A, n), (B, 1_000 * MS_NS + n)] {
+                assert_eq!(spacing.wait(now, source, published_ns), None);
+                spacing.note(now, source, published_ns);
+            }
+        }
+    }
+
+    #[test]
+    fn times_that_no_clock_gives_hold_up_nothing_for_long() {
+        let written = burst([0, i64::MAX, i64::MIN, i64::MAX, 0, -1, 7], Duration::ZERO);
+        assert!(written.last().unwrap() <= &(INTERVAL_MAX * 7), "{written:?}");
+    }
+}
