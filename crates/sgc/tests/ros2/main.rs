@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod all;
 mod bugs;
 mod calls;
 mod events;

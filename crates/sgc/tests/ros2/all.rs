@@ -1,0 +1,226 @@
+//! All that nodes of ROS 2 do with each other, from one site to the other: every message type, lifecycles, simulated time, service
+//! introspection, transforms, images, high rates, partners.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use crate::lab::{Lab, Site, robot_to_desk, share, uses};
+use crate::support::{Peer, eventually};
+use crate::{PAIRS, PLAN, count};
+
+/// Starts `features.py`.
+fn start(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
+    lab.rclpy(site, distribution, "features.py", args)
+}
+
+/// Ends them, so that they take their leave.
+fn end<const N: usize>(mut peers: [Peer; N]) {
+    peers.iter_mut().for_each(Peer::end);
+    for peer in &mut peers {
+        peer.summary();
+    }
+}
+
+/// Runs the publisher and the subscriber of all types, and returns what the latter sums up.
+fn all_types(lab: &Lab, [talks, listens]: [&str; 2], talks_at: Site, [published, heard]: [&str; 2]) -> Value {
+    let run = |site, distribution, role, namespace| {
+        let args = [role, "--namespace", namespace, "--timeout", "30"];
+        lab.rclpy(site, distribution, "values.py", &args)
+    };
+    let mut listener = run(Site::Desk, listens, "sub", heard);
+    let mut talker = run(talks_at, talks, "pub", published);
+    talker.wait_matched("a match of each publisher");
+    listener.wait_matched("a match of each subscriber");
+    talker.go();
+    listener.summary()
+}
+
+/// Patterns, a name for others and a namespace carry the topics of all types.
+#[test]
+fn every_message_type_arrives_by_value() {
+    let robot = share("topic", "/types/**", "desk") + "as = \"/arm/types/**\"\n";
+    let desk = uses("topic", "/arm/types/**", "robot") + "namespace = \"/robot1\"\n";
+    let lab = Lab::real(PLAN, [robot, desk]);
+    let assert_whole = |summary: &Value, what: &str| {
+        assert!(count(summary, "types") > 130, "{summary}");
+        let faults = ["missing", "altered", "wrong"].map(|key| summary[key].clone());
+        assert_eq!(faults, [json!([]), json!([]), json!({})], "{what}");
+    };
+    let native = all_types(&lab, PAIRS[0], Site::Desk, ["/native"; 2]);
+    assert_whole(&native, "with nothing in between");
+    for pair in PAIRS {
+        let carried = all_types(&lab, pair, Site::Robot, ["/types", "/robot1/arm/types"]);
+        assert_whole(&carried, &format!("{pair:?}"));
+    }
+}
+
+#[test]
+fn lifecycle_of_a_far_node_is_led_as_that_of_a_near_one() {
+    let mut tables = robot_to_desk("service", ["/robot/camera/*"]);
+    for (table, more) in tables.iter_mut().zip(robot_to_desk("topic", ["/robot/camera/*"])) {
+        *table += &more;
+    }
+    let lab = Lab::real(PLAN, tables);
+    for [serves, manages] in PAIRS {
+        let [native, carried] = [(Site::Desk, "/near"), (Site::Robot, "/robot")].map(|(site, namespace)| {
+            let camera = start(&lab, site, serves, &["camera", "--namespace", namespace]);
+            let mut manager = start(&lab, Site::Desk, manages, &["manage", "--namespace", namespace]);
+            let managed = manager.wait("the end of its life", |e| e["event"] == "managed");
+            end([camera, manager]);
+            managed
+        });
+        assert_eq!(native["events"].as_array().unwrap().len(), 11, "{native}");
+        assert_eq!(carried, native, "{serves} to {manages}");
+    }
+}
+
+#[test]
+fn clocks_with_use_sim_time_follow_a_far_simulator_back_to_its_beginning_too() {
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/clock"]));
+    for [talks, listens] in PAIRS {
+        let mut simulated = start(&lab, Site::Desk, listens, &["simulated"]);
+        let mut simulator = start(&lab, Site::Robot, talks, &["simulator"]);
+        let mut ticks = |times: usize| {
+            let tick = |e: &Value| e["event"] == "tick" && e["seconds"].as_f64() > Some(1_000.0);
+            let heard: Vec<_> = (0..times)
+                .map(|_| simulated.wait("a tick of simulated time", tick)["seconds"].as_f64().unwrap())
+                .collect();
+            assert!(heard.is_sorted() && heard[times - 1] < 100_000.0, "{talks} to {listens}: {heard:?}");
+            heard[times - 1]
+        };
+        // One of them a second of simulated time, ten a second.
+        let last = ticks(20);
+        simulator.go();
+        let jump = simulated.wait("a jump back", |e| e["event"] == "jumped");
+        let back = jump["seconds"].as_f64().unwrap();
+        assert!(back < 0.0 && 1_001.0 - back >= last, "{talks} to {listens}: {last} {jump}");
+        simulated.wait("a tick", |e| e["event"] == "tick" && e["seconds"].as_f64() < Some(last));
+        end([simulated, simulator]);
+    }
+}
+
+/// The events that come within a second of each other, without those who made the call.
+fn events_of_a_call(watcher: &Peer) -> Vec<Value> {
+    let mut heard = Vec::new();
+    while let Ok((_, mut event)) = watcher.events.recv_timeout(Duration::from_secs(1)) {
+        if event["event"] == "service_event" {
+            event["client"].take();
+            event["number"].take();
+            heard.push(event);
+        }
+    }
+    heard
+}
+
+/// The events of a service tell the same of a call, but who made it: the server's are of the client that `sgc` is to it.
+#[test]
+fn events_of_far_services_are_heard_with_their_contents() {
+    let mut tables = robot_to_desk("service", ["/add"]);
+    for (table, more) in tables.iter_mut().zip(robot_to_desk("topic", ["/add/_service_event"])) {
+        *table += &more;
+    }
+    let lab = Lab::real(PLAN, tables);
+    for [serves, calls] in PAIRS {
+        let [native, carried] = [(Site::Desk, "/near"), (Site::Robot, "/add")].map(|(site, name)| {
+            let of = ["--topic", name];
+            let watcher = start(&lab, Site::Desk, calls, &[&["watch"], &of[..]].concat());
+            let server = start(&lab, site, serves, &[&["serve"], &of[..]].concat());
+            let mut client = start(&lab, Site::Desk, calls, &[&["call"], &of[..]].concat());
+            // The events of the first calls may come before their publishers and the watcher know each other.
+            let mut heard = Vec::new();
+            eventually(&format!("all events of a call, {serves} to {calls} of {name}"), || {
+                client.go();
+                client.wait("an answer", |e| e["event"] == "answer" && e["success"] == false);
+                heard = events_of_a_call(&watcher);
+                let kinds: BTreeSet<_> = heard.iter().map(|event| event["kind"].to_string()).collect();
+                (heard.len(), kinds.len()) == (4, 4)
+            });
+            end([watcher, server, client]);
+            heard.sort_by_key(|event| event["kind"].to_string());
+            heard
+        });
+        assert_eq!(native.len(), 4, "{native:?}");
+        assert_eq!(carried, native, "{serves} to {calls}");
+    }
+}
+
+#[test]
+fn far_transforms_have_the_prefix_of_their_frames() {
+    let [robot, desk] = robot_to_desk("topic", ["/tf"]);
+    let lab = Lab::real(PLAN, [robot, desk + "frame_prefix = \"robot1/\"\n"]);
+    for [talks, listens] in PAIRS {
+        let talker = start(&lab, Site::Robot, talks, &["broadcast", "--topic", "/tf"]);
+        let mut listener = start(&lab, Site::Desk, listens, &["frames", "--topic", "/tf"]);
+        let heard = listener.wait("transforms", |e| e["event"] == "frames");
+        let expected = json!([
+            ["robot1/map", "robot1/odom", 1.0],
+            ["robot1/odom", "robot1/base_link", 0.5],
+            ["robot1/base_link", "", -2.0]
+        ]);
+        assert_eq!(heard["frames"], expected, "{talks} to {listens}");
+        end([talker, listener]);
+    }
+}
+
+#[test]
+fn images_of_one_six_and_thirteen_megabytes_arrive_whole() {
+    const SIZES: [&str; 3] = ["1000000", "6000000", "13000000"];
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/image"]));
+    for [talks, listens] in PAIRS {
+        let mut listener = start(&lab, Site::Desk, listens, &["image-sub", "--topic", "/image"]);
+        let args = [&["image-pub", "--topic", "/image", "--sizes"], &SIZES[..]].concat();
+        let mut talker = start(&lab, Site::Robot, talks, &args);
+        listener.wait_matched("a match at the desk");
+        talker.wait_matched("a match at the robot");
+        let mut next = || {
+            talker.go();
+            let mut sent = talker.wait("an image sent", |e| e["event"] == "sent");
+            sent["event"] = json!("received");
+            sent["whole"] = json!(true);
+            sent
+        };
+        // The first may be lost while its ends find each other.
+        let first = next();
+        let second = next();
+        let mut heard = listener.wait("an image", |e| e["event"] == "received");
+        if heard == first {
+            heard = listener.wait("another", |e| e["event"] == "received");
+        }
+        assert_eq!(heard, second, "{talks} to {listens}");
+        for _ in 0..2 {
+            let sent = next();
+            let heard = listener.wait("another", |e| e["event"] == "received");
+            assert_eq!(heard, sent, "{talks} to {listens}");
+        }
+    }
+}
+
+#[test]
+fn topic_of_a_thousand_messages_a_second_arrives_whole_and_in_time() {
+    const LATEST_P50_US: f64 = 5_000.0;
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/imu"]));
+    for [talks, listens] in PAIRS {
+        // A subscriber that keeps ten loses some when it has no processor for 10 ms, natively as well.
+        let common = ["--topic", "/imu", "--size", "300", "--depth", "0", "--timeout", PLAN.peer_life];
+        let listen = [&["sub", "--last", "3000", "--linger", "0.2"], &common[..]].concat();
+        let mut listener = lab.load(Site::Desk, listens, &listen);
+        let talk = [
+            &["pub", "--rate", "1000", "--count", "3000", "--wait-go", "--begin", "0.5", "--hold", "1"],
+            &common[..],
+        ]
+        .concat();
+        let mut talker = lab.load(Site::Robot, talks, &talk);
+        talker.wait_matched("a match at the publisher");
+        listener.wait_matched("a match at the subscriber");
+        talker.go();
+        let summary = listener.summary();
+        let counts = ["last", "lost", "duplicated", "altered", "reordered"].map(|key| count(&summary, key));
+        assert_eq!(counts, [2999, 0, 0, 0, 0], "{talks} to {listens}: {summary}");
+        assert!(
+            summary["latency_us"]["p50"].as_f64() <= Some(LATEST_P50_US),
+            "{talks} to {listens}: {summary}"
+        );
+    }
+}
