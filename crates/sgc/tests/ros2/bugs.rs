@@ -2,10 +2,13 @@
 
 use std::collections::BTreeSet;
 
+use std::time::Duration;
+
 use rustix::process::Signal;
+use sgc_testkit::netsim::{Direction, Loss, Namespace, Profile, Reorder, TunEnd, TunLink, TunOptions};
 
 use crate::lab::{Lab, Site, robot_to_desk};
-use crate::support::Peer;
+use crate::support::{Peer, eventually, say};
 use crate::{PAIRS, PLAN, count};
 
 /// Starts a Python program of `tests/peers/ros2`.
@@ -89,5 +92,91 @@ fn topic_survives_thirteen_participants_that_join_at_once() {
         // Whoever was there before still hears what is said now.
         let before = listener.events.try_iter().filter_map(|(_, e)| e["seq"].as_u64()).max();
         listener.wait("a later message", |e| e["seq"].as_u64() > before);
+    }
+}
+
+/// ros2/rmw_zenoh #425: where two distributions have different definitions of a type, topics are silent and nothing says why. Here they
+/// flow, as they do natively, and it is said.
+#[test]
+fn different_definitions_of_a_type_are_named_where_they_meet() {
+    let lab = Lab::real(PLAN, robot_to_desk("topic", PAIRS.map(|[talks, _]| format!("/differs_{talks}"))));
+    for [talks, listens] in PAIRS {
+        let topic = format!("/differs_{talks}");
+        let of = ["--topic", &topic];
+        let says = |site, text: &str| eventually(text, || lab.why(site, &topic).contains(text));
+        let _other = start(&lab, Site::Robot, talks, "features.py", &[&["other"], &of[..]].concat());
+        let mut listener = start(&lab, Site::Desk, listens, "events.py", &[&["sub"], &of[..]].concat());
+        listener.wait("a message", |e| e["event"] == "received");
+        says(Site::Desk, "✗ the definitions of std_msgs/msg/String differ: ");
+        let told = lab.status(Site::Desk)["problems"].to_string();
+        assert!(told.contains(&topic) && told.contains("RIHS01_"), "{talks} to {listens}: {told}");
+        let _talker = start(&lab, Site::Robot, talks, "events.py", &[&["pub"], &of[..]].concat());
+        says(Site::Robot, "✗ local publishers have different definitions of std_msgs/msg/String: ");
+    }
+}
+
+/// The way between two namespaces, worse than any of this machine's.
+fn bad_way(robot: &Namespace, cloud: &Namespace) -> TunLink {
+    let profile = Profile {
+        delay: Duration::from_millis(20),
+        jitter: Duration::from_millis(5),
+        loss: Loss::Random(0.05),
+        reorder: Reorder { share: 0.05, by: Duration::from_millis(10) },
+        duplicate: 0.02,
+        ..Profile::default()
+    };
+    let end = |namespace: &Namespace, address: &str| TunEnd {
+        namespace: Some(namespace.name().to_owned()),
+        interface: "radio".into(),
+        addresses: vec![address.into()],
+        routes: Vec::new(),
+    };
+    let ends = [end(robot, "10.94.1.2/24"), end(cloud, "10.94.1.1/24")];
+    TunLink::start(ends, &TunOptions { profiles: [profile; 2], ..TunOptions::default() }).unwrap()
+}
+
+/// eProsima/DDS-Router #397: over a bad network reliable messages are lost. The way loses, delays, doubles and reorders packets, and is
+/// cut for some seconds.
+#[test]
+fn reliable_messages_arrive_once_and_in_order_over_a_bad_network() {
+    const CUT: Duration = Duration::from_secs(3);
+    let mut lab =
+        Lab::silent(PLAN, robot_to_desk("topic", PAIRS.map(|[talks, _]| format!("/radio_{talks}"))));
+    let (Some(robot), Some(cloud)) = (lab.namespace(Site::Robot), lab.namespace(Site::Cloud)) else {
+        return say("no namespaces, no bad network between them: nothing is shown");
+    };
+    let way = bad_way(robot, cloud);
+    lab.reconfigure(Site::Robot, "quic://10.92.1.1", "quic://10.94.1.1");
+    for site in [Site::Robot, Site::Desk] {
+        lab.reconfigure(site, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+    }
+    lab.start_all();
+    for [talks, listens] in PAIRS {
+        let topic = format!("/radio_{talks}");
+        let of = ["--topic", &topic, "--depth", "1000"];
+        let mut listener = start(&lab, Site::Desk, listens, "events.py", &[&["sub"], &of[..]].concat());
+        let args = [&["pub", "--rate", "100"], &of[..]].concat();
+        let _talker = start(&lab, Site::Robot, talks, "events.py", &args);
+        let mut heard = Vec::new();
+        let mut hear = |messages: usize| {
+            for _ in 0..messages {
+                let event = listener.wait("a message", |e| e["event"] == "received");
+                heard.push(count(&event, "seq"));
+            }
+            heard.len()
+        };
+        hear(200);
+        way.cut();
+        std::thread::sleep(CUT);
+        way.restore();
+        hear(500);
+        assert!(heard.windows(2).all(|pair| pair[1] == pair[0] + 1), "{talks} to {listens}: {heard:?}");
+    }
+    for direction in Direction::BOTH {
+        let counters = way.counters(direction);
+        assert!(
+            [counters.lost, counters.duplicated, counters.reordered, counters.cut].iter().all(|n| *n > 0),
+            "{counters:?}"
+        );
     }
 }
