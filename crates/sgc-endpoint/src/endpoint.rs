@@ -13,11 +13,13 @@ use sgc_trust::{
     GrantError, Identity, SignedError, TrustAnchors, name_of, next_seq, operations_blind, renewal_blind,
 };
 use sgc_wire::{
-    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, ClockWatch, Control, Credentials, DescribedType,
-    Metadata, Name, NodeId, Now, OperationAnswer, Recover, RefuseReason, Role, SinkId, SourceId, TopicGrant,
+    ADVERT_NAMES_MAX, AdvertBody, Blind, Catalogue, ClockWatch, Consumer, Control, Credentials,
+    DescribedType, Metadata, Name, NodeId, Now, OperationAnswer, Recover, RefuseReason, Role, SinkId,
+    SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
+use crate::consumers::{ConsumerAsker, consumers_name};
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
 use crate::types::{TypeAsker, types_name};
@@ -221,6 +223,21 @@ pub enum Event {
         /// The types.
         types: Vec<DescribedType>,
     },
+    /// The consumers that a node has of what this one owns, whenever they change; not limited to interfaces that it was
+    /// granted.
+    Consumers {
+        /// The node.
+        peer: NodeId,
+        /// Its consumers.
+        consumers: Vec<Consumer>,
+    },
+    /// The consumers of a node are not told any more, until [`Event::Consumers`] tells them again.
+    ConsumersLost {
+        /// The node.
+        peer: NodeId,
+        /// Why.
+        reason: LostReason,
+    },
     /// A followed owner's catalogue, whenever it changes.
     Catalogue {
         /// The owner.
@@ -305,6 +322,11 @@ pub struct Endpoint {
     pub(crate) questions: BTreeMap<SinkId, TypeAsker>,
     /// Shares that were described, of which nobody who asked was told yet.
     pub(crate) untold: BTreeSet<Name>,
+    /// The name at which owners ask for this node's consumers.
+    pub(crate) consumers_name: (Name, Blind),
+    /// The consumers, by the owner of what they use; `None` until there is one.
+    pub(crate) consumers: Option<BTreeMap<NodeId, Vec<Consumer>>>,
+    pub(crate) consumer_askers: BTreeMap<SinkId, ConsumerAsker>,
     pub(crate) shares: Shares,
     pub(crate) joins: BTreeMap<Name, Join>,
     /// Catalogue names of followed owners.
@@ -355,6 +377,9 @@ impl Endpoint {
             describes: false,
             questions: BTreeMap::new(),
             untold: BTreeSet::new(),
+            consumers_name: consumers_name(&own),
+            consumers: None,
+            consumer_askers: BTreeMap::new(),
             shares: Shares::default(),
             joins: BTreeMap::new(),
             followed: BTreeMap::new(),
@@ -501,7 +526,9 @@ impl Endpoint {
         self.adverts_apart = 0;
         let types = self.describes.then_some(&self.types_name);
         let of_authority = self.renewal_name.iter().chain(&self.operations_name);
-        let fixed = self.catalogue_names.iter().chain(of_authority).chain(types).map(|(_, b)| *b);
+        let consumers = self.consumers.is_some().then_some(&self.consumers_name);
+        let fixed = self.catalogue_names.iter().chain(of_authority).chain(types).chain(consumers);
+        let fixed = fixed.map(|(_, blind)| *blind);
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
     }
 

@@ -255,6 +255,7 @@ impl Endpoint {
     fn lost(&mut self, name: Name, reason: LostReason) {
         match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
             (Some(owner), _) => self.owner_lost(*owner, reason),
+            (None, Some(Wish::Consumers)) => self.consumers_lost(name, reason),
             (None, Some(Wish::Renew(_) | Wish::Operate(_) | Wish::Types(_))) => {}
             (None, _) => self.event(Event::Lost { name, reason }),
         }
@@ -278,7 +279,7 @@ impl Endpoint {
             (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
             (None, Some(Wish::Operate(_))) => self.event(Event::OperationDenied { name, by }),
             // What is not described is not known; that is seen where it is needed.
-            (None, Some(Wish::Types(_))) => {}
+            (None, Some(Wish::Types(_) | Wish::Consumers)) => {}
             (None, _) => self.event(Event::Refused { name, by }),
         }
     }
@@ -426,6 +427,9 @@ impl Endpoint {
                 let asked = |t: &DescribedType| names.contains(&t.name);
                 let types: Vec<_> = types.into_iter().filter(asked).collect();
                 self.event(Event::Types { owner, types });
+            }
+            (GrantContent::Consumers(consumers), Some(Wish::Consumers)) => {
+                self.event(Event::Consumers { peer: owner, consumers });
             }
             _ => self.unexpected("kind of grant"),
         }

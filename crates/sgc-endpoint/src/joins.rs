@@ -82,6 +82,8 @@ pub enum Wish {
     Operate(Bytes),
     /// What the types of these interfaces of an owner look like.
     Types(Vec<Name>),
+    /// The consumers that a node has of what this one owns.
+    Consumers,
 }
 
 impl Wish {
@@ -95,6 +97,7 @@ impl Wish {
                 let question = TypeQuestion { names: names.clone() };
                 Request::Ask { what: question.to_vec().into() }
             }
+            Self::Consumers => Request::Ask { what: Bytes::new() },
         }
     }
 

@@ -12,6 +12,7 @@
 mod advert_pace;
 mod calls;
 mod compression;
+mod consumers;
 mod endpoint;
 mod history;
 mod joiner;

@@ -176,6 +176,7 @@ impl Endpoint {
             self.withdrawn.extend(name.take().map(|(_, blind)| blind));
         }
         self.withdraw_types();
+        self.withdraw_consumers();
         self.renew_at = None;
         self.enforce_at = None;
         self.catalogue_rests = None;
@@ -297,6 +298,7 @@ impl Endpoint {
             self.answer_operation(self.now, sink, Err(reason));
         }
         self.enforce_types();
+        self.enforce_consumers();
     }
 
     /// Who lost the right to a share begins anew if it gets it back.
@@ -530,7 +532,8 @@ impl Endpoint {
                         || self.is_catalogue(&name)
                         || self.is_renewal(&name)
                         || self.is_operations(&name)
-                        || self.is_types(&name))
+                        || self.is_types(&name)
+                        || self.is_consumers(&name))
                 {
                     self.refuse(name, sink, 1, why.refuse_reason());
                 }
@@ -554,6 +557,8 @@ impl Endpoint {
             self.handle_operation(name, sink, asked);
         } else if self.is_types(&name) {
             self.handle_type_question(name, sink, asked);
+        } else if self.is_consumers(&name) {
+            self.handle_consumer_question(name, sink, asked);
         } else {
             self.handle_subscribe_or_publish(name, sink, asked);
         }
@@ -742,6 +747,8 @@ impl Endpoint {
             self.operations.remove(&sink);
         } else if self.is_types(&name) {
             self.questions.remove(&sink);
+        } else if self.is_consumers(&name) {
+            self.consumer_askers.remove(&sink);
         } else if let Some(share) = self.shares.shares.get_mut(&name)
             && let Some(granted) = share.sinks.remove(&sink)
         {

@@ -10,8 +10,8 @@ use sgc_endpoint::{Event, JoinStatus, PackedType, Wish};
 use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Catalogue, Control, Decode, Encode, JoinBody, LinkStateBody, Metadata,
-    Name, Packet, SinkId, SourceId, SourceOffer,
+    AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
+    Metadata, Name, Packet, Qos, RosNode, SinkId, SourceId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -473,6 +473,37 @@ impl World {
         let names = topics.iter().map(|topic| self.name(owner, topic)).collect();
         if let Some(running) = &mut self.nodes[node.0].running {
             running.endpoint.ask_types(now, id, names);
+        }
+        self.settle(node);
+    }
+
+    /// Sets the consumers of a node: for each, the owner and the topic that it uses, and the name of its ROS 2 node.
+    pub fn set_consumers(&mut self, node: NodeKey, consumers: &[(NodeKey, &str, &str)]) {
+        self.note(format!("consumers {node:?}:{consumers:?}"));
+        let now = self.now_at(node);
+        let mut by_owner = BTreeMap::<_, Vec<_>>::new();
+        for (n, (owner, topic, ros_node)) in (0_u64..).zip(consumers) {
+            let consumer = Consumer {
+                interface: self.name(*owner, topic),
+                id: n.to_be_bytes(),
+                node: RosNode::new("/", ros_node, None).expect("a name that ROS 2 accepts"),
+                type_hash: None,
+                qos: Qos::default(),
+            };
+            by_owner.entry(self.identity(*owner).node_id()).or_default().push(consumer);
+        }
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.set_consumers(now, by_owner);
+        }
+        self.settle(node);
+    }
+
+    /// Asks another node for its consumers of what this one owns.
+    pub fn ask_consumers(&mut self, node: NodeKey, other: NodeKey) {
+        self.note(format!("ask consumers {node:?} {other:?}"));
+        let (now, id) = (self.now_at(node), self.identity(other).node_id());
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.ask_consumers(now, id);
         }
         self.settle(node);
     }

@@ -53,7 +53,9 @@ pub use issue::{KeyRequest, certificate_uris, requested_key_hash};
 pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
-pub use names::{TopicSecret, derive_name, name_of, operations_blind, renewal_blind, types_blind};
+pub use names::{
+    TopicSecret, consumers_blind, derive_name, name_of, operations_blind, renewal_blind, types_blind,
+};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{Denied, Grantees, Listed, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};

@@ -104,6 +104,17 @@ pub fn types_blind(owner: &NodeId) -> Blind {
     Blind(out)
 }
 
+/// The blind under which an owner asks a node for the consumers of its interfaces: known to all who know the node, also to
+/// owners of other fleets.
+pub fn consumers_blind(node: &NodeId) -> Blind {
+    let mut context = digest::Context::new(&digest::SHA256);
+    context.update(b"sgc consumers v1");
+    context.update(&node.0);
+    let mut out = [0; 32];
+    out.copy_from_slice(context.finish().as_ref());
+    Blind(out)
+}
+
 /// The name of an interface, by one who holds the fleet secret.
 pub fn derive_name(fleet: &FleetSecret, owner: &NodeId, metadata: &Metadata) -> Name {
     name_of(owner, &TopicSecret::derive(fleet, metadata).blind())

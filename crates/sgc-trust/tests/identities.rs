@@ -91,6 +91,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &types_blind(&owner)).to_string(),
         "828a47618f81d5ed681ad75af94f07541a24253de14f409ec53ef1c6582055bd"
     );
+    assert_eq!(
+        consumers_blind(&owner).to_string(),
+        "6a52dcc61d5d19fbb977128454aa4bd13e5b887e11d1b9f98c4e17c372e9659f"
+    );
+    assert_eq!(
+        name_of(&owner, &consumers_blind(&owner)).to_string(),
+        "234f5f5f41edbac0aa1df4fcc86e1890821e5266cf5685428698337c34faaff5"
+    );
 }
 
 #[test]

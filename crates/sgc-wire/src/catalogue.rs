@@ -3,6 +3,7 @@
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::consumers::{CONSUMERS_MAX, Consumer};
 use crate::control::{CERT_BYTES_MAX, CHAIN_CERTS_MAX, SOURCE_KEY_BYTES_MAX};
 use crate::ids::{Blind, SecretBytes, SourceId};
 use crate::metadata::Metadata;
@@ -35,6 +36,8 @@ pub enum GrantContent {
     Types(Vec<DescribedType>),
     /// The result of an operation on a fleet; from its authority.
     Operation(OperationAnswer),
+    /// The consumers that a node has of the interfaces of the owner that asked.
+    Consumers(Vec<Consumer>),
 }
 
 /// One epoch of one topic.
@@ -181,6 +184,10 @@ impl Encode for GrantContent {
                 w.u8(4);
                 answer.encode(w);
             }
+            Self::Consumers(consumers) => {
+                w.u8(5);
+                w.list(consumers, |w, c| c.encode(w));
+            }
         }
     }
 }
@@ -209,6 +216,7 @@ impl Decode for GrantContent {
             })),
             3 => Ok(Self::Types(r.list("types", TYPES_PER_QUESTION_MAX, DescribedType::decode)?)),
             4 => Ok(Self::Operation(OperationAnswer::decode(r)?)),
+            5 => Ok(Self::Consumers(r.list("consumers", CONSUMERS_MAX, Consumer::decode)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }

@@ -8,6 +8,7 @@
 mod catalogue;
 mod clock;
 mod codec;
+mod consumers;
 mod control;
 mod ids;
 mod message;
@@ -25,6 +26,7 @@ pub use catalogue::{
 };
 pub use clock::{ClockWatch, ToldClock};
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
+pub use consumers::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer};
 pub use control::{
     ADJACENCIES_MAX, ADVERT_NAMES_MAX, ASK_BYTES_MAX, ATTACHED_MAX, Adjacency, AdvertBody, Answer,
     AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX,

@@ -215,6 +215,8 @@ impl<N: RosNetwork> Core<N> {
             | Event::OwnGrant { .. }
             | Event::Recover(_)
             | Event::Types { .. }
+            | Event::Consumers { .. }
+            | Event::ConsumersLost { .. }
             | Event::Followed { .. }
             | Event::Granted { .. } => {}
         }

@@ -1,0 +1,148 @@
+//! Consumers over the wire: a node tells the owners of what it uses which ROS 2 subscribers and service clients it has of that.
+//!
+//! A node is asked at a name of its own by owners that granted it something. The answer is sealed to the owner, holds what uses
+//! interfaces of that owner alone, and is given again whenever that changes. Which of it is shown is for the owner's driver.
+
+use std::collections::BTreeMap;
+
+use sgc_trust::{consumers_blind, name_of};
+use sgc_wire::{
+    Blind, CONSUMERS_MAX, Consumer, GrantContent, Name, NodeId, Now, RefuseReason, Request, SinkId,
+};
+
+use crate::Endpoint;
+use crate::endpoint::Event;
+use crate::joins::{LostReason, Wish};
+use crate::owner::{OLDER_REQUEST, is_older, place};
+use crate::shares::GrantedSink;
+
+/// An owner that asked for this node's consumers.
+#[derive(Debug)]
+pub(crate) struct ConsumerAsker {
+    asker: GrantedSink,
+    /// The last answer.
+    told: Option<Vec<Consumer>>,
+}
+
+/// Name at which `node` is asked for its consumers.
+pub(crate) fn consumers_name(node: &NodeId) -> (Name, Blind) {
+    let blind = consumers_blind(node);
+    (name_of(node, &blind), blind)
+}
+
+/// As one who uses what others own.
+impl Endpoint {
+    /// Sets the consumers of this node, by the owner of what they use; each owner is told its own when it asks and when they
+    /// change. Those beyond [`CONSUMERS_MAX`] of an owner are left out. The name to ask at is advertised from the first
+    /// consumer on.
+    pub fn set_consumers(&mut self, now: Now, mut consumers: BTreeMap<NodeId, Vec<Consumer>>) {
+        self.now = now;
+        consumers.values_mut().for_each(|all| all.truncate(CONSUMERS_MAX));
+        if self.consumers.is_none() {
+            if consumers.is_empty() {
+                return;
+            }
+            self.withdrawn.remove(&self.consumers_name.1);
+            self.unadvertised.insert(self.consumers_name.1);
+        }
+        self.consumers = Some(consumers);
+        for sink in self.consumer_askers.keys().copied().collect::<Vec<_>>() {
+            self.tell_consumers(sink);
+        }
+    }
+
+    pub(crate) fn is_consumers(&self, name: &Name) -> bool {
+        self.consumers_name.0 == *name
+    }
+
+    pub(crate) fn handle_consumer_question(&mut self, name: Name, sink: SinkId, asker: GrantedSink) {
+        if !matches!(&asker.request, Request::Ask { what } if what.is_empty()) {
+            return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+        }
+        if self.consumers.is_none() {
+            return self.refuse(name, sink, 1, RefuseReason::NotShared);
+        }
+        let serial = match self.consumer_askers.get(&sink).map(|known| &known.asker) {
+            Some(known) if is_older(&asker, known) => return self.unexpected(OLDER_REQUEST),
+            Some(known) if known.peer.node_id == asker.peer.node_id => known.serial,
+            Some(_) => return self.refuse(name, sink, 1, RefuseReason::Limit),
+            None => {
+                let askers = self.consumer_askers.iter().map(|(sink, asked)| (sink, &asked.asker));
+                match place(askers, &asker, &self.config.limits) {
+                    Ok(None) => {}
+                    Ok(Some(oldest)) => self.end_consumer_question(oldest, RefuseReason::Limit),
+                    Err(reason) => return self.refuse(name, sink, 1, reason),
+                }
+                0
+            }
+        };
+        let asker = GrantedSink { serial, ..asker };
+        self.consumer_askers.insert(sink, ConsumerAsker { asker, told: None });
+        self.tell_consumers(sink);
+    }
+
+    /// Tells an owner its consumers here if they are others than it was told.
+    fn tell_consumers(&mut self, sink: SinkId) {
+        let (Some(asked), Some(consumers)) = (self.consumer_askers.get_mut(&sink), &self.consumers) else {
+            return;
+        };
+        let consumers = consumers.get(&asked.asker.peer.node_id).cloned().unwrap_or_default();
+        if asked.told.as_ref() == Some(&consumers) {
+            return;
+        }
+        asked.told = Some(consumers.clone());
+        asked.asker.serial += 1;
+        let (serial, reply_key) = (asked.asker.serial, asked.asker.reply_key.clone());
+        let content = GrantContent::Consumers(consumers);
+        if !self.grant(self.consumers_name.0, sink, serial, &reply_key, &content) {
+            self.consumer_askers.remove(&sink);
+        }
+    }
+
+    /// Cuts owners that lost their certificate.
+    pub(crate) fn enforce_consumers(&mut self) {
+        let lost = |(sink, asked): (&SinkId, &ConsumerAsker)| {
+            self.standing(&asked.asker.peer).map(|reason| (*sink, reason))
+        };
+        let lost: Vec<_> = self.consumer_askers.iter().filter_map(lost).collect();
+        for (sink, reason) in lost {
+            self.end_consumer_question(sink, reason);
+        }
+    }
+
+    fn end_consumer_question(&mut self, sink: SinkId, reason: RefuseReason) {
+        if let Some(asked) = self.consumer_askers.remove(&sink) {
+            self.refuse(self.consumers_name.0, sink, asked.asker.serial + 1, reason);
+        }
+    }
+
+    pub(crate) fn withdraw_consumers(&mut self) {
+        if self.consumers.take().is_some() {
+            self.unadvertised.remove(&self.consumers_name.1);
+            self.withdrawn.insert(self.consumers_name.1);
+        }
+        self.consumer_askers.clear();
+    }
+}
+
+/// As an owner.
+impl Endpoint {
+    /// Asks a node for its consumers of what this one owns, until [`Self::leave_consumers`]. A node that tells none, or is of
+    /// a version that cannot, does not advertise the name that it is asked at: then nothing happens.
+    pub fn ask_consumers(&mut self, now: Now, peer: NodeId) {
+        let (name, _) = consumers_name(&peer);
+        self.join(now, name, peer, Wish::Consumers);
+    }
+
+    /// Asks a node no longer.
+    pub fn leave_consumers(&mut self, now: Now, peer: &NodeId) {
+        let (name, _) = consumers_name(peer);
+        self.leave(now, &name);
+    }
+
+    pub(crate) fn consumers_lost(&mut self, name: Name, reason: LostReason) {
+        if let Some(peer) = self.joins.get(&name).map(|join| join.owner) {
+            self.event(Event::ConsumersLost { peer, reason });
+        }
+    }
+}

@@ -1,0 +1,108 @@
+//! Consumers: the ROS 2 subscribers and service clients of a node, as it tells them to the owner of what they use.
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::ids::Name;
+use crate::qos::Qos;
+use crate::ros_node::RosNode;
+use crate::types::TYPE_HASH_BYTES_MAX;
+
+/// Most consumers in one answer.
+pub const CONSUMERS_MAX: usize = 512;
+/// Most consumers of one interface that a node tells, and that its owner shows of that node.
+pub const CONSUMERS_PER_INTERFACE_MAX: usize = 16;
+
+/// A subscriber or a service client.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Consumer {
+    /// The interface that it uses.
+    pub interface: Name,
+    /// The same for as long as the consumer lives; tells apart those of one node and interface.
+    pub id: [u8; 8],
+    /// The ROS 2 node that it belongs to.
+    pub node: RosNode,
+    /// `RIHS01_…` type hash, if its network says it.
+    pub type_hash: Option<String>,
+    /// The QoS that it requests; of a service client, ROS 2's for services.
+    pub qos: Qos,
+}
+
+impl Encode for Consumer {
+    fn encode(&self, w: &mut Writer) {
+        self.interface.encode(w);
+        w.raw(&self.id);
+        self.node.encode(w);
+        w.option(self.type_hash.as_ref(), |w, hash| w.str(hash));
+        self.qos.encode(w);
+    }
+}
+
+impl Decode for Consumer {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self {
+            interface: Name::decode(r)?,
+            id: r.array("consumer")?,
+            node: RosNode::decode(r)?,
+            type_hash: r.option("type hash", |r| r.str("type hash", TYPE_HASH_BYTES_MAX))?,
+            qos: Qos::decode(r)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::catalogue::GrantContent;
+    use crate::control::SEALED_BYTES_MAX;
+
+    fn consumer(name: &str) -> Consumer {
+        let node = RosNode::new("/desk", name, None).unwrap();
+        let (interface, type_hash) = (Name([7; 32]), Some("RIHS01_ab".to_owned()));
+        Consumer { interface, id: *b"consumer", node, type_hash, qos: Qos::default() }
+    }
+
+    /// The bytes are normative.
+    #[test]
+    fn consumers_have_these_bytes() {
+        let bytes = [
+            &[7; 32][..],
+            b"consumer",
+            &[0, 0, 0, 5],
+            b"/desk",
+            &[0, 0, 0, 4],
+            b"rviz",
+            &[0, 1, 0, 0, 0, 9],
+            b"RIHS01_ab",
+            &Qos::default().to_vec(),
+        ]
+        .concat();
+        assert_eq!(consumer("rviz").to_vec(), bytes);
+        assert_eq!(Consumer::from_slice(&bytes), Ok(consumer("rviz")));
+        let content = GrantContent::Consumers(vec![consumer("rviz")]);
+        assert_eq!(content.to_vec(), [&[5, 0, 0, 0, 1][..], &bytes].concat());
+        assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));
+    }
+
+    #[test]
+    fn the_longest_answer_has_room_and_a_longer_one_is_refused() {
+        let long = "n".repeat(RosNode::NAME_BYTES_MAX - 1);
+        let path = format!("/{long}");
+        let node = RosNode::new(&path, &long, Some(&path)).unwrap();
+        let type_hash = Some("h".repeat(TYPE_HASH_BYTES_MAX));
+        let longest = vec![Consumer { node, type_hash, ..consumer("rviz") }; CONSUMERS_MAX + 1];
+        let fits = GrantContent::Consumers(longest[1..].to_vec()).to_vec();
+        assert!(fits.len() < SEALED_BYTES_MAX && GrantContent::from_slice(&fits).is_ok());
+        let refused = GrantContent::from_slice(&GrantContent::Consumers(longest).to_vec());
+        assert!(matches!(refused, Err(DecodeError::TooLong { field: "consumers", .. })), "{refused:?}");
+    }
+
+    #[test]
+    fn hostile_node_names_are_refused() {
+        let bytes = consumer("rviz").to_vec();
+        let at = bytes.windows(4).position(|word| word == b"rviz").unwrap();
+        for name in [b"rv/z", b"1viz", b"\x1b[2J", b"r iz"] {
+            let mut hostile = bytes.clone();
+            hostile[at..at + 4].copy_from_slice(name);
+            assert!(Consumer::from_slice(&hostile).is_err(), "{name:?}");
+        }
+    }
+}
