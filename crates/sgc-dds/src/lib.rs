@@ -37,6 +37,7 @@ mod reader;
 mod rpc;
 mod sample;
 mod service;
+mod shown;
 pub mod user_data;
 mod wait;
 mod writer;

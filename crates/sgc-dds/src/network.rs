@@ -14,7 +14,7 @@ use cyclors::{
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{
     DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError,
-    RosNetwork, SampleHandler, ServiceSpec,
+    RosNetwork, SampleHandler, ServiceSpec, ShownEndpoint,
 };
 
 use crate::announced;
@@ -31,6 +31,7 @@ use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
 use crate::sample;
 use crate::service::{CycloneClient, CycloneServer};
+use crate::shown;
 use crate::user_data;
 use crate::writer::CycloneWriter;
 
@@ -179,6 +180,18 @@ impl RosNetwork for CycloneNetwork {
 
     fn reader_guid(&self, reader: &CycloneReader) -> Guid {
         reader.guid()
+    }
+
+    fn has_graph(&self) -> bool {
+        self.announcer.is_some()
+    }
+
+    fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError> {
+        let word = match kind {
+            EndpointKind::Reader => "reader",
+            EndpointKind::Writer => "writer",
+        };
+        shown::create(&self.participant, kind, spec).map_err(|reason| refuse_endpoint(word, spec, reason))
     }
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {

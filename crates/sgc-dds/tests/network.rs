@@ -1065,6 +1065,32 @@ fn what_proxies_announce_is_for_ros_and_not_for_other_proxies() {
 }
 
 #[test]
+fn shown_endpoints_are_seen_with_type_and_qos_and_match_none() {
+    let (ros, sgc) = (open(103, None), open(103, Some("arm-1")));
+    let seen = discover(&ros);
+    let hash = Some("RIHS01_ab".to_owned());
+    let best_effort = |qos: &mut Qos| qos.reliability = Reliability::BestEffort;
+    let shown = with(EndpointSpec { type_hash: hash.clone(), ..spec("chatter") }, best_effort);
+    let talker = ros.create_writer(&spec("chatter")).unwrap();
+    let (_listener, _samples) = read(&ros, &spec("chatter"));
+    for kind in [EndpointKind::Reader, EndpointKind::Writer] {
+        let endpoint = sgc.show(kind, &shown).unwrap();
+        let found = appeared(&seen);
+        assert_eq!((found.kind, found.guid, found.topic), (kind, endpoint.guid, shown.topic.clone()));
+        assert_eq!((found.type_hash, found.qos.reliability), (hash.clone(), Reliability::BestEffort));
+        drop(endpoint);
+        assert_eq!(vanished(&seen), found.guid);
+    }
+    let _shown = [EndpointKind::Reader, EndpointKind::Writer].map(|kind| sgc.show(kind, &shown).unwrap());
+    // One that matches comes later, so that those that do not have been looked at.
+    let (_reader, samples) = read(&sgc, &spec("chatter"));
+    matched(&talker, 2);
+    write(&talker, &string_cdr("once"));
+    assert_eq!(next(&samples).payload, padded(&string_cdr("once")));
+    assert_eq!(talker.matched_readers(), 2);
+}
+
+#[test]
 fn ids_are_as_long_as_those_of_the_network() {
     let sgc = open_graph(98, Some("arm-1"));
     let events = discover(&sgc);

@@ -4,6 +4,7 @@
 //! happens in tasks and threads of its own.
 
 mod alerts;
+mod consumers;
 mod graph;
 mod nodes;
 mod operations;
@@ -22,8 +23,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{
-    DiscoveryEvent, EndpointSpec, Guid, RosClient, RosNetwork, RosServer, Routes, ServiceSpec, ShareRule,
-    UseRule,
+    DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosNetwork, RosServer, Routes, ServiceSpec,
+    ShareRule, ShownEndpoint, UseRule,
 };
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
@@ -38,6 +39,7 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::authority::{Authority, DeskAnswers};
 use crate::calls::Calls;
 use crate::control_queue::{FrameRoom, Inbox, InboxShare};
+use crate::core::consumers::{ConsumerKey, FarConsumers};
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
 use crate::core::types::{TypeOutcome, Types};
@@ -140,6 +142,13 @@ pub(crate) enum CoreEvent {
         guid: Guid,
         /// Dropping it ends it.
         reader: Box<dyn std::any::Any + Send>,
+    },
+    /// Endpoints that stand for a consumer elsewhere were made, or not.
+    ConsumerShown {
+        /// The consumer.
+        key: ConsumerKey,
+        /// As they were asked for, each with its endpoint.
+        ends: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
     },
     /// What calls local servers for others was made, or what local clients call.
     ServiceReady {
@@ -257,6 +266,8 @@ pub(crate) struct Core<N: RosNetwork> {
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     /// Which nodes the local graph shows for them.
     graph: LocalGraph,
+    /// The subscribers and service clients that owners are told, and those elsewhere that are shown here.
+    consumers: FarConsumers,
     history_due: BTreeMap<(Name, SourceId), Instant>,
     /// When the keys of past epochs of a joined name are dropped.
     retire_due: BTreeMap<Name, Instant>,
@@ -384,6 +395,7 @@ impl<N: RosNetwork> Core<N> {
             service_ends: HashMap::new(),
             writers: HashMap::new(),
             graph,
+            consumers: FarConsumers::default(),
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
             message_keys: parts.message_keys,
@@ -542,6 +554,7 @@ impl<N: RosNetwork> Core<N> {
                     (_, None) => {}
                 }
             }
+            CoreEvent::ConsumerShown { key, ends } => self.consumer_shown(key, ends),
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
             CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
             CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
@@ -627,6 +640,7 @@ impl<N: RosNetwork> Core<N> {
         self.operations_due(now.instant);
         self.calls_due(now.instant);
         self.types_due(now.instant);
+        self.consumers_due(now);
         self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
@@ -662,13 +676,15 @@ impl<N: RosNetwork> Core<N> {
                 self.carry_out(command);
             }
             if !progressed {
+                self.note_consumers();
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let history = self.history_due.values().min().copied();
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
                 let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
-                let all = all.into_iter().chain(own).chain([self.types.deadline()]);
+                let all =
+                    all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
                 return all.flatten().min();
             }
         }
@@ -701,6 +717,7 @@ impl<N: RosNetwork> Core<N> {
     /// Stops taking in; what is queued still leaves.
     fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
         self.routes = None;
+        self.end_consumers();
         self.local_taps.drain(..).for_each(|tap| tap.close());
         for share in self.shares.values() {
             share.close();

@@ -8,9 +8,42 @@ mod support;
 
 use lab::{Lab, share, uses};
 use sgc_ros::{EndpointKind, GraphNode, Guid, RosNetwork, RosWriter};
-use sgc_testkit::{FakeDomain, FakeRos, FakeWriter};
-use sgc_wire::{Qos, Reliability, RosNode};
+use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
+use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Qos, Reliability, RosNode};
 use support::*;
+
+/// A participant with one node of this name, which has a reader of a topic.
+struct ListeningProcess {
+    net: FakeRos,
+    reader: FakeReader,
+}
+
+impl ListeningProcess {
+    fn new(domain: &FakeDomain, node: &str, topic: &str) -> Self {
+        let net = domain.join(false);
+        let reader =
+            net.create_reader(&spec(topic, Qos::default()), Box::new(|_: sgc_ros::Sample| {})).unwrap();
+        let process = Self { net, reader };
+        process.is_called(node);
+        process
+    }
+
+    fn is_called(&self, node: &str) {
+        let node = RosNode::new("/desk", node, None).unwrap();
+        self.net.announce(&[GraphNode { node, readers: vec![self.reader.guid()], writers: vec![] }]).unwrap();
+    }
+}
+
+/// Waits until proxies on a network announce exactly these nodes, each with so many readers and writers.
+fn shows_ends(net: &FakeDomain, expected: &[(&str, usize, usize)]) {
+    let expected: Vec<_> =
+        expected.iter().map(|(node, readers, writers)| ((*node).to_owned(), *readers, *writers)).collect();
+    let deadline = std::time::Instant::now() + PATIENCE;
+    while net.mirrored() != expected {
+        assert!(std::time::Instant::now() < deadline, "{:?} instead of {expected:?}", net.mirrored());
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}
 
 /// A participant with one node of this name, which has a writer on each topic.
 struct RosProcess {
@@ -155,4 +188,73 @@ fn every_publisher_has_its_own_qos_and_others_may_publish_beside() {
     assert!(offered.iter().any(|qos| qos.deadline_ns.is_none()), "{offered:?}");
     assert!(offered.iter().all(|qos| qos.reliability == Reliability::Reliable), "{offered:?}");
     assert_eq!(watch.count("rt/a", EndpointKind::Reader), 0);
+}
+
+#[test]
+fn subscribers_of_a_shared_topic_appear_at_its_owner_and_vanish() {
+    let trio = Trio::new();
+    let (_cloud, _robot) = (trio.cloud(), trio.robot(&["/a", "/b"], "desk"));
+    let mut desk = trio.desk(&["/a"]);
+    let _talker = RosProcess::new(&trio.robot_net, "talker", &["/a", "/b"]);
+    let net = &trio.robot_net;
+    let view = ListeningProcess::new(&trio.desk_net, "view", "/a");
+    let _private = ListeningProcess::new(&trio.desk_net, "private", "/other");
+    let _unused = ListeningProcess::new(&trio.desk_net, "unused", "/b");
+    shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    let recorder = ListeningProcess::new(&trio.desk_net, "recorder", "/a");
+    shows_ends(net, &[("/desk/recorder", 1, 0), ("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    // One reader takes the messages, and an endpoint stays when its node is renamed.
+    assert_eq!(net.count("rt/a", EndpointKind::Reader), 1);
+    let shown = net.guids("shown:rt/a", EndpointKind::Reader);
+    recorder.is_called("renamed");
+    shows_ends(net, &[("/desk/renamed", 1, 0), ("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    assert_eq!(net.guids("shown:rt/a", EndpointKind::Reader), shown);
+    let gone = std::time::Instant::now();
+    drop(recorder);
+    shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    assert!(gone.elapsed() < std::time::Duration::from_secs(1), "{:?}", gone.elapsed());
+    // A node that goes in good order takes its subscribers with it; one that comes back shows them again.
+    desk.stop();
+    shows_ends(net, &[("/sgc_robot", 1, 0)]);
+    desk = trio.desk(&["/a"]);
+    shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    // What is not used any more is not told any more.
+    desk.reload(|config| config.uses.clear());
+    shows_ends(net, &[("/sgc_robot", 1, 0)]);
+    drop(view);
+}
+
+#[test]
+fn subscribers_of_a_node_that_is_lost_go_after_a_while_and_a_restarted_router_changes_nothing() {
+    let trio = Trio::new();
+    let (mut cloud, _robot, desk) = (trio.cloud(), trio.robot(&["/a"], "desk"), trio.desk(&["/a"]));
+    let _talker = RosProcess::new(&trio.robot_net, "talker", &["/a"]);
+    let _view = ListeningProcess::new(&trio.desk_net, "view", "/a");
+    let net = &trio.robot_net;
+    let both = [("/desk/view", 1, 0), ("/sgc_robot", 1, 0)];
+    shows_ends(net, &both);
+    let shown = net.guids("shown:rt/a", EndpointKind::Reader);
+    cloud.kill();
+    cloud = trio.cloud();
+    let again = ListeningProcess::new(&trio.desk_net, "again", "/a");
+    shows_ends(net, &[("/desk/again", 1, 0), ("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
+    assert!(net.guids("shown:rt/a", EndpointKind::Reader).contains(&shown[0]));
+    drop(again);
+    shows_ends(net, &both);
+    desk.kill();
+    wait("no subscriber is shown", || net.count("shown:rt/a", EndpointKind::Reader) == 0);
+    drop(cloud);
+}
+
+#[test]
+fn subscribers_beyond_the_bound_are_counted_and_not_shown() {
+    let trio = Trio::new();
+    let (_cloud, _robot, desk) = (trio.cloud(), trio.robot(&["/a"], "desk"), trio.desk(&["/a"]));
+    let _talker = RosProcess::new(&trio.robot_net, "talker", &["/a"]);
+    let nodes: Vec<_> = (0..CONSUMERS_PER_INTERFACE_MAX + 2).map(|n| format!("n{n}")).collect();
+    let _views: Vec<_> = nodes.iter().map(|node| ListeningProcess::new(&trio.desk_net, node, "/a")).collect();
+    let shown = || trio.robot_net.count("shown:rt/a", EndpointKind::Reader);
+    wait("as many as are shown", || shown() == CONSUMERS_PER_INTERFACE_MAX);
+    wait("those beyond are counted", || desk.drops("consumers_untold") == 2);
+    assert_eq!(shown(), CONSUMERS_PER_INTERFACE_MAX);
 }

@@ -18,15 +18,15 @@ pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_nam
 pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
     HandleSamples, KeyHash, RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter,
-    Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec,
+    Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosPolicy, RELIABLE_READER_DEPTH_MIN,
     SERVICE_DEPTH, mismatches, of_all_instances, reader_for, service_qos, weakest,
 };
 pub use routes::{
-    Command, Direction, GLOBAL_TOPICS, LITERAL_TOPICS, Naming, OfferView, Problem, REDISCOVERY_HOLD,
-    ROUTES_PER_WILDCARD_MAX, Rename, RouteStatus, Routes, SINKLESS_HOLD, Shaping, ShareRouteView, ShareRule,
-    ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseView, WRITERLESS_HOLD, is_for_wildcards,
-    is_pattern, matches,
+    Command, Consumers, Direction, GLOBAL_TOPICS, LITERAL_TOPICS, Naming, OfferView, Problem,
+    REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, RouteStatus, Routes, SINKLESS_HOLD, Shaping,
+    ShareRouteView, ShareRule, ShareView, UNREACHABLE_HOLD, UseRouteView, UseRule, UseView, WRITERLESS_HOLD,
+    is_for_wildcards, is_pattern, matches,
 };

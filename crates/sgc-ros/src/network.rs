@@ -4,6 +4,7 @@
 //! `sgc-testkit` in memory for tests. Payloads are serialised samples: the four-byte encapsulation
 //! header (RTPS 2.5, 10.2) and the body, untouched.
 
+use std::any::Any;
 use std::fmt;
 use std::time::Duration;
 
@@ -261,6 +262,26 @@ pub trait RosServer: Send + Sync + 'static {
     fn guids(&self) -> [Guid; 2];
 }
 
+/// An endpoint that the local graph shows and that no other matches; lives until dropped, which may block.
+pub struct ShownEndpoint {
+    /// Its GUID.
+    pub guid: Guid,
+    _endpoint: Box<dyn Any + Send>,
+}
+
+impl ShownEndpoint {
+    /// Wraps the entities that have the endpoint shown until they are dropped.
+    pub fn new(guid: Guid, entities: impl Any + Send) -> Self {
+        Self { guid, _endpoint: Box::new(entities) }
+    }
+}
+
+impl fmt::Debug for ShownEndpoint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ShownEndpoint").field("guid", &self.guid).finish_non_exhaustive()
+    }
+}
+
 /// Receives discovery events on a thread of the network; must not block.
 pub type DiscoveryHandler = Box<dyn FnMut(DiscoveryEvent) + Send>;
 
@@ -350,6 +371,13 @@ pub trait RosNetwork: Send + Sync + 'static {
 
     /// GUID of a reader made here.
     fn reader_guid(&self, reader: &Self::Reader) -> Guid;
+
+    /// Returns `true` if nodes are told of and announced.
+    fn has_graph(&self) -> bool;
+
+    /// Has the local graph show an endpoint that stands for one elsewhere: with its type, type hash and QoS but for history and
+    /// partitions. No endpoint matches it, so that it takes nothing, acknowledges nothing and gives nothing. May block.
+    fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError>;
 
     /// Has the local graph show these nodes, and no others, as this participant's. May block.
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError>;

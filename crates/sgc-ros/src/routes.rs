@@ -10,6 +10,7 @@
 //! route whose one entry comes with the grant, from an owner of another fleet whose catalogue this node cannot read.
 
 mod command;
+mod consumers;
 mod graph;
 mod naming;
 mod problems;
@@ -40,6 +41,7 @@ use problems::{Cause, Problems};
 use settling::Settling;
 
 pub use command::{Command, Problem};
+pub use consumers::Consumers;
 pub use naming::{
     GLOBAL_TOPICS, LITERAL_TOPICS, Naming, ROUTES_PER_WILDCARD_MAX, Rename, is_for_wildcards, is_pattern,
     matches,
@@ -348,6 +350,8 @@ pub struct Routes<R> {
     waits: bool,
     /// A route has ended since that was looked at.
     freed: bool,
+    /// Local consumers, or what they use, may be others than before.
+    consumers_changed: bool,
     commands: VecDeque<Command>,
 }
 
@@ -377,6 +381,7 @@ impl<R: RngCore> Routes<R> {
             problems: Problems::default(),
             waits: false,
             freed: false,
+            consumers_changed: false,
             commands: VecDeque::new(),
         };
         routes.join_tokens();
@@ -391,6 +396,7 @@ impl<R: RngCore> Routes<R> {
 
     /// The local graph changed.
     pub fn handle_discovery(&mut self, now: Instant, event: DiscoveryEvent) {
+        self.consumers_changed = true;
         match event {
             DiscoveryEvent::Appeared(endpoint) => {
                 if self.endpoints.len() >= LOCAL_ENDPOINTS_MAX {

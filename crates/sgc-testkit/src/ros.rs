@@ -13,7 +13,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
     RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
-    SampleHead, SampleKind, ServiceSpec,
+    SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
 };
 use sgc_wire::{History, Qos};
 
@@ -314,6 +314,25 @@ impl RosNetwork for FakeRos {
 
     fn reader_guid(&self, reader: &FakeReader) -> Guid {
         reader.guid
+    }
+
+    fn has_graph(&self) -> bool {
+        true
+    }
+
+    fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError> {
+        // No other endpoint has the topic.
+        let spec = EndpointSpec { topic: format!("shown:{}", spec.topic), ..spec.clone() };
+        Ok(match kind {
+            EndpointKind::Reader => {
+                let reader = self.create_reader(&spec, Box::new(|_: Sample| {}))?;
+                ShownEndpoint::new(reader.guid, reader)
+            }
+            EndpointKind::Writer => {
+                let writer = self.create_writer(&spec)?;
+                ShownEndpoint::new(writer.guid, writer)
+            }
+        })
     }
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {

@@ -6,6 +6,7 @@ import sys
 import time
 
 import rclpy
+from rclpy.action import get_action_client_names_and_types_by_node
 from rclpy.node import Node
 
 
@@ -14,6 +15,10 @@ def main() -> int:
     parser.add_argument("--topic", required=True)
     parser.add_argument("--publishers", type=int, default=0, help="waits for so many")
     parser.add_argument("--subscribers", type=int, default=0, help="waits for so many")
+    parser.add_argument("--exactly", action="store_true", help="waits for just so many")
+    parser.add_argument("--service", help="shows its clients")
+    parser.add_argument("--action", help="shows its clients")
+    parser.add_argument("--client", help="waits until this node, with its namespace, is among them")
     parser.add_argument("--node", help="waits until all publishers are of this node")
     parser.add_argument("--timeout", type=float, default=60)
     options = parser.parse_args()
@@ -37,17 +42,39 @@ def main() -> int:
     def endpoints(read):
         return [endpoint(info) for info in read(options.topic)]
 
+    def clients(read, interface):
+        found = []
+        for name, namespace in node.get_node_names_and_namespaces():
+            try:
+                if interface in dict(read(name, namespace)):
+                    found.append(f"{namespace.rstrip('/')}/{name}")
+            except RuntimeError:  # NodeNameNonExistentError: gone meanwhile
+                pass
+        return sorted(found)
+
+    def action_clients(name, namespace):
+        return get_action_client_names_and_types_by_node(node, name, namespace)
+
+    def is_there(found):
+        return options.client in found or not options.client
+
     while True:
+        service_clients = clients(node.get_client_names_and_types_by_node, options.service) if options.service else []
+        in_action = clients(action_clients, options.action) if options.action else []
         publishers = endpoints(node.get_publishers_info_by_topic)
         subscribers = endpoints(node.get_subscriptions_info_by_topic)
         is_known = all(e["node"] and not e["node"].startswith("_") for e in publishers + subscribers)
         is_known = is_known and all(e["node"] == options.node or not options.node for e in publishers)
-        enough = len(publishers) >= options.publishers and len(subscribers) >= options.subscribers
+        have, wanted = (len(publishers), len(subscribers)), (options.publishers, options.subscribers)
+        enough = have == wanted if options.exactly else have[0] >= wanted[0] and have[1] >= wanted[1]
+        enough = enough and (not options.service or is_there(service_clients)) and (not options.action or is_there(in_action))
         if (enough and is_known) or time.monotonic() > deadline:
             break
         rclpy.spin_once(node, timeout_sec=0.1)
     nodes = sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in node.get_node_names_and_namespaces())
-    print(json.dumps({"event": "summary", "publishers": publishers, "subscribers": subscribers, "nodes": nodes}), flush=True)
+    said = {"publishers": publishers, "subscribers": subscribers, "nodes": nodes}
+    said |= {"service_clients": service_clients, "action_clients": in_action}
+    print(json.dumps({"event": "summary"} | said), flush=True)
     return 0
 
 

@@ -1,17 +1,25 @@
-//! What the local ROS graph shows of this proxy: the far nodes that its writers stand for, and one of its own for the
+//! What the local ROS graph shows of this proxy: the far nodes that its endpoints stand for, and one of its own for the
 //! rest.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use sgc_ros::{GraphNode, Guid, RosNetwork};
+use sgc_ros::{EndpointKind, GraphNode, Guid, RosNetwork};
 use sgc_wire::{Name, NodeId, RosNode, SourceId};
 use tracing::debug;
 
 use super::Core;
+use super::consumers::ConsumerKey;
 
 /// A local writer: the joined name, and the source that it is for.
 type WriterKey = (Name, Option<SourceId>);
+
+/// The endpoints that stand for one consumer, and its node.
+struct ConsumerEnds {
+    node: (NodeId, RosNode),
+    readers: Vec<Guid>,
+    writers: Vec<Guid>,
+}
 
 /// Which endpoints are here, and whose.
 pub(super) struct LocalGraph {
@@ -20,6 +28,8 @@ pub(super) struct LocalGraph {
     /// Each with the node of SGC that it is of: nodes of two robots may have one name.
     nodes: BTreeMap<WriterKey, (NodeId, RosNode)>,
     readers: BTreeMap<Name, Guid>,
+    /// Endpoints that stand for consumers elsewhere.
+    consumers: BTreeMap<ConsumerKey, ConsumerEnds>,
     has_changed: bool,
     /// What is to be shown, for the thread that shows it; `None` once that has taken it.
     wanted: Arc<Mutex<Option<Vec<GraphNode>>>>,
@@ -35,6 +45,7 @@ impl LocalGraph {
             writers: BTreeMap::new(),
             nodes: BTreeMap::new(),
             readers: BTreeMap::new(),
+            consumers: BTreeMap::new(),
             has_changed: true,
             wanted: Arc::default(),
             showing: Arc::default(),
@@ -90,6 +101,20 @@ impl LocalGraph {
         };
     }
 
+    /// Endpoints stand for a consumer of this node from here on.
+    pub(super) fn consumer_there(&mut self, key: ConsumerKey, node: RosNode, ends: &[(EndpointKind, Guid)]) {
+        let of = |kind| ends.iter().filter(move |(of, _)| *of == kind).map(|(_, guid)| *guid).collect();
+        let node = (key.peer, node);
+        let ends =
+            ConsumerEnds { node, readers: of(EndpointKind::Reader), writers: of(EndpointKind::Writer) };
+        self.consumers.insert(key, ends);
+        self.has_changed = true;
+    }
+
+    pub(super) fn consumer_gone(&mut self, key: &ConsumerKey) {
+        self.has_changed |= self.consumers.remove(key).is_some();
+    }
+
     /// All nodes, each of one owner once, if something changed since this was asked.
     fn changed(&mut self) -> Option<Vec<GraphNode>> {
         if !std::mem::take(&mut self.has_changed) {
@@ -108,6 +133,11 @@ impl LocalGraph {
                 Some(node) => far.entry(node).or_default().1.push(*guid),
                 None => own.1.push(*guid),
             }
+        }
+        for ends in self.consumers.values() {
+            let of_node = far.entry(&ends.node).or_default();
+            of_node.0.extend(&ends.readers);
+            of_node.1.extend(&ends.writers);
         }
         let own = self.own.clone().map(|node| GraphNode { node, readers: own.0, writers: own.1 });
         let far = far.into_iter().map(|((_, node), (readers, writers))| GraphNode {
@@ -188,6 +218,13 @@ mod tests {
         graph.writer_gone(&(name, source(1)));
         graph.set_node((name, source(3)), NodeId([2; 32]), None);
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 2), of("/talker", 0, 1)]);
+        // A node that publishes and subscribes is one node.
+        let of_two = ConsumerKey { interface: name, peer: NodeId([2; 32]), id: [1; 8] };
+        graph.writer_there((name, source(2)), guid(4));
+        graph.consumer_there(of_two, talker().unwrap(), &[(EndpointKind::Reader, guid(6))]);
+        assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 1, 1)]);
+        graph.consumer_gone(&of_two);
+        assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 0, 1)]);
         graph.reader_gone(&name);
         [None, source(2), source(3)].iter().for_each(|s| graph.writer_gone(&(name, *s)));
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 0, 0)]);

@@ -1,7 +1,7 @@
 //! What router and endpoint want done, and what happened that somebody has to know.
 
 use sgc_endpoint::{Event, Output as EndpointOutput};
-use sgc_ros::RosNetwork;
+use sgc_ros::{RosNetwork, UNREACHABLE_HOLD};
 use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
 use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Now, RefuseReason, Role};
@@ -125,6 +125,8 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Consumers { peer, consumers } => self.consumers_told(now, peer, consumers),
+            Event::ConsumersLost { peer, reason } => self.consumers_lost(now, peer, reason),
             Event::Types { owner, types } => self.types_told(owner, types),
             Event::Recover(recover) => {
                 if let Some(share) = self.shares.get(&recover.name)
@@ -165,16 +167,19 @@ impl<N: RosNetwork> Core<N> {
                 graph::forget_refusal(&mut self.refused, &name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
                     routes.handle_sink_joined(&name, sink);
+                    self.consumers.sink_joined(now.instant, peer, name, sink);
                 }
             }
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
                 routes.handle_sink_left(now.instant, &name, &sink);
+                self.consumers.sink_left(peer, name, sink, now.instant + UNREACHABLE_HOLD);
             }
             Event::SinkCut { name, sink, peer, reason } => {
                 info!(peer = %peer.short(), %reason, "took a grant back; a new epoch begins");
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 routes.handle_sink_left(now.instant, &name, &sink);
+                self.consumers.sink_left(peer, name, sink, now.instant);
             }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");

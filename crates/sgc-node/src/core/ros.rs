@@ -77,6 +77,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::Unshare { name } => {
                 self.endpoint.unshare(now, &name);
+                self.consumers.show_soon(now.instant);
                 self.forget_type(&name);
                 if let Some(share) = self.shares.remove(&name) {
                     share.close();

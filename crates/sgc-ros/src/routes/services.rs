@@ -24,7 +24,7 @@ pub(super) fn interface(topic: &str) -> Option<(Kind, &str)> {
 }
 
 /// Both topics of a service.
-fn service_spec(local_name: &str, type_name: &str, type_hash: Option<&str>) -> ServiceSpec {
+pub(super) fn service_spec(local_name: &str, type_name: &str, type_hash: Option<&str>) -> ServiceSpec {
     let half = |half: ServiceTopic, type_hash: Option<&str>| EndpointSpec {
         topic: half.dds_topic(local_name),
         type_name: half.dds_type(type_name),

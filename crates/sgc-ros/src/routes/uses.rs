@@ -134,6 +134,7 @@ impl<R: RngCore> Routes<R> {
         }
         if let Some(route) = self.uses.get_mut(name) {
             route.granted = true;
+            self.consumers_changed = true;
             route.refused = None;
             route.unreachable_until = None;
             let rule = route.rule;
@@ -183,6 +184,7 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn entry_there(&mut self, name: Name, rule: usize, entry: CatalogueEntry) {
         let transient_local = entry.qos.is_transient_local();
         let local_name = self.use_rules[rule].local_name(&entry.metadata);
+        self.consumers_changed = true;
         let goes_on = |route: &UseRoute| {
             self.use_rules[route.rule].direction == self.use_rules[rule].direction
                 && route.local_name == local_name
@@ -253,6 +255,7 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
             self.freed = true;
+            self.consumers_changed = true;
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
             }

@@ -223,6 +223,21 @@ const CONTROL: &[Refusal] = &[
     named("create_writer", "the local network refused a writer", DDS_LOG),
     counted("create_service", "the local network refused an end of a service", DDS_LOG),
     counted("announce_nodes", "the local network could not be told of other nodes", DDS_LOG),
+    counted(
+        "show_consumer",
+        "the local network could not be shown a subscriber or client of another node",
+        DDS_LOG,
+    ),
+    counted(
+        "consumers_untold",
+        "more subscribers or clients use one interface of another node than its owner is told of",
+        "",
+    ),
+    counted(
+        "consumers_unshown",
+        "more subscribers or clients of other nodes use what is shared here than the local graph shows",
+        "",
+    ),
     counted("frames", "a transform could not be given the prefix of its owner", SAME_VERSION),
     counted("call_refused", "a call was refused: too many were under way, or its server is not there", ""),
     counted("reply_to_nothing", "a reply came to a call that nobody waits for any more", ""),

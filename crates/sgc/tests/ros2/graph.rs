@@ -1,10 +1,12 @@
-//! Far programs in the local ROS graph, as a program of each distribution reads it.
+//! Far programs in the local ROS graph, those that publish and those that consume, as a program of each distribution reads it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
+use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::lab::{Lab, Site, robot_to_desk};
+use crate::lab::{Lab, Site, robot_to_desk, share, uses};
+use crate::support::Peer;
 use crate::{PAIRS, PLAN};
 
 /// The ends of a topic as a program of this distribution finds them at a site, once each has a node.
@@ -56,4 +58,93 @@ fn readers_of_sgc_are_shown_as_those_of_its_node() {
         let found = ends(&lab, Site::Robot, reads, "1", "1");
         assert_eq!(found["subscribers"][0]["node"], "sgc_robot", "{reads}: {found}");
     }
+}
+
+/// The subscribers of a topic, once there are exactly so many, by the name of their node.
+fn subscribers(lab: &Lab, site: Site, distribution: &str, count: usize) -> BTreeMap<String, Value> {
+    let wanted = count.to_string();
+    let args =
+        ["--topic", "/load", "--exactly", "--publishers", "1", "--subscribers", &wanted, "--timeout", "30"];
+    let found = lab.rclpy(site, distribution, "graph.py", &args).summary();
+    let all = found["subscribers"].as_array().unwrap();
+    assert_eq!(all.len(), count, "{distribution} at {site:?}: {found}");
+    all.iter().map(|end| (end["node"].as_str().unwrap().to_owned(), end.clone())).collect()
+}
+
+fn subscriber(lab: &Lab, distribution: &str, node: &str, more: &[&str]) -> Peer {
+    let common = ["sub", "--topic", "/load", "--node", node, "--wait-stop", "--timeout", PLAN.peer_life];
+    lab.load(Site::Desk, distribution, &[&common, more].concat())
+}
+
+#[test]
+fn far_subscribers_are_shown_with_node_type_qos_and_id_while_they_live() {
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    for [talks, hears] in PAIRS {
+        let talk = ["pub", "--topic", "/load", "--wait-go", "--timeout", PLAN.peer_life];
+        let mut talker = lab.load(Site::Robot, talks, &talk);
+        let _view = subscriber(&lab, hears, "map_view", &["--reliable"]);
+        let mut recorder = subscriber(&lab, hears, "recorder", &["--best-effort"]);
+        for reads in ["jazzy", "kilted"] {
+            let native = subscribers(&lab, Site::Desk, reads, 2);
+            // The reader that takes the messages for both is one of the node of `sgc`.
+            let mut far = subscribers(&lab, Site::Robot, reads, 3);
+            assert!(far.remove("sgc_robot").is_some(), "{far:?}");
+            for (node, end) in &native {
+                assert_eq!(without_gid(&far[node]), without_gid(end), "{talks}, {hears}, {reads}");
+            }
+            assert_ne!(far["map_view"]["gid"], far["recorder"]["gid"]);
+            assert_ne!(far["map_view"]["reliability"], far["recorder"]["reliability"]);
+        }
+        recorder.end();
+        let left = subscribers(&lab, Site::Robot, talks, 2);
+        assert!(left.contains_key("map_view") && left.contains_key("sgc_robot"), "{left:?}");
+        // The publisher knows of one, however many are shown.
+        talker.end();
+        assert_eq!(talker.summary()["matched"], 1, "{talks}, {hears}");
+    }
+}
+
+#[test]
+fn far_service_and_action_clients_are_shown() {
+    let (topic, service, action) = ("/robot/chatter", "/robot/status", "/robot/fibonacci");
+    let mut tables = robot_to_desk("topic", [topic]);
+    for (kind, name) in [("service", service), ("action", action)] {
+        tables[0] += &share(kind, name, "desk");
+        tables[1] += &uses(kind, name, "robot");
+    }
+    let lab = Lab::real(PLAN, tables);
+    for [serves, calls] in PAIRS {
+        let _robot = lab.rclpy(Site::Robot, serves, "mixed.py", &["robot"]);
+        let _desk = lab.rclpy(Site::Desk, calls, "mixed.py", &["desk"]);
+        let client = ["--client", "/desk/listener", "--timeout", "30"];
+        let args = [&["--topic", topic, "--service", service, "--action", action][..], &client].concat();
+        let found = lab.rclpy(Site::Robot, serves, "graph.py", &args).summary();
+        for kind in ["service_clients", "action_clients"] {
+            let clients = found[kind].as_array().unwrap();
+            assert!(clients.contains(&"/desk/listener".into()), "{serves}, {calls}: {kind} of {found}");
+        }
+        let nodes = found["nodes"].as_array().unwrap();
+        assert_eq!(nodes.iter().filter(|node| *node == "/desk/listener").count(), 1, "{nodes:?}");
+    }
+}
+
+#[test]
+fn consumers_of_a_node_without_graph_are_not_shown() {
+    let mut lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let talk = ["pub", "--topic", "/load", "--timeout", PLAN.peer_life];
+    let _talker = lab.load(Site::Robot, "jazzy", &talk);
+    lab.end(Site::Desk, Signal::TERM);
+    lab.reconfigure(Site::Desk, "[ros]\n", "[ros]\ngraph = false\n");
+    lab.start(Site::Desk);
+    let mut listener = subscriber(&lab, "kilted", "map_view", &["--verbose"]);
+    // It hears messages for two seconds; one that is told is shown after less than one.
+    for _ in 0..20 {
+        listener.wait("a message", |event| event["event"] == "received");
+    }
+    let shown = subscribers(&lab, Site::Robot, "jazzy", 1);
+    assert!(shown.contains_key("sgc_robot"), "{shown:?}");
+    lab.end(Site::Desk, Signal::TERM);
+    lab.reconfigure(Site::Desk, "graph = false\n", "");
+    lab.start(Site::Desk);
+    assert!(subscribers(&lab, Site::Robot, "jazzy", 2).contains_key("map_view"));
 }

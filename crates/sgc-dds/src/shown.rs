@@ -1,0 +1,51 @@
+//! Endpoints that the local graph shows and that match none: a partition keeps them apart, of which the graph of ROS 2 says nothing.
+//!
+//! An endpoint that matches none gets no data, answers no heartbeat and keeps nothing. Neither Fast DDS nor Cyclone reports a
+//! partition as an incompatible QoS.
+
+use std::sync::Arc;
+
+use cyclors::{dds_create_reader, dds_create_writer};
+use sgc_ros::{EndpointKind, EndpointSpec, ShownEndpoint};
+use sgc_wire::{History, Qos};
+
+use crate::entity::Entity;
+use crate::network::Participant;
+
+/// Partition of shown endpoints. Endpoints of ROS 2 are in none.
+const PARTITION: &str = "sgc/shown";
+
+/// Fields drop in this order: children first.
+struct Shown {
+    _endpoint: Entity,
+    _group: Option<Entity>,
+    _topic: Entity,
+    _participant: Arc<Participant>,
+}
+
+/// Creates the endpoint.
+pub(crate) fn create(
+    participant: &Arc<Participant>,
+    kind: EndpointKind,
+    spec: &EndpointSpec,
+) -> Result<ShownEndpoint, String> {
+    let (history, partitions) = (History::KeepLast(1), vec![PARTITION.to_owned()]);
+    let spec = EndpointSpec { qos: Qos { history, partitions, ..spec.qos.clone() }, ..spec.clone() };
+    let qos = participant.endpoint_qos(kind, &spec, "")?;
+    let topic = participant.topic(&spec)?;
+    let group = participant.group(kind, &spec)?;
+    let parent = group.as_ref().unwrap_or(participant.entity()).handle();
+    // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
+    let endpoint = Entity::new(unsafe {
+        match kind {
+            EndpointKind::Reader => dds_create_reader(parent, topic.handle(), qos.as_ptr(), std::ptr::null()),
+            EndpointKind::Writer => dds_create_writer(parent, topic.handle(), qos.as_ptr(), std::ptr::null()),
+        }
+    })?;
+    let guid = endpoint.guid()?;
+    let participant = Arc::clone(participant);
+    Ok(ShownEndpoint::new(
+        guid,
+        Shown { _endpoint: endpoint, _group: group, _topic: topic, _participant: participant },
+    ))
+}

@@ -1,0 +1,287 @@
+//! Subscribers and service clients across nodes: those here are told to the owners of what they use, and those elsewhere that use what
+//! this node shares are shown on its local network.
+//!
+//! One reader takes the messages of a shared topic, however many subscribers there are elsewhere; those are shown by endpoints that
+//! nothing matches ([`RosNetwork::show`]).
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use sgc_endpoint::LostReason;
+use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
+use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, RosNode, SinkId};
+use tracing::debug;
+
+use super::{Core, CoreEvent, drop_elsewhere};
+
+/// How long changes of the local consumers are gathered before owners are told.
+const TELL_AFTER: Duration = Duration::from_millis(100);
+/// How long changes of the consumers elsewhere are gathered before they are shown.
+const SHOW_AFTER: Duration = Duration::from_millis(100);
+/// Nodes that are asked for their consumers.
+const ASKED_NODES_MAX: usize = 64;
+/// Consumers elsewhere that are shown, of all nodes and interfaces.
+const SHOWN_MAX: usize = 512;
+
+/// A consumer elsewhere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct ConsumerKey {
+    /// The share that it uses.
+    pub(super) interface: Name,
+    /// Its SGC node.
+    pub(super) peer: NodeId,
+    /// Its id there.
+    pub(super) id: [u8; 8],
+}
+
+/// What the local network shows for one consumer.
+struct ShownConsumer {
+    node: RosNode,
+    ends: Vec<(EndpointKind, EndpointSpec)>,
+    /// None while they are being made.
+    endpoints: Option<Vec<(EndpointKind, ShownEndpoint)>>,
+}
+
+/// The sinks of a node at one share.
+#[derive(Default)]
+struct Sinks {
+    granted: BTreeSet<SinkId>,
+    /// Until when the node counts as granted without any.
+    until: Option<Instant>,
+}
+
+/// The consumers of other nodes, and when those of this one are told.
+#[derive(Default)]
+pub(super) struct FarConsumers {
+    /// When owners are told of the local consumers.
+    tell_due: Option<Instant>,
+    /// When the local network is brought in line with what was told.
+    show_due: Option<Instant>,
+    sinks: BTreeMap<NodeId, BTreeMap<Name, Sinks>>,
+    asked: BTreeSet<NodeId>,
+    told: BTreeMap<NodeId, Vec<Consumer>>,
+    /// Nodes that are out of reach, and until when their consumers stay.
+    lost: BTreeMap<NodeId, Instant>,
+    shown: BTreeMap<ConsumerKey, ShownConsumer>,
+    /// How many there was no room for the last time: local ones to tell, and those elsewhere to show.
+    left_out: [u64; 2],
+}
+
+impl FarConsumers {
+    pub(super) fn sink_joined(&mut self, now: Instant, peer: NodeId, name: Name, sink: SinkId) {
+        let sinks = self.sinks.entry(peer).or_default().entry(name).or_default();
+        sinks.granted.insert(sink);
+        sinks.until = None;
+        self.show_soon(now);
+    }
+
+    /// A sink is gone. Without another one its node counts as granted until then, so that a restarted router changes nothing.
+    pub(super) fn sink_left(&mut self, peer: NodeId, name: Name, sink: SinkId, until: Instant) {
+        let Some(sinks) = self.sinks.get_mut(&peer).and_then(|names| names.get_mut(&name)) else { return };
+        if sinks.granted.remove(&sink) && sinks.granted.is_empty() {
+            sinks.until = Some(until);
+        }
+    }
+
+    pub(super) fn deadline(&self) -> Option<Instant> {
+        let left = self.sinks.values().flat_map(BTreeMap::values).filter_map(|sinks| sinks.until);
+        left.chain(self.lost.values().copied()).chain(self.tell_due).chain(self.show_due).min()
+    }
+
+    pub(super) fn show_soon(&mut self, now: Instant) {
+        self.show_due.get_or_insert(now + SHOW_AFTER);
+    }
+
+    /// Forgets what is over; true if something was.
+    fn forget(&mut self, now: Instant) -> bool {
+        let mut forgot = false;
+        let mut is_over = |until: Option<Instant>| {
+            let is_over = until.is_some_and(|until| until <= now);
+            forgot |= is_over;
+            is_over
+        };
+        self.lost.retain(|peer, until| {
+            let is_over = is_over(Some(*until));
+            if is_over {
+                self.told.remove(peer);
+            }
+            !is_over
+        });
+        for names in self.sinks.values_mut() {
+            names.retain(|_, sinks| !is_over(sinks.until));
+        }
+        self.sinks.retain(|_, names| !names.is_empty());
+        forgot
+    }
+
+    /// The consumers to be shown, and how many there is no room for.
+    fn wanted(&self) -> (BTreeMap<ConsumerKey, &Consumer>, u64) {
+        let (mut wanted, mut left_out) = (BTreeMap::new(), 0);
+        for (peer, consumers) in &self.told {
+            let Some(granted) = self.sinks.get(peer) else { continue };
+            let mut of_interface = BTreeMap::<Name, usize>::new();
+            for consumer in consumers.iter().filter(|consumer| granted.contains_key(&consumer.interface)) {
+                let known = of_interface.entry(consumer.interface).or_default();
+                if *known >= CONSUMERS_PER_INTERFACE_MAX || wanted.len() >= SHOWN_MAX {
+                    left_out += 1;
+                    continue;
+                }
+                *known += 1;
+                let key = ConsumerKey { interface: consumer.interface, peer: *peer, id: consumer.id };
+                wanted.insert(key, consumer);
+            }
+        }
+        (wanted, left_out)
+    }
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// Has owners told if local consumers may have changed.
+    pub(super) fn note_consumers(&mut self) {
+        if self.routes.as_mut().is_some_and(|routes| routes.take_consumers_changed()) {
+            self.consumers.tell_due.get_or_insert_with(|| Instant::now() + TELL_AFTER);
+        }
+    }
+
+    /// A node told its consumers.
+    pub(super) fn consumers_told(&mut self, now: Now, peer: NodeId, consumers: Vec<Consumer>) {
+        if self.consumers.asked.contains(&peer) {
+            self.consumers.lost.remove(&peer);
+            self.consumers.told.insert(peer, consumers);
+            self.consumers.show_soon(now.instant);
+        }
+    }
+
+    /// A node tells its consumers no longer: at once if that is its will, or after a while if it is out of reach.
+    pub(super) fn consumers_lost(&mut self, now: Now, peer: NodeId, reason: LostReason) {
+        let hold = match reason {
+            LostReason::Withdrawn | LostReason::Refused(_) => Duration::ZERO,
+            LostReason::Unreachable | LostReason::Cut(_) => UNREACHABLE_HOLD,
+        };
+        if self.consumers.asked.contains(&peer) {
+            self.consumers.lost.entry(peer).or_insert(now.instant + hold);
+        }
+    }
+
+    pub(super) fn consumers_due(&mut self, now: Now) {
+        if self.consumers.tell_due.take_if(|at| *at <= now.instant).is_some()
+            && let Some(routes) = &self.routes
+        {
+            let consumers = routes.consumers();
+            self.count_left_out(0, "consumers_untold", consumers.left_out);
+            self.endpoint.set_consumers(now, consumers.by_owner);
+        }
+        let is_due = self.consumers.show_due.take_if(|at| *at <= now.instant).is_some();
+        if self.consumers.forget(now.instant) || is_due {
+            self.ask_consumers(now);
+            self.show_consumers();
+        }
+    }
+
+    /// Asks the nodes that were granted something, and no others.
+    fn ask_consumers(&mut self, now: Now) {
+        let has_graph = self.network.get().is_some_and(|network| network.has_graph());
+        let consumers = &mut self.consumers;
+        let gone: Vec<_> =
+            consumers.asked.iter().filter(|peer| !consumers.sinks.contains_key(peer)).copied().collect();
+        for peer in gone {
+            consumers.asked.remove(&peer);
+            consumers.told.remove(&peer);
+            consumers.lost.remove(&peer);
+            self.endpoint.leave_consumers(now, &peer);
+        }
+        let own = self.identity.node_id();
+        for peer in consumers.sinks.keys().filter(|peer| has_graph && **peer != own) {
+            if consumers.asked.len() < ASKED_NODES_MAX && consumers.asked.insert(*peer) {
+                self.endpoint.ask_consumers(now, *peer);
+            }
+        }
+    }
+
+    /// Brings the local network in line with the consumers elsewhere.
+    fn show_consumers(&mut self) {
+        let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else { return };
+        let (wanted, left_out) = self.consumers.wanted();
+        let wanted: BTreeMap<_, _> = wanted
+            .into_iter()
+            .map(|(key, consumer)| (key, (consumer.node.clone(), routes.consumer_ends(consumer))))
+            .filter(|(_, (_, ends))| !ends.is_empty())
+            .collect();
+        self.count_left_out(1, "consumers_unshown", left_out);
+        let is_gone = |key: &ConsumerKey, shown: &ShownConsumer| {
+            wanted.get(key).is_none_or(|(_, ends)| *ends != shown.ends)
+        };
+        let shown = &mut self.consumers.shown;
+        let gone: Vec<_> =
+            shown.iter().filter(|(key, shown)| is_gone(key, shown)).map(|(key, _)| *key).collect();
+        for key in gone {
+            self.graph.consumer_gone(&key);
+            if let Some(endpoints) = shown.remove(&key).and_then(|shown| shown.endpoints) {
+                drop_elsewhere(Box::new(endpoints));
+            }
+        }
+        for (key, (node, ends)) in wanted {
+            if let Some(shown) = shown.get_mut(&key) {
+                if std::mem::replace(&mut shown.node, node.clone()) != node
+                    && let Some(endpoints) = &shown.endpoints
+                {
+                    self.graph.consumer_there(key, node, &guids(endpoints));
+                }
+                continue;
+            }
+            shown.insert(key, ShownConsumer { node, ends: ends.clone(), endpoints: None });
+            let Some(events) = self.events.upgrade() else { return };
+            let (network, alive, failures) = (network.clone(), self.alive.clone(), self.ros_failures.clone());
+            tokio::task::spawn_blocking(move || {
+                let _alive = alive;
+                let mut made = Vec::new();
+                for (kind, spec) in ends {
+                    match network.show(kind, &spec) {
+                        Ok(endpoint) => made.push((kind, spec, endpoint)),
+                        Err(error) => {
+                            failures.count("show_consumer");
+                            debug!(%error, "the local graph does not show a subscriber or client elsewhere");
+                            return;
+                        }
+                    }
+                }
+                let _ = events.blocking_send(CoreEvent::ConsumerShown { key, ends: made });
+            });
+        }
+    }
+
+    /// Endpoints were made for a consumer, which may be another by now.
+    pub(super) fn consumer_shown(
+        &mut self,
+        key: ConsumerKey,
+        made: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
+    ) {
+        let (ends, endpoints): (Vec<_>, Vec<_>) =
+            made.into_iter().map(|(kind, spec, endpoint)| ((kind, spec), (kind, endpoint))).unzip();
+        match self.consumers.shown.get_mut(&key) {
+            Some(shown) if shown.ends == ends && shown.endpoints.is_none() => {
+                self.graph.consumer_there(key, shown.node.clone(), &guids(&endpoints));
+                shown.endpoints = Some(endpoints);
+            }
+            _ => drop_elsewhere(Box::new(endpoints)),
+        }
+    }
+
+    /// Counts by how many more there is no room for than the last time.
+    fn count_left_out(&mut self, which: usize, kind: &'static str, left_out: u64) {
+        let before = std::mem::replace(&mut self.consumers.left_out[which], left_out);
+        if left_out > before {
+            self.control_drops.add(kind, left_out - before);
+        }
+    }
+
+    /// Shows no consumers any more.
+    pub(super) fn end_consumers(&mut self) {
+        let shown = std::mem::take(&mut self.consumers).shown;
+        drop_elsewhere(Box::new(shown.into_values().filter_map(|shown| shown.endpoints).collect::<Vec<_>>()));
+    }
+}
+
+fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> Vec<(EndpointKind, sgc_ros::Guid)> {
+    endpoints.iter().map(|(kind, endpoint)| (*kind, endpoint.guid)).collect()
+}

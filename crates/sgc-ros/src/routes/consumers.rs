@@ -1,0 +1,123 @@
+//! Consumers: which local subscribers and service clients use what others own, and the endpoints that stand for those of others.
+
+use std::collections::BTreeMap;
+
+use rand_core::RngCore;
+use sgc_wire::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, History, Kind, Name, NodeId, Qos};
+
+use super::services::service_spec;
+use super::{Direction, Routes, UseRoute};
+use crate::names::{ServiceTopic, dds_topic, dds_type, ros_type};
+use crate::network::{EndpointKind, EndpointSpec};
+
+/// Local consumers of what others own.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Consumers {
+    /// The consumers, by the owner of what they use.
+    pub by_owner: BTreeMap<NodeId, Vec<Consumer>>,
+    /// How many there are beyond [`CONSUMERS_PER_INTERFACE_MAX`] of an interface and [`CONSUMERS_MAX`] of an owner.
+    pub left_out: u64,
+}
+
+/// The endpoint that each consumer of an interface has.
+struct ConsumingEnd {
+    kind: EndpointKind,
+    type_name: String,
+    interface: Name,
+    owner: NodeId,
+}
+
+impl<R: RngCore> Routes<R> {
+    /// Returns `true` if consumers may have changed since this was asked.
+    pub fn take_consumers_changed(&mut self) -> bool {
+        std::mem::take(&mut self.consumers_changed)
+    }
+
+    /// Returns the local subscribers and service clients that belong to a node and use what is granted to this one.
+    pub fn consumers(&self) -> Consumers {
+        let mut used = BTreeMap::<String, Vec<ConsumingEnd>>::new();
+        for (name, route) in &self.uses {
+            if let Some((kind, topic, type_name)) = self.consuming_end(route) {
+                let owner = self.use_rules[route.rule].owner;
+                used.entry(topic).or_default().push(ConsumingEnd {
+                    kind,
+                    type_name,
+                    interface: *name,
+                    owner,
+                });
+            }
+        }
+        let mut consumers = Consumers::default();
+        if used.is_empty() {
+            return consumers;
+        }
+        let mut of_interface = BTreeMap::<Name, usize>::new();
+        for endpoint in self.endpoints.values() {
+            let (Some(ends), Some(node)) = (used.get(&endpoint.topic), self.node_of(&endpoint.guid)) else {
+                continue;
+            };
+            let fits =
+                |end: &&ConsumingEnd| (end.kind, &end.type_name) == (endpoint.kind, &endpoint.type_name);
+            for ConsumingEnd { interface, owner, .. } in ends.iter().filter(fits) {
+                let of_owner = consumers.by_owner.entry(*owner).or_default();
+                let known = of_interface.entry(*interface).or_default();
+                if *known >= CONSUMERS_PER_INTERFACE_MAX || of_owner.len() >= CONSUMERS_MAX {
+                    consumers.left_out += 1;
+                    continue;
+                }
+                *known += 1;
+                of_owner.push(Consumer {
+                    interface: *interface,
+                    id: self.secret.publisher_tag(&endpoint.guid.0),
+                    node: node.clone(),
+                    type_hash: endpoint.type_hash.clone(),
+                    qos: Qos { partitions: Vec::new(), ..endpoint.qos.clone() },
+                });
+            }
+        }
+        consumers
+    }
+
+    /// The kind, topic and type of the endpoint by which a program consumes what a use brings here.
+    fn consuming_end(&self, route: &UseRoute) -> Option<(EndpointKind, String, String)> {
+        if !route.granted && route.unreachable_until.is_none() {
+            return None;
+        }
+        let (rule, type_name) = (&self.use_rules[route.rule], &route.entry.metadata.type_name);
+        let request = ServiceTopic::Request;
+        match (rule.kind, rule.direction) {
+            (Kind::Service, _) => Some((
+                EndpointKind::Writer,
+                request.dds_topic(&route.local_name),
+                request.dds_type(type_name),
+            )),
+            (_, Direction::Bring) => {
+                Some((EndpointKind::Reader, dds_topic(&route.local_name), dds_type(type_name)))
+            }
+            (_, Direction::Publish) => None,
+        }
+    }
+
+    /// Returns the endpoints by which the local network sees a consumer of a share that is elsewhere: a reader, or both ends of a
+    /// service client. None if there is no such share.
+    pub fn consumer_ends(&self, consumer: &Consumer) -> Vec<(EndpointKind, EndpointSpec)> {
+        let Some(share) = self.shares.get(&consumer.interface) else { return Vec::new() };
+        // It goes into a text of `key=value;` elements.
+        let is_plain = |hash: &&String| hash.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
+        let type_hash = consumer.type_hash.as_ref().filter(is_plain);
+        if self.share_rules[share.rule].is_service() {
+            let type_name = ros_type(&share.type_name);
+            let spec = service_spec(&share.local_name, &type_name, type_hash.map(String::as_str));
+            return vec![(EndpointKind::Writer, spec.request), (EndpointKind::Reader, spec.reply)];
+        }
+        let spec = EndpointSpec {
+            topic: dds_topic(&share.local_name),
+            type_name: share.type_name.clone(),
+            keyless: share.keyless,
+            asks_key_hash: false,
+            type_hash: type_hash.cloned(),
+            qos: Qos { history: History::KeepLast(1), partitions: Vec::new(), ..consumer.qos.clone() },
+        };
+        vec![(EndpointKind::Reader, spec)]
+    }
+}
