@@ -63,6 +63,16 @@ impl Described {
         &self.type_hash
     }
 
+    /// Returns `true` for the hashes that endpoints announce for the type: its own, and of a service those of its request and its
+    /// response, which `rmw_fastrtps` announces.
+    pub fn is_announced_as(&self, type_hash: &str) -> bool {
+        let is_of =
+            |half: TypeName| self.layout.part(&half).is_some_and(|part| part.type_hash() == type_hash);
+        let name = &self.name;
+        self.type_hash == type_hash
+            || name.kind() != "msg" && (is_of(name.request()) || is_of(name.response()))
+    }
+
     /// A serialised `type_description_interfaces/msg/TypeDescription`.
     pub fn description(&self) -> &Bytes {
         &self.description
@@ -97,6 +107,21 @@ mod tests {
             assert_eq!((read.name(), read.type_hash()), (ours.name(), ours.type_hash()));
             assert_eq!(read.layout().type_hash(), ours.type_hash());
         }
+    }
+
+    #[test]
+    fn service_is_announced_by_its_hash_or_those_of_its_messages() {
+        let (service, message) = (described("std_srvs/srv/SetBool"), described("std_msgs/msg/String"));
+        // As the packages of Jazzy and Kilted have them.
+        let service_hash = "RIHS01_abe9e4bb6b41b40e6789712c00ec8871923e089af3f667a79992a428cff2da0a";
+        let request = "RIHS01_c62fbb99d94e1b25e8ef9e109f9581956bb1b3361a45a4e5810c36a90d29932e";
+        let response = "RIHS01_d0814e7f7b4880ab77e9c57426c7aa1562ab69f11eef8e2e968812f9cbd0b059";
+        for hash in [service_hash, request, response] {
+            assert!(service.is_announced_as(hash) && !message.is_announced_as(hash), "{hash}");
+        }
+        assert!(
+            !service.is_announced_as(message.type_hash()) && message.is_announced_as(message.type_hash())
+        );
     }
 
     #[test]

@@ -100,19 +100,23 @@ impl TypeStore {
     /// A type with its description; without a hash, of those with this name the one that came last.
     pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Described>> {
         let kept = self.lock();
+        let named = || {
+            let named = kept.types.range((name.clone(), String::new())..).take_while(|((n, _), _)| n == name);
+            named.map(|(_, entry)| entry)
+        };
         let found = match type_hash {
-            Some(type_hash) => kept.types.get(&(name.clone(), type_hash.to_owned())),
-            None => {
-                let named =
-                    kept.types.range((name.clone(), String::new())..).take_while(|((n, _), _)| n == name);
-                named.map(|(_, entry)| entry).max_by_key(|entry| entry.at)
-            }
+            Some(type_hash) => kept.types.get(&(name.clone(), type_hash.to_owned())).or_else(|| {
+                named()
+                    .filter(|_| name.kind() != "msg")
+                    .find(|entry| entry.described.is_announced_as(type_hash))
+            }),
+            None => named().max_by_key(|entry| entry.at),
         };
         found.map(|entry| entry.described.clone())
     }
 
-    /// What messages of a type look like. The request and the response of a service are found by its hash, too, which is the
-    /// one that its endpoints announce.
+    /// What messages of a type look like. The request and the response of a service are found by each hash that its endpoints
+    /// announce ([`Described::is_announced_as`]).
     pub fn layout(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Layout>> {
         if let Some(described) = self.described(name, type_hash) {
             return Some(described.layout().clone());
@@ -156,7 +160,8 @@ mod tests {
         let store = TypeStore::default();
         let service = store.insert(described("std_srvs/srv/SetBool", "")).unwrap();
         let request = "std_srvs/srv/SetBool_Request".parse().unwrap();
-        for hash in [None, Some(service.type_hash())] {
+        let of_request = service.layout().part(&request).unwrap().type_hash();
+        for hash in [None, Some(service.type_hash()), Some(&*of_request)] {
             let layout = store.layout(&request, hash).unwrap();
             assert_eq!(layout.from_json(br#"{"data": true}"#).unwrap().to_json(), r#"{"data":true}"#);
         }

@@ -419,7 +419,7 @@ fn find(
     }
     let described = Described::of(definitions.layout(type_name)?)?;
     match type_hash {
-        Some(announced) if described.type_hash() != announced => Err(TypeMiss::Differs {
+        Some(announced) if !described.is_announced_as(announced) => Err(TypeMiss::Differs {
             found: described.type_hash().to_owned(),
             announced: announced.to_owned(),
         }),
@@ -428,9 +428,14 @@ fn find(
 }
 
 fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> Result<KnownOrNew, TypeMiss> {
-    // Where nobody announces a hash, the owner vouches for it.
-    let expected = type_hash.unwrap_or(&told.type_hash);
-    Ok(Err(Described::read(unpack_type(told)?, type_name, expected)?))
+    // Where nobody announces a hash, the owner vouches for it, and for that of a service, of which only the messages may be announced.
+    let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
+    let described = Described::read(unpack_type(told)?, type_name, expected)?;
+    if let Some(expected) = type_hash.filter(|announced| !described.is_announced_as(announced)) {
+        let (found, expected) = (described.type_hash().to_owned(), expected.to_owned());
+        return Err(NotBelieved::Description(DescriptionError::Hash { found, expected }).into());
+    }
+    Ok(Err(described))
 }
 
 impl<N: RosNetwork> Core<N> {
@@ -656,8 +661,19 @@ mod tests {
         assert_eq!(differs.key(), Some("type_differs"), "{differs}");
         let unknown = run(job("p/msg/Nobody", None, None)).unwrap_err();
         assert_eq!(unknown.key(), None, "{unknown}");
-        // A service is looked for by its own name and hash.
-        assert!(run(job("std_srvs/srv/SetBool", None, None)).is_ok());
+        // A service is looked for by its own name, and by its hash or that of what its readers read.
+        let service = run(job("std_srvs/srv/SetBool", None, None)).unwrap();
+        let request = service.layout().part(&service.name().request()).unwrap().type_hash();
+        for hash in [service.type_hash(), &request] {
+            assert!(run(job("std_srvs/srv/SetBool", Some(hash), None)).is_ok());
+            let told = told(service.type_hash(), PayloadEncoding::Plain, service.description());
+            assert!(run(job("std_srvs/srv/SetBool", Some(hash), Some(told))).is_ok());
+        }
+        let differs = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), None)).unwrap_err();
+        assert_eq!(differs.key(), Some("type_differs"), "{differs}");
+        let other = told(service.type_hash(), PayloadEncoding::Plain, service.description());
+        let refused = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), Some(other))).unwrap_err();
+        assert_eq!(refused.key(), Some("type_refused"), "{refused}");
     }
 
     #[test]

@@ -142,6 +142,10 @@ fn events_of_far_services_are_heard_with_their_contents() {
             heard
         });
         assert_eq!(native.len(), 4, "{native:?}");
+        for site in [Site::Robot, Site::Desk] {
+            let drops = &lab.status(site)["drops"];
+            assert!(drops["type_differs"].is_null(), "the definition of the service is not told: {drops}");
+        }
         assert_eq!(carried, native, "{serves} to {calls}");
     }
 }
