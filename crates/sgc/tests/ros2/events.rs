@@ -159,13 +159,18 @@ fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_a
 }
 
 #[test]
-fn far_subscriber_that_asks_for_too_much_is_told_as_a_near_one_is() {
+fn far_subscriber_that_asks_for_too_much_and_its_publisher_are_told_as_near_ones_are() {
     let lab = Lab::real(PLAN, carried(&["/carried"]));
     let qos: [&[&str]; 2] =
         [&["--lease", "2", "--best-effort"], &["--lease", "1", "--kind", "manual", "--deadline", "1"]];
-    let all = Pair::start_all(&lab, ["/native", "/carried"], qos);
-    for pairs in &all {
-        let told = |pair: &Pair| pair.hears("an incompatible publisher", |e| e["event"] == "incompatible").1;
+    let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
+    for pairs in &mut all {
+        let is_told = |event: &Value| event["event"] == "incompatible";
+        let offered = pairs
+            .each_mut()
+            .map(|pair| pair.talker.wait("an incompatible subscriber", is_told)["policy"].clone());
+        assert_eq!(offered[1], offered[0], "{}", pairs[1].name);
+        let told = |pair: &Pair| pair.hears("an incompatible publisher", is_told).1;
         let [native, carried] = pairs.each_ref().map(told);
         assert_eq!(carried["policy"], native["policy"], "{}", pairs[1].name);
         assert!(!pairs[1].reported().iter().any(|e| e["event"] == "received"), "{}", pairs[1].name);
