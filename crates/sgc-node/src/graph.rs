@@ -1,7 +1,7 @@
 //! What is there and where it goes, as the status socket tells it: local endpoints, what is shared and used and how that
 //! goes, links and names. One document, from which `sgc topic` and `sgc why` make what they show.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
@@ -311,6 +311,8 @@ pub struct ShareRoute {
     pub qos: Option<Qos>,
     /// Granted nodes.
     pub granted: Vec<String>,
+    /// The type hashes that subscribers, or clients, of other nodes announce, as far as those tell it.
+    pub consumer_hashes: BTreeMap<String, BTreeSet<String>>,
     /// Refused nodes, and why.
     pub refused: BTreeMap<String, String>,
     /// Messages published.

@@ -92,6 +92,19 @@ impl FarConsumers {
         self.show_due.get_or_insert(now + SHOW_AFTER);
     }
 
+    /// The type hashes that the consumers of a share announce, with their SGC nodes.
+    pub(super) fn hashes(&self, interface: Name) -> impl Iterator<Item = (NodeId, &str)> {
+        self.told
+            .iter()
+            .filter(move |(peer, _)| {
+                self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&interface))
+            })
+            .flat_map(move |(peer, consumers)| {
+                let of_it = consumers.iter().filter(move |consumer| consumer.interface == interface);
+                of_it.filter_map(|consumer| consumer.type_hash.as_deref()).map(|hash| (*peer, hash))
+            })
+    }
+
     /// Forgets what is over; true if something was.
     fn forget(&mut self, now: Instant) -> bool {
         let mut forgot = false;

@@ -122,6 +122,10 @@ impl<N: RosNetwork> Core<N> {
                     .into_iter()
                     .map(|(_, peer)| self.called(&peer))
                     .collect();
+                let mut consumer_hashes = BTreeMap::<_, BTreeSet<_>>::new();
+                for (peer, hash) in self.consumers.hashes(route.name) {
+                    consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
+                }
                 let refused = self.refused.get(&route.name).into_iter().flatten();
                 let sink = self.sinks.get(&route.name);
                 share.routes.push(ShareRoute {
@@ -133,6 +137,7 @@ impl<N: RosNetwork> Core<N> {
                     is_written: route.is_written,
                     qos: route.qos.as_ref().map(Into::into),
                     granted: granted.into_iter().collect(),
+                    consumer_hashes,
                     refused: refused.map(|(peer, why)| (self.called(peer), why.clone())).collect(),
                     messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
                     written: sink.map_or(0, |sink| sink.delivered()),

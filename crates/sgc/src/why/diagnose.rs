@@ -395,6 +395,24 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
     }
 }
 
+/// Subscribers of another node have another definition of the type than the publishers here.
+fn definitions_differ(graph: &Graph, route: &ShareRoute) -> Option<Step> {
+    let (publishers, _) = ends(graph, Interface::Topic, &route.topic);
+    let ours = publishers.iter().find_map(|end| end.type_hash.as_deref())?;
+    let mut theirs =
+        route.consumer_hashes.iter().flat_map(|(node, hashes)| hashes.iter().map(move |hash| (node, hash)));
+    let (node, other) = theirs.find(|(_, hash)| *hash != ours)?;
+    Some(Step::wrong(
+        format!(
+            "the definitions of {} differ: {} here, {} at {node}",
+            route.type_name,
+            short_hash(ours),
+            short_hash(other)
+        ),
+        "build both sides from one version of the interface package",
+    ))
+}
+
 /// The members that a share names and of which this node has not heard; first those that are misspelt.
 fn unheard(graph: &Graph, share: &Share) -> Vec<Step> {
     let misspelt = share.unheard.iter().filter_map(|member| Some((&member.name, member.meant.as_ref()?)));
@@ -486,6 +504,10 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
         }
         steps.push(Step::fine("calls of others are put to the local server"));
         far_half(&route.granted.join(", "), topic, steps);
+        return;
+    }
+    if let Some(step) = definitions_differ(graph, route) {
+        steps.push(step);
         return;
     }
     if provides && !route.is_read {

@@ -182,6 +182,11 @@ fn each_fault_of_an_owner_is_named() {
             g.shares[0].routes[0].refused = [("desk".to_owned(), "not listed".to_owned())].into();
         }),
         ("no branch leads away", |g| g.names = BTreeMap::new()),
+        ("the definitions of std_msgs/msg/String differ: RIHS01_a here, RIHS01_b at desk", |g| {
+            g.endpoints[0].type_hash = Some("RIHS01_a".into());
+            let hashes = ["RIHS01_a".to_owned(), "RIHS01_b".to_owned()].into();
+            g.shares[0].routes[0].consumer_hashes = [("desk".to_owned(), hashes)].into();
+        }),
         ("the local publishers are not read", |g| g.shares[0].routes[0].is_read = false),
         ("dropped here: stale 9, too_old 1", |g| {
             let dropped =
