@@ -1,8 +1,10 @@
-//! Parameters that Cyclone leaves out where it announces endpoints (SEDP).
+//! Parameters of announcements of endpoints (SEDP): those that Cyclone leaves out, and one that it must not see.
 //!
 //! - The participant of each endpoint: Fast DDS 3 shows an endpoint without it as one of no ROS node.
 //! - That a reader expects inline QoS, where [`asking`] made it: with it come the hashes of keys, which writers of Fast DDS 2 tell nobody
 //!   else. Writers of Cyclone refuse to match such a reader.
+//! - The identifiers of types (XTypes 1.3, 7.6.3.2.2) in received announcements: Cyclone asks for the types, finds those of Fast DDS 3
+//!   invalid, and then ignores all further endpoints that have them. Types are nothing to a network here but names and hashes.
 //!
 //! An announcement is a sample of a built-in type, which makes it of a list of parameters. [`complete`] gives the two types of a domain
 //! another table of functions, which calls Cyclone's and adds to the result. It reaches into `struct ddsi_sertype_plist` of the Cyclone
@@ -27,6 +29,10 @@ use crate::payload::HEADER_BYTES;
 const PID_PARTICIPANT_GUID: u16 = 0x0050;
 const PID_ENDPOINT_GUID: u16 = 0x005a;
 const PID_EXPECTS_INLINE_QOS: u16 = 0x0043;
+
+/// PID_TYPE_INFORMATION (XTypes 1.3, 7.6.3.2.2), and a parameter that readers ignore: none has the number, and nobody has to understand it.
+const PID_TYPE_INFORMATION: u16 = 0x0075;
+const PID_IGNORED: u16 = 0x3f75;
 
 /// The entity id of every participant (RTPS 2.5, table 9.2).
 const ENTITYID_PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
@@ -157,8 +163,14 @@ unsafe extern "C" fn from_ser(
     bytes: usize,
 ) -> *mut ddsi_serdata {
     let Some(call) = original().from_ser else { return std::ptr::null_mut() };
-    // SAFETY: Cyclone's arguments for Cyclone's function.
-    unsafe { finish(call(sertype, kind, fragments, bytes)) }
+    // SAFETY: Cyclone's arguments for Cyclone's function, then a sample that it made.
+    unsafe {
+        let made = call(sertype, kind, fragments, bytes);
+        if made.is_null() || kind != ddsi_serdata_kind_SDK_DATA {
+            return finish(made);
+        }
+        finish(changed(sertype, made, |list| hide_type(list)).unwrap_or(made))
+    }
 }
 
 unsafe extern "C" fn from_keyhash(
@@ -182,15 +194,19 @@ unsafe extern "C" fn from_sample(
         if made.is_null() || kind != ddsi_serdata_kind_SDK_DATA {
             return made;
         }
-        completed(sertype, made).unwrap_or(made)
+        changed(sertype, made, |list| add_missing(list, ASKS.get())).unwrap_or(made)
     }
 }
 
-/// The announcement with what it lacks, in the place of another, which is given back.
+/// The announcement with another list of parameters, in the place of one that is given back.
 ///
 /// # Safety
 /// `made` must be a sample of `sertype`, of Cyclone's own making.
-unsafe fn completed(sertype: *const ddsi_sertype, made: *mut ddsi_serdata) -> Option<*mut ddsi_serdata> {
+unsafe fn changed(
+    sertype: *const ddsi_sertype,
+    made: *mut ddsi_serdata,
+    change: impl FnOnce(&mut Vec<u8>) -> Option<()>,
+) -> Option<*mut ddsi_serdata> {
     let ops = original();
     let (get_size, to_ser, from_ser_iov) = (ops.get_size?, ops.to_ser?, ops.from_ser_iov?);
     // SAFETY: by contract; `list` has room for the sample, header included.
@@ -199,17 +215,33 @@ unsafe fn completed(sertype: *const ddsi_sertype, made: *mut ddsi_serdata) -> Op
         to_ser(made, 0, list.len(), list.as_mut_ptr().cast());
         list
     };
-    add_missing(&mut list, ASKS.get())?;
+    change(&mut list)?;
     let piece = ddsrt_iovec_t { iov_base: list.as_mut_ptr().cast(), iov_len: list.len() };
     let bytes = list.len() - HEADER_BYTES;
     // SAFETY: one piece, which lives until the call returns, and its length without the header.
-    let completed = unsafe { from_ser_iov(sertype, ddsi_serdata_kind_SDK_DATA, 1, &raw const piece, bytes) };
-    if completed.is_null() {
+    let changed = unsafe { from_ser_iov(sertype, ddsi_serdata_kind_SDK_DATA, 1, &raw const piece, bytes) };
+    if changed.is_null() {
         return None;
     }
     // SAFETY: the only reference to a sample that nobody has seen.
     unsafe { ddsi_serdata_unref(made) };
-    Some(completed)
+    Some(changed)
+}
+
+/// Gives the identifier of a type the number of a parameter that is ignored; none if there is no identifier.
+fn hide_type(list: &mut [u8]) -> Option<()> {
+    let big = list.get(1)? & 1 == 0;
+    let (mut at, mut found) = (HEADER_BYTES, None);
+    for parameter in Parameters::new(list.get(HEADER_BYTES..)?, big) {
+        let (pid, value) = parameter?;
+        if pid == PID_TYPE_INFORMATION {
+            found = Some(at);
+        }
+        at += 4 + value.len();
+    }
+    let number = if big { PID_IGNORED.to_be_bytes() } else { PID_IGNORED.to_le_bytes() };
+    list.get_mut(found?..)?.get_mut(..2)?.copy_from_slice(&number);
+    Some(())
 }
 
 /// Adds to the list of parameters of an announcement, in the byte order of this machine; none if there is nothing to add, or it is no
@@ -264,6 +296,19 @@ mod tests {
             let asks = if expects { asks.clone() } else { Vec::new() };
             assert_eq!(made, list(&[parameter(5, &[1; 8]), endpoint.clone(), participant.clone(), asks]));
         }
+    }
+
+    #[test]
+    fn types_are_hidden_and_all_else_stays() {
+        let endpoint = parameter(PID_ENDPOINT_GUID, &[7; 16]);
+        let type_of = |pid| list(&[endpoint.clone(), parameter(pid, &[5; 12])]);
+        let mut received = type_of(PID_TYPE_INFORMATION);
+        assert!(hide_type(&mut received).is_some());
+        assert_eq!(received, type_of(PID_IGNORED));
+        assert!(hide_type(&mut received).is_none());
+        let mut cut = type_of(PID_TYPE_INFORMATION);
+        cut.truncate(HEADER_BYTES + 22);
+        assert!(hide_type(&mut cut).is_none());
     }
 
     #[test]
