@@ -78,6 +78,9 @@ pub const RECEIVE_BUFFER_BYTES: u32 = 8 << 20;
 /// Bound on the addresses of this host that are asked for participants: each costs a hundred packets in 30 s.
 pub const HOST_ADDRESSES_MAX: usize = 8;
 
+/// Bound on the interfaces that lead to static peers: Cyclone takes four, of which one is the loopback interface.
+const OUTWARD_MAX: usize = 3;
+
 /// How many participants of one host unicast discovery reaches.
 const PARTICIPANT_INDEX_MAX: u32 = 99;
 
@@ -158,7 +161,8 @@ fn participant_index_max(domain: u32) -> u32 {
 /// peers are asked for ever, while Cyclone 11 gives up after 30 s. The host's other addresses are asked as
 /// well, from the loopback interface, which no packet leaves: a Cyclone 11 that is bound to such an
 /// address ignores participants that speak to it on another. And with static peers on other hosts, `LocalHost` takes
-/// the interfaces that lead to them, where Cyclone would take the first that can do multicast.
+/// the interfaces that lead to them, where Cyclone would take the first that can do multicast. `Subnet` takes the loopback interface
+/// as well: nodes that keep to their host are found there.
 ///
 /// # Errors
 /// [`RosError::Domain`] if the configuration is invalid.
@@ -168,6 +172,9 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
     let mut discovery = String::new();
     let mut peers: Vec<String> = Vec::new();
 
+    if !instance.interfaces_chosen {
+        general.push_str(&interfaces(config, instance));
+    }
     match config.discovery {
         DiscoveryRange::Off => {
             general.push_str("<AllowMulticast>false</AllowMulticast>");
@@ -178,30 +185,23 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
             );
         }
         DiscoveryRange::LocalHost => {
-            if config.static_peers.iter().all(|p| is_loopback(p)) {
+            if is_loopback_only(config) {
                 if !instance.interfaces_chosen {
-                    let lo = Ipv4Addr::LOCALHOST;
-                    let _ = write!(
-                        general,
-                        "<Interfaces><NetworkInterface address=\"{lo}\"/></Interfaces>\
-                         <AllowMulticast>spdp</AllowMulticast>"
-                    );
+                    general.push_str("<AllowMulticast>spdp</AllowMulticast>");
                 }
             } else {
-                if !instance.interfaces_chosen && !instance.towards_peers.is_empty() {
-                    general.push_str("<Interfaces>");
-                    for address in &instance.towards_peers {
-                        let _ = write!(general, "<NetworkInterface address=\"{address}\"/>");
-                    }
-                    general.push_str("</Interfaces>");
-                }
                 general.push_str("<AllowMulticast>false</AllowMulticast>");
             }
             let host = std::iter::once(&Ipv4Addr::LOCALHOST).chain(&instance.host_addresses);
             peers.extend(host.map(Ipv4Addr::to_string));
             peers.extend_from_slice(&config.static_peers);
         }
-        DiscoveryRange::Subnet => peers.extend_from_slice(&config.static_peers),
+        DiscoveryRange::Subnet => {
+            if !instance.interfaces_chosen {
+                peers.push(Ipv4Addr::LOCALHOST.to_string());
+            }
+            peers.extend_from_slice(&config.static_peers);
+        }
         DiscoveryRange::SystemDefault => {}
     }
     if matches!(config.discovery, DiscoveryRange::LocalHost | DiscoveryRange::Subnet) {
@@ -241,6 +241,35 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
     Ok(xml)
 }
 
+/// True within the loopback interface.
+fn is_loopback_only(config: &DdsConfig) -> bool {
+    config.discovery == DiscoveryRange::LocalHost && config.static_peers.iter().all(|p| is_loopback(p))
+}
+
+/// The interfaces to take: those that discovery reaches by, and the loopback interface, by which this host's programs are spoken to
+/// whatever becomes of its addresses. The others come first: static peers are asked by the first.
+fn interfaces(config: &DdsConfig, instance: &Instance) -> String {
+    const LOOPBACK: &str = "<NetworkInterface address=\"127.0.0.1\" presence_required=\"false\"/>";
+    let before = "priority=\"3\"";
+    let outward: String = match config.discovery {
+        DiscoveryRange::Off | DiscoveryRange::SystemDefault => return String::new(),
+        DiscoveryRange::LocalHost if is_loopback_only(config) => {
+            return "<Interfaces><NetworkInterface address=\"127.0.0.1\"/></Interfaces>".into();
+        }
+        _ if instance.host_addresses.is_empty() => String::new(),
+        DiscoveryRange::LocalHost if !instance.towards_peers.is_empty() => instance
+            .towards_peers
+            .iter()
+            .take(OUTWARD_MAX)
+            .map(|address| format!("<NetworkInterface address=\"{address}\" {before}/>"))
+            .collect(),
+        DiscoveryRange::LocalHost | DiscoveryRange::Subnet => {
+            format!("<NetworkInterface autodetermine=\"true\" {before}/>")
+        }
+    };
+    format!("<Interfaces>{outward}{LOOPBACK}</Interfaces>")
+}
+
 /// The hosts of the peers that are not this one by loopback, without their ports.
 pub fn far_hosts(peers: &[String]) -> impl Iterator<Item = &str> {
     peers.iter().filter(|p| !is_loopback(p)).map(|peer| match peer.rsplit_once(':') {
@@ -249,9 +278,8 @@ pub fn far_hosts(peers: &[String]) -> impl Iterator<Item = &str> {
     })
 }
 
-/// The IPv4 addresses of this host that are not loopback, from the text of Linux's `/proc/net/fib_trie`; at
-/// most [`HOST_ADDRESSES_MAX`].
-pub fn local_addresses(fib_trie: &str) -> Vec<Ipv4Addr> {
+/// The IPv4 addresses of this host that are not loopback, from the text of Linux's `/proc/net/fib_trie`; at most `max`.
+pub fn local_addresses(fib_trie: &str, max: usize) -> Vec<Ipv4Addr> {
     let mut found = Vec::new();
     let mut last = None;
     for line in fib_trie.lines().map(str::trim) {
@@ -260,7 +288,7 @@ pub fn local_addresses(fib_trie: &str) -> Vec<Ipv4Addr> {
         } else if line == "/32 host LOCAL"
             && let Some(address) = last.take_if(|a| !a.is_loopback())
             && !found.contains(&address)
-            && found.len() < HOST_ADDRESSES_MAX
+            && found.len() < max
         {
             found.push(address);
         }
@@ -304,11 +332,32 @@ mod tests {
     #[test]
     fn subnet_keeps_multicast_and_asks_the_peers_for_ever() {
         let xml = xml(DiscoveryRange::Subnet, &["robot.lab", "10.0.0.7:7410"]);
-        assert!(!xml.contains("AllowMulticast") && !xml.contains("NetworkInterface"));
+        assert!(!xml.contains("AllowMulticast"));
         assert!(xml.contains("<Peer Address=\"robot.lab\" PruneDelay=\"inf\"/>"));
         assert!(xml.contains("<Peer Address=\"10.0.0.7:7410\" PruneDelay=\"inf\"/>"));
-        assert!(!xml.contains("127.0.0.1"));
         assert!(xml.contains("<ParticipantIndex>auto</ParticipantIndex>"));
+    }
+
+    #[test]
+    fn the_loopback_interface_is_taken_behind_the_others() {
+        let outward = "<NetworkInterface autodetermine=\"true\" priority=\"3\"/>";
+        let loopback = "<NetworkInterface address=\"127.0.0.1\" presence_required=\"false\"/>";
+        let taken = |discovery, peers: &[&str], host_addresses: Vec<Ipv4Addr>| {
+            let static_peers = peers.iter().map(|p| p.to_string()).collect();
+            let config = DdsConfig { discovery, static_peers, ..DdsConfig::default() };
+            let xml = cyclone_config(&config, &Instance { host_addresses, ..plain() }).unwrap();
+            xml.contains("<Peer Address=\"127.0.0.1\" PruneDelay=\"inf\"/>")
+                && xml.contains(&format!("<Interfaces>{outward}{loopback}</Interfaces>"))
+        };
+        let address = vec![Ipv4Addr::new(192, 0, 2, 2)];
+        assert!(taken(DiscoveryRange::Subnet, &[], address.clone()));
+        assert!(taken(DiscoveryRange::LocalHost, &["10.0.0.7"], address.clone()));
+        assert!(!taken(DiscoveryRange::SystemDefault, &[], address));
+        let xml = xml(DiscoveryRange::Subnet, &[]);
+        assert!(
+            xml.contains(&format!("<Interfaces>{loopback}</Interfaces>")),
+            "a host without another address"
+        );
     }
 
     #[test]
@@ -337,16 +386,19 @@ mod tests {
                     |-- 127.0.0.1\n  /32 host LOCAL\n     |-- 192.0.2.0\n        /24 link UNICAST\n\
                     |-- 192.0.2.2\n              /32 host LOCAL\n  |-- 192.0.2.255\n /32 link BROADCAST\n\
                     Local:\n |-- 192.0.2.2\n /32 host LOCAL\n |-- 10.0.0.1\n /32 host LOCAL\n";
-        assert_eq!(local_addresses(trie), [Ipv4Addr::new(192, 0, 2, 2), Ipv4Addr::new(10, 0, 0, 1)]);
-        assert!(local_addresses("/32 host LOCAL").is_empty());
+        assert_eq!(
+            local_addresses(trie, HOST_ADDRESSES_MAX),
+            [Ipv4Addr::new(192, 0, 2, 2), Ipv4Addr::new(10, 0, 0, 1)]
+        );
+        assert!(local_addresses("/32 host LOCAL", HOST_ADDRESSES_MAX).is_empty());
         let many: String = (0..20).map(|i| format!("|-- 10.0.0.{i}\n/32 host LOCAL\n")).collect();
-        assert_eq!(local_addresses(&many).len(), HOST_ADDRESSES_MAX);
+        assert_eq!(local_addresses(&many, HOST_ADDRESSES_MAX).len(), HOST_ADDRESSES_MAX);
     }
 
     #[test]
     fn a_far_static_peer_lifts_the_loopback_binding_but_not_the_range() {
         let xml = xml(DiscoveryRange::LocalHost, &["10.0.0.7"]);
-        assert!(!xml.contains("NetworkInterface"));
+        assert!(!xml.contains("<NetworkInterface address=\"127.0.0.1\"/>"));
         assert!(xml.contains("<AllowMulticast>false</AllowMulticast>"));
         assert!(xml.contains("Address=\"127.0.0.1\"") && xml.contains("Address=\"10.0.0.7\""));
     }
@@ -355,11 +407,13 @@ mod tests {
     fn interfaces_that_lead_to_static_peers_are_taken_unless_the_user_chose() {
         let towards_peers = vec![Ipv4Addr::new(10, 0, 0, 1), Ipv4Addr::new(10, 1, 0, 1)];
         let taken = |discovery, interfaces_chosen| {
-            let instance = Instance { towards_peers: towards_peers.clone(), interfaces_chosen, ..plain() };
+            let (towards_peers, host_addresses) = (towards_peers.clone(), towards_peers.clone());
+            let instance = Instance { towards_peers, host_addresses, interfaces_chosen, ..plain() };
             let static_peers = vec!["10.0.0.7".to_owned(), "10.1.0.7".to_owned()];
             let config = DdsConfig { discovery, static_peers, ..DdsConfig::default() };
             let xml = cyclone_config(&config, &instance).unwrap();
-            ["10.0.0.1", "10.1.0.1"].map(|a| xml.contains(&format!("<NetworkInterface address=\"{a}\"/>")))
+            ["10.0.0.1", "10.1.0.1"]
+                .map(|a| xml.contains(&format!("<NetworkInterface address=\"{a}\" priority=")))
         };
         assert_eq!(taken(DiscoveryRange::LocalHost, false), [true, true]);
         assert_eq!(taken(DiscoveryRange::LocalHost, true), [false, false]);

@@ -19,12 +19,14 @@
 #![warn(clippy::undocumented_unsafe_blocks)]
 
 mod announced;
+mod announcement;
 pub mod config;
 mod discovery;
 mod entity;
 mod first_messages;
 mod fragments;
 mod graph;
+mod host_addresses;
 pub mod identity;
 mod inline_qos;
 mod intake;
@@ -35,6 +37,7 @@ pub mod payload;
 pub mod qos;
 mod reader;
 mod rpc;
+mod same_host;
 mod sample;
 mod service;
 mod shown;

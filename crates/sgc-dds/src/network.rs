@@ -19,7 +19,8 @@ use sgc_ros::{
 
 use crate::announced;
 use crate::config::{
-    DdsConfig, Instance, PEERS_MAX, chooses_interfaces, cyclone_config, far_hosts, local_addresses,
+    DdsConfig, DiscoveryRange, HOST_ADDRESSES_MAX, Instance, PEERS_MAX, chooses_interfaces, cyclone_config,
+    far_hosts, local_addresses,
 };
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
@@ -29,6 +30,7 @@ use crate::intake::Pace;
 use crate::log;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
+use crate::same_host::SameHost;
 use crate::sample;
 use crate::service::{CycloneClient, CycloneServer};
 use crate::shown;
@@ -63,6 +65,8 @@ pub struct CycloneNetwork {
 #[derive(Debug)]
 pub(crate) struct Participant {
     entity: Entity,
+    /// Ends before the domain.
+    _same_host: Option<SameHost>,
     domain: Entity,
     guid: Guid,
     domain_id: u32,
@@ -100,6 +104,7 @@ impl CycloneNetwork {
         }
         let participant = Participant {
             entity,
+            _same_host: domain.same_host,
             domain: domain.entity,
             guid,
             domain_id: config.domain,
@@ -316,6 +321,8 @@ struct Domain {
     entity: Entity,
     /// The id that Cyclone knows it by.
     id: u32,
+    /// None if it loses programs of this host when the host's addresses change.
+    same_host: Option<SameHost>,
 }
 
 /// Creates the Cyclone domain: under the ROS domain's own id, so that `<Domain Id="…">` in the user's
@@ -325,7 +332,8 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
     let number = NUMBER.fetch_add(1, Ordering::Relaxed);
     let interfaces_chosen =
         config.cyclonedds_uri.as_deref().is_some_and(|uri| chooses_interfaces(uri, read_file));
-    let host_addresses = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default());
+    let host_addresses =
+        local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), HOST_ADDRESSES_MAX);
     // With one address there is nothing to choose.
     let towards_peers =
         if host_addresses.len() > 1 { addresses_towards(&config.static_peers) } else { Vec::new() };
@@ -336,16 +344,29 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
 
     for (id, aliased) in [(config.domain, false), (ALIAS_FIRST.wrapping_add(number & 0x00ff_ffff), true)] {
         instance.aliased = aliased;
-        let xml = c_string(&cyclone_config(config, &instance)?).map_err(refused)?;
-        // SAFETY: the configuration is a NUL-terminated string, copied by the call.
-        let (handle, errors) = log::listen(|| unsafe { dds_create_domain(id, xml.as_ptr()) });
+        let create = |instance: &Instance| {
+            let xml = c_string(&cyclone_config(config, instance)?).map_err(refused)?;
+            // SAFETY: the configuration is a NUL-terminated string, copied by the call.
+            Ok::<_, RosError>(log::listen(|| unsafe { dds_create_domain(id, xml.as_ptr()) }))
+        };
+        let (mut handle, errors) = create(&instance)?;
         if handle == DDS_RETCODE_PRECONDITION_NOT_MET && !aliased {
             continue;
+        }
+        if handle < 0 && config.discovery == DiscoveryRange::Subnet && !instance.interfaces_chosen {
+            // No interface but the loopback is up, for instance: Cyclone's own choice is better than none.
+            instance.interfaces_chosen = true;
+            (handle, _) = create(&instance)?;
         }
         if handle < 0 && !errors.is_empty() {
             return Err(refused(format!("{}: {errors}", reason(handle))));
         }
-        return Ok(Domain { entity: Entity::new(handle).map_err(refused)?, id });
+        let entity = Entity::new(handle).map_err(refused)?;
+        let same_host = SameHost::install(&entity, id);
+        if let Err(reason) = &same_host {
+            tracing::warn!(reason, "programs of this host may be lost when its addresses change");
+        }
+        return Ok(Domain { entity, id, same_host: same_host.ok() });
     }
     Err(refused("the domain could not be created".into()))
 }
@@ -366,7 +387,7 @@ fn addresses_towards(peers: &[String]) -> Vec<Ipv4Addr> {
     found
 }
 
-fn read_file(name: &str) -> Option<String> {
+pub(crate) fn read_file(name: &str) -> Option<String> {
     use std::io::Read as _;
     let mut text = String::new();
     let file = std::fs::File::open(name).ok()?;

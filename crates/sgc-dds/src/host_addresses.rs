@@ -1,0 +1,164 @@
+//! The IPv4 addresses of this host: those that it has, and those that it had since this process follows them.
+//!
+//! A thread of the process is told by the kernel when something changes, and lives as long as the process.
+
+use std::net::Ipv4Addr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Once, PoisonError, RwLock};
+use std::time::Duration;
+use std::{io, thread};
+
+use rustix::fd::OwnedFd;
+use rustix::io::Errno;
+use rustix::net::netlink::SocketAddrNetlink;
+use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv, socket_with};
+
+use crate::config::local_addresses;
+use crate::network::read_file;
+
+/// Bound on addresses that this host has, and on all that are remembered; the oldest are forgotten.
+const HERE_MAX: usize = 64;
+const KNOWN_MAX: usize = 256;
+/// The kernel tells of a link before it withdraws its addresses: pauses after which they are read.
+const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_millis(450)];
+/// Kernel messages about links and IPv4 addresses (`RTMGRP_LINK` and `RTMGRP_IPV4_IFADDR`, rtnetlink(7)).
+const GROUPS: u32 = 0x1 | 0x10;
+const MESSAGE_BYTES_MAX: usize = 8192;
+
+static ADDRESSES: RwLock<Addresses> = RwLock::new(Addresses { here: Vec::new(), known: Vec::new() });
+/// An address that this host had is gone.
+static ANY_GONE: AtomicBool = AtomicBool::new(false);
+
+struct Addresses {
+    here: Vec<Ipv4Addr>,
+    known: Vec<Ipv4Addr>,
+}
+
+impl Addresses {
+    fn update(&mut self, here: Vec<Ipv4Addr>) {
+        for address in &here {
+            if !self.known.contains(address) {
+                self.known.push(*address);
+            }
+        }
+        let forgotten = self.known.len().saturating_sub(KNOWN_MAX);
+        self.known.drain(..forgotten);
+        self.here = here;
+    }
+
+    fn any_gone(&self) -> bool {
+        self.known.iter().any(|address| !self.here.contains(address))
+    }
+}
+
+/// Begins to follow this host's addresses, if this process does not yet.
+pub(crate) fn follow() {
+    static FOLLOWED: Once = Once::new();
+    FOLLOWED.call_once(|| {
+        let kernel = subscribe();
+        refresh();
+        let started = kernel.and_then(|kernel| {
+            thread::Builder::new().name("sgc-dds-host".into()).spawn(move || {
+                // Between the first look and the thread's beginning something may have changed, which the kernel kept.
+                while wait_for_change(&kernel).is_ok() {
+                    for pause in PAUSES {
+                        thread::sleep(pause);
+                        refresh();
+                    }
+                }
+            })
+        });
+        if let Err(error) = started {
+            tracing::warn!(%error, "this host's addresses are not followed: local programs are lost when they change");
+        }
+    });
+}
+
+/// Returns `true` if an address that this host had is gone. Cheap.
+pub(crate) fn any_gone() -> bool {
+    ANY_GONE.load(Ordering::Relaxed)
+}
+
+/// Returns `true` if an address is this host's or was.
+pub(crate) fn is_known(address: Ipv4Addr) -> bool {
+    address.is_loopback() || read(|addresses| addresses.known.contains(&address))
+}
+
+/// Returns `true` if this host has an address now.
+pub(crate) fn is_here(address: Ipv4Addr) -> bool {
+    address.is_loopback() || read(|addresses| addresses.here.contains(&address))
+}
+
+fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
+    look(&ADDRESSES.read().unwrap_or_else(PoisonError::into_inner))
+}
+
+fn refresh() {
+    let here = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), HERE_MAX);
+    let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
+    if addresses.here != here {
+        if !addresses.known.is_empty() {
+            tracing::info!(now = ?here, before = ?addresses.here, "this host's addresses changed");
+        }
+        addresses.update(here);
+        ANY_GONE.store(addresses.any_gone(), Ordering::Relaxed);
+    }
+}
+
+fn subscribe() -> io::Result<OwnedFd> {
+    let kernel = socket_with(AddressFamily::NETLINK, SocketType::RAW, SocketFlags::CLOEXEC, None)?;
+    bind(&kernel, &SocketAddrNetlink::new(0, GROUPS))?;
+    Ok(kernel)
+}
+
+fn wait_for_change(kernel: &OwnedFd) -> io::Result<()> {
+    let mut message = [0; MESSAGE_BYTES_MAX];
+    let mut flags = RecvFlags::empty();
+    loop {
+        match recv(kernel, &mut message[..], flags) {
+            // There was more than the kernel had room for, which says as much as a message.
+            Ok(_) | Err(Errno::NOBUFS) => flags = RecvFlags::DONTWAIT,
+            Err(Errno::INTR) => {}
+            Err(Errno::AGAIN) => return Ok(()),
+            Err(error) => return Err(error.into()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OLD: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 2);
+    const NEW: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 3);
+
+    #[test]
+    fn addresses_that_are_gone_stay_known() {
+        let mut addresses = Addresses { here: Vec::new(), known: Vec::new() };
+        addresses.update(vec![OLD]);
+        assert!(!addresses.any_gone());
+        addresses.update(vec![NEW]);
+        assert!(addresses.any_gone());
+        assert_eq!((&addresses.here[..], &addresses.known[..]), (&[NEW][..], &[OLD, NEW][..]));
+        addresses.update(vec![NEW, OLD]);
+        assert!(!addresses.any_gone());
+    }
+
+    #[test]
+    fn known_addresses_are_bounded() {
+        let mut addresses = Addresses { here: Vec::new(), known: Vec::new() };
+        for n in 0..1000 {
+            addresses.update(vec![Ipv4Addr::from_bits(0x0a00_0000 + n)]);
+        }
+        assert_eq!(addresses.known.len(), KNOWN_MAX);
+        assert!(addresses.known.ends_with(&addresses.here));
+    }
+
+    #[test]
+    fn loopback_is_always_here() {
+        follow();
+        assert!(is_here(Ipv4Addr::LOCALHOST) && is_known(Ipv4Addr::LOCALHOST));
+        // Of documentation (RFC 5737).
+        assert!(!is_known(Ipv4Addr::new(192, 0, 2, 77)));
+    }
+}

@@ -1,0 +1,390 @@
+//! Programs of this host stay reached whichever addresses the host has.
+//!
+//! A participant announces the addresses that its host had when it started, and Cyclone sends from sockets that are bound to such an
+//! address. Once the address is gone neither leads anywhere, though nobody moved; Fast DDS keeps to the addresses that it heard first.
+//! Therefore this module takes the place of the function by which Cyclone sends a packet:
+//! - Participants are announced to programs of this host at 127.0.0.1 alone, and to others at the host's other address alone. One address
+//!   for each, because Fast DDS sends each message to all. A multicast announcement is sent twice: to other hosts without a copy for
+//!   this one, and to this host with a hop limit of zero.
+//! - When the address that a packet would leave with, or that it is for, is gone, and the receiver is on this host, the packet goes to
+//!   127.0.0.1.
+//!
+//! All other packets go as Cyclone sends them. This reaches into `struct ddsi_tran_conn` and `struct ddsi_tran_write_msgfrags` of the
+//! Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection that does not refer to its domain, or whose socket is
+//! not bound to an address of this host, is left alone.
+
+use std::ffi::{c_int, c_void};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
+use std::os::fd::BorrowedFd;
+use std::ptr;
+use std::sync::atomic::{AtomicPtr, Ordering};
+use std::sync::{Arc, PoisonError, RwLock};
+
+use cyclors::{
+    DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, dds_create_participant, dds_create_reader, dds_domain_set_deafmute,
+    dds_get_entity_sertype, ddsi_domaingv, ddsi_locator, ddsi_tran_conn, ddsi_xlocator,
+};
+use rustix::net::sockopt;
+
+use crate::announcement::{self, HEAD_BYTES};
+use crate::config::local_addresses;
+use crate::entity::{Entity, INFINITE, check};
+use crate::host_addresses;
+use crate::network::read_file;
+
+/// `DDSI_LOCATOR_KIND_UDPv4`.
+const UDP_V4: i32 = 1;
+/// `DDSI_TRAN_CONN`.
+const CONNECTION: u32 = 1;
+/// Bound on addresses of this host for which Cyclone may have a socket.
+const ADDRESSES_MAX: usize = 64;
+/// Any port serves to ask Cyclone for a socket; this one is discard's (RFC 863). No packet is sent.
+const ANY_PORT: u32 = 9;
+/// Bound on the pieces of a packet, `IOV_MAX`.
+const PIECES_MAX: usize = 1024;
+
+type Write =
+    unsafe extern "C" fn(*const Connection, *const ddsi_locator, *const Fragments, u32, *mut usize) -> c_int;
+
+/// The beginning of `struct ddsi_tran_conn`.
+#[repr(C)]
+struct Connection {
+    port: u32,
+    kind: u32,
+    is_multicast: bool,
+    domain: *const ddsi_domaingv,
+    handle: Option<unsafe extern "C" fn(*const Connection) -> c_int>,
+    read: *const c_void,
+    write: AtomicPtr<c_void>,
+}
+
+/// `ddsrt_iovec_t`.
+#[repr(C)]
+struct Piece {
+    start: *const u8,
+    bytes: usize,
+}
+
+/// `struct ddsi_tran_write_msgfrags`; more pieces follow.
+#[repr(C)]
+struct Fragments {
+    count: usize,
+    reserved: Piece,
+    first: [Piece; 0],
+}
+
+/// `struct ddsi_locators_one` and `ddsi_locators_t`.
+#[repr(C)]
+struct AnnouncedAddress {
+    next: *mut AnnouncedAddress,
+    address: ddsi_locator,
+}
+
+#[repr(C)]
+struct AnnouncedAddresses {
+    count: u32,
+    first: *mut AnnouncedAddress,
+    last: *mut AnnouncedAddress,
+}
+
+/// `struct ddsi_network_packet_info`.
+#[repr(C)]
+struct PacketInfo {
+    source: ddsi_locator,
+    destination: ddsi_locator,
+    interface: u32,
+}
+
+type Visit = unsafe extern "C" fn(*const ddsi_xlocator, *mut c_void);
+
+unsafe extern "C" {
+    fn ddsi_addrset_from_locatorlists(
+        gv: *const ddsi_domaingv,
+        unicast: *const AnnouncedAddresses,
+        multicast: *const AnnouncedAddresses,
+        packet: *const PacketInfo,
+        allow_source: bool,
+        inherited: *const c_void,
+    ) -> *mut c_void;
+    fn ddsi_addrset_forall(addresses: *mut c_void, visit: Visit, argument: *mut c_void);
+    fn ddsi_unref_addrset(addresses: *mut c_void);
+}
+
+/// Cyclone's own function, which all its UDP connections have.
+static CYCLONES: AtomicPtr<c_void> = AtomicPtr::new(ptr::null_mut());
+/// The sockets beside each connection that sends by this module, by the connection's address.
+static BESIDE: RwLock<Vec<(usize, Arc<Beside>)>> = RwLock::new(Vec::new());
+
+/// The sockets beside a connection.
+struct Beside {
+    /// The address that the connection is bound to.
+    address: Ipv4Addr,
+    /// Bound to 127.0.0.1.
+    loopback: UdpSocket,
+    /// For multicasts, unless the address is of the loopback interface.
+    multicast: Option<Multicast>,
+}
+
+struct Multicast {
+    to_others: UdpSocket,
+    to_this_host: UdpSocket,
+}
+
+/// A domain that sends by this module. Dropping it ends that.
+#[derive(Debug)]
+pub(crate) struct SameHost {
+    connections: Vec<usize>,
+}
+
+impl Drop for SameHost {
+    fn drop(&mut self) {
+        let mut beside = BESIDE.write().unwrap_or_else(PoisonError::into_inner);
+        beside.retain(|(connection, _)| !self.connections.contains(connection));
+    }
+}
+
+impl SameHost {
+    /// Makes a new domain send by this module, before anybody hears of it.
+    ///
+    /// # Errors
+    /// Where Cyclone is not as this module knows it, or does not use UDP over IPv4.
+    pub(crate) fn install(domain: &Entity, id: u32) -> Result<Self, String> {
+        host_addresses::follow();
+        // SAFETY: takes numbers only; the handle is checked by Cyclone.
+        let silence = |on| unsafe { dds_domain_set_deafmute(domain.handle(), on, on, INFINITE) };
+        check(silence(true))?;
+        // The way to the inside of a domain begins at a participant.
+        // SAFETY: null means the default QoS and no listener.
+        let participant = Entity::new(unsafe { dds_create_participant(id, ptr::null(), ptr::null()) });
+        let installed = participant.and_then(|participant| install(inside(&participant)?));
+        check(silence(false)).and(installed)
+    }
+}
+
+/// Returns the inside of a participant's domain.
+fn inside(participant: &Entity) -> Result<*const ddsi_domaingv, String> {
+    // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
+    let reader = Entity::new(unsafe {
+        dds_create_reader(participant.handle(), DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, ptr::null(), ptr::null())
+    })?;
+    let mut sertype = ptr::null();
+    // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
+    check(unsafe { dds_get_entity_sertype(reader.handle(), &mut sertype) })?;
+    // SAFETY: the type of a reader lives as long as the reader; its domain was set when it was registered.
+    let domain = unsafe { (*sertype).gv.v } as *const ddsi_domaingv;
+    if domain.is_null() { Err("the domain of a type is not known".into()) } else { Ok(domain) }
+}
+
+fn install(domain: *const ddsi_domaingv) -> Result<SameHost, String> {
+    let here = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), ADDRESSES_MAX);
+    let mut same_host = SameHost { connections: Vec::new() };
+    for address in std::iter::once(Ipv4Addr::LOCALHOST).chain(here) {
+        let Some(connection) = connection_for(domain, address) else { continue };
+        if !same_host.connections.contains(&(connection as usize)) {
+            // SAFETY: a connection of the domain, which lives as long; its beginning says whether it is as expected.
+            take_over(domain, unsafe { &*connection })?;
+            same_host.connections.push(connection as usize);
+        }
+    }
+    if same_host.connections.is_empty() {
+        return Err("the domain does not use UDP over IPv4".into());
+    }
+    Ok(same_host)
+}
+
+/// Makes a connection send by [`write`].
+fn take_over(domain: *const ddsi_domaingv, connection: &Connection) -> Result<(), String> {
+    let handle = connection.handle.filter(|_| {
+        ptr::eq(connection.domain, domain) && connection.kind == CONNECTION && !connection.is_multicast
+    });
+    let Some(handle) = handle else { return Err("a connection is not as expected".into()) };
+    // SAFETY: Cyclone's own function, called with what it is for.
+    let number = unsafe { handle(connection) };
+    if number < 0 {
+        return Err("a connection has no socket".into());
+    }
+    // SAFETY: open until Cyclone closes it with the domain.
+    let socket = unsafe { BorrowedFd::borrow_raw(number) };
+    let bound = rustix::net::getsockname(socket).ok().and_then(|name| SocketAddr::try_from(name).ok());
+    let address = match bound.map(|bound| bound.ip()) {
+        Some(IpAddr::V4(address)) if host_addresses::is_here(address) => address,
+        _ => return Err("a socket is not bound to an address of this host".into()),
+    };
+    let beside = Beside::new(address, socket).map_err(|error| error.to_string())?;
+    let found = connection.write.load(Ordering::Acquire);
+    let ours = write as Write as *mut c_void;
+    if found != ours {
+        let known = CYCLONES.compare_exchange(ptr::null_mut(), found, Ordering::AcqRel, Ordering::Acquire);
+        if found.is_null() || known.is_err_and(|known| known != found) {
+            return Err("connections send in different ways".into());
+        }
+    }
+    let mut all = BESIDE.write().unwrap_or_else(PoisonError::into_inner);
+    all.push((ptr::from_ref(connection) as usize, Arc::new(beside)));
+    connection.write.store(ours, Ordering::Release);
+    Ok(())
+}
+
+impl Beside {
+    fn new(address: Ipv4Addr, cyclones: BorrowedFd<'_>) -> std::io::Result<Self> {
+        let multicast = |is_to_this_host: bool| {
+            let socket = UdpSocket::bind((address, 0))?;
+            sockopt::set_ip_multicast_if(&socket, &address)?;
+            let hops = if is_to_this_host { 0 } else { sockopt::ip_multicast_ttl(cyclones)? };
+            sockopt::set_ip_multicast_ttl(&socket, hops)?;
+            sockopt::set_ip_multicast_loop(&socket, is_to_this_host)?;
+            Ok::<_, std::io::Error>(socket)
+        };
+        let sockets = || {
+            Ok::<_, std::io::Error>(Multicast {
+                to_others: multicast(false)?,
+                to_this_host: multicast(true)?,
+            })
+        };
+        Ok(Self {
+            address,
+            loopback: UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?,
+            multicast: if address.is_loopback() { None } else { Some(sockets()?) },
+        })
+    }
+
+    /// Returns `true` if a packet to an address of this host has to go another way than Cyclone's.
+    fn is_cut_off_from(&self, to: Ipv4Addr) -> bool {
+        host_addresses::any_gone()
+            && host_addresses::is_known(to)
+            && !(host_addresses::is_here(self.address) && host_addresses::is_here(to))
+    }
+
+    /// Sends a packet that Cyclone would not send as it must be; `None` if Cyclone would.
+    fn send(&self, to: Ipv4Addr, port: u16, packet: &Packet<'_>) -> Option<std::io::Result<()>> {
+        let is_cut_off = self.is_cut_off_from(to);
+        let is_announcement = packet.is_announcement();
+        let sent = |socket: &UdpSocket, to, bytes: &[u8]| socket.send_to(bytes, (to, port)).map(drop);
+        if !is_announcement {
+            return is_cut_off.then(|| sent(&self.loopback, Ipv4Addr::LOCALHOST, &packet.bytes()));
+        }
+        let [mut for_this_host, mut for_others] = [packet.bytes(), packet.bytes()];
+        announcement::replace(&mut for_this_host, |_| Ipv4Addr::LOCALHOST);
+        announcement::replace(&mut for_others, |a| if a.is_loopback() { self.address } else { a });
+        match &self.multicast {
+            Some(multicast) if to.is_multicast() => {
+                if !host_addresses::is_here(self.address) {
+                    return None;
+                }
+                let _ = sent(&multicast.to_this_host, to, &for_this_host);
+                Some(sent(&multicast.to_others, to, &for_others))
+            }
+            Some(multicast) if !host_addresses::is_known(to) => {
+                Some(sent(&multicast.to_others, to, &for_others))
+            }
+            _ if is_cut_off => Some(sent(&self.loopback, Ipv4Addr::LOCALHOST, &for_this_host)),
+            Some(multicast) => Some(sent(&multicast.to_others, to, &for_this_host)),
+            None => Some(sent(&self.loopback, to, &for_this_host)),
+        }
+    }
+}
+
+/// A packet of Cyclone's.
+struct Packet<'a> {
+    pieces: &'a [Piece],
+}
+
+impl Packet<'_> {
+    fn parts(&self) -> impl Iterator<Item = &[u8]> {
+        let whole = self.pieces.iter().filter(|piece| !piece.start.is_null());
+        // SAFETY: Cyclone passes pieces of so many bytes, for the duration of the call.
+        whole.map(|piece| unsafe { std::slice::from_raw_parts(piece.start, piece.bytes) })
+    }
+
+    fn is_announcement(&self) -> bool {
+        let mut head = [0; HEAD_BYTES];
+        let mut filled = 0;
+        for part in self.parts() {
+            let more = part.len().min(HEAD_BYTES - filled);
+            head[filled..filled + more].copy_from_slice(&part[..more]);
+            filled += more;
+            if filled == HEAD_BYTES {
+                break;
+            }
+        }
+        announcement::is_announcement(&head[..filled])
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        self.parts().flatten().copied().collect()
+    }
+}
+
+/// Sends a packet, in the place of Cyclone's `ddsi_udp_conn_write`.
+unsafe extern "C" fn write(
+    connection: *const Connection,
+    to: *const ddsi_locator,
+    fragments: *const Fragments,
+    flags: u32,
+    written: *mut usize,
+) -> c_int {
+    // SAFETY: Cyclone passes a valid address, and a packet of so many pieces.
+    let sent = unsafe {
+        let count = (*fragments).count;
+        let pieces = (&raw const (*fragments).first).cast::<Piece>();
+        if count > PIECES_MAX {
+            None
+        } else {
+            let packet = Packet { pieces: std::slice::from_raw_parts(pieces, count) };
+            otherwise(connection as usize, &*to, &packet)
+                .map(|sent| (sent, packet.parts().map(<[u8]>::len).sum()))
+        }
+    };
+    if let Some((Ok(()), bytes)) = sent {
+        // SAFETY: null or a valid place for the number.
+        if let Some(written) = unsafe { written.as_mut() } {
+            *written = bytes;
+        }
+        return 0;
+    }
+    // Also when the other way failed: Cyclone tries, and says why it cannot.
+    // SAFETY: the function was there before this one, which is in its place since `take_over` kept it.
+    unsafe {
+        let cyclones: Write = std::mem::transmute(CYCLONES.load(Ordering::Acquire));
+        cyclones(connection, to, fragments, flags, written)
+    }
+}
+
+/// Sends a packet in another way than Cyclone's, if it has to.
+fn otherwise(connection: usize, to: &ddsi_locator, packet: &Packet<'_>) -> Option<std::io::Result<()>> {
+    if to.kind != UDP_V4 || !(host_addresses::any_gone() || packet.is_announcement()) {
+        return None;
+    }
+    let [.., a, b, c, d] = to.address;
+    let port = u16::try_from(to.port).ok()?;
+    let beside = {
+        let all = BESIDE.read().unwrap_or_else(PoisonError::into_inner);
+        all.iter().find(|(of, _)| *of == connection).map(|(_, beside)| Arc::clone(beside))
+    };
+    beside?.send(Ipv4Addr::new(a, b, c, d), port, packet)
+}
+
+/// Returns the connection that Cyclone would use for an address.
+fn connection_for(domain: *const ddsi_domaingv, address: Ipv4Addr) -> Option<*const Connection> {
+    unsafe extern "C" fn keep(found: *const ddsi_xlocator, connection: *mut c_void) {
+        // SAFETY: Cyclone passes a valid address, and what it was given.
+        unsafe { *connection.cast::<*mut ddsi_tran_conn>() = (*found).conn }
+    }
+    let unknown = ddsi_locator { kind: -1, port: 0, address: [0; 16] };
+    let mut asked = ddsi_locator { kind: UDP_V4, port: ANY_PORT, address: [0; 16] };
+    asked.address[12..].copy_from_slice(&address.octets());
+    let mut one = AnnouncedAddress { next: ptr::null_mut(), address: asked };
+    let one: *mut AnnouncedAddress = &mut one;
+    let unicast = AnnouncedAddresses { count: 1, first: one, last: one };
+    let none = AnnouncedAddresses { count: 0, first: ptr::null_mut(), last: ptr::null_mut() };
+    let packet = PacketInfo { source: unknown, destination: unknown, interface: 0 };
+    let mut connection: *mut ddsi_tran_conn = ptr::null_mut();
+    // SAFETY: the domain is valid, the lists are for the duration of the call, null means nothing inherited; the set is
+    // this function's until it gives it back.
+    unsafe {
+        let set = ddsi_addrset_from_locatorlists(domain, &unicast, &none, &packet, false, ptr::null());
+        ddsi_addrset_forall(set, keep, (&raw mut connection).cast());
+        ddsi_unref_addrset(set);
+    }
+    (!connection.is_null()).then_some(connection.cast_const().cast())
+}
