@@ -3,6 +3,8 @@
 
 CARGO ?= cargo
 ARGS ?=
+# What release builds have. Tests have it, too, so that Cyclone DDS is built once.
+FEATURES := --features sgc/sros2
 
 .PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
@@ -30,7 +32,7 @@ demo: build
 	"$${CARGO_TARGET_DIR:-target}/release/sgc" demo $(ARGS)
 
 build: deps-build
-	$(CARGO) build --release --locked -p sgc
+	$(CARGO) build --release --locked -p sgc $(FEATURES)
 
 # One after the other, the quick ones first, whatever -j says.
 test: deps-test
@@ -68,14 +70,14 @@ fmt:
 	$(CARGO) fmt --all --check
 
 clippy:
-	$(CARGO) clippy --workspace --all-targets --locked -- -D warnings
+	$(CARGO) clippy --workspace --all-targets $(FEATURES) --locked -- -D warnings
 
 # Includes the tests against the peers, so they must have been built.
 unit: peers
-	$(CARGO) test --workspace --locked $(ARGS)
+	$(CARGO) test --workspace $(FEATURES) --locked $(ARGS)
 
 docs:
-	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace --locked
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked
 
 deny:
 	@scripts/deny.sh
@@ -93,17 +95,17 @@ peers-check-long: peers
 # Five routers that are cut and killed at random; a new seed each time, which it prints. The suite runs a short one.
 ring: peers
 	SGC_RING_SEED=$${SGC_RING_SEED:-$$(date +%s)} SGC_RING_SECONDS=$${SGC_RING_SECONDS:-120} \
-		$(CARGO) test -p sgc --locked --test ring $(ARGS) -- --nocapture
+		$(CARGO) test -p sgc $(FEATURES) --locked --test ring $(ARGS) -- --nocapture
 
 # Two hundred restarts of programs and nodes at random; a new seed each time, which it prints. The suite runs a short one.
 churn: peers
 	SGC_CHURN_SEED=$${SGC_CHURN_SEED:-$$(date +%s)} SGC_CHURN_STEPS=$${SGC_CHURN_STEPS:-200} \
-		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) nothing_is_left -- --nocapture
+		$(CARGO) test -p sgc $(FEATURES) --locked --test fidelity $(ARGS) nothing_is_left -- --nocapture
 
 # Ten minutes of images to a subscriber that stands still. The suite runs a short one.
 stall: peers
 	SGC_STALL_SECONDS=$${SGC_STALL_SECONDS:-600} \
-		$(CARGO) test -p sgc --locked --test fidelity $(ARGS) stands_still -- --nocapture
+		$(CARGO) test -p sgc $(FEATURES) --locked --test fidelity $(ARGS) stands_still -- --nocapture
 
 # Long searches of the fuzz targets; adds what they find to fuzz/corpus. `unit` runs the targets over that folder.
 fuzz:
@@ -113,20 +115,20 @@ fuzz:
 # 26 days. The suite runs a short one.
 gateway-soak: peers
 	SGC_SOAK_CLIENTS=$${SGC_SOAK_CLIENTS:-500} SGC_SOAK_CONNECTS=$${SGC_SOAK_CONNECTS:-20000} \
-		$(CARGO) test -p sgc --locked --test gateway_soak $(ARGS) -- --nocapture
+		$(CARGO) test -p sgc $(FEATURES) --locked --test gateway_soak $(ARGS) -- --nocapture
 
 # What a network of 200 nodes and 2000 endpoints costs a node, 50 of them shared.
 bench-graph: peers
 	SGC_GRAPH_NODES=$${SGC_GRAPH_NODES:-200} SGC_GRAPH_SHARED=$${SGC_GRAPH_SHARED:-50} SGC_GRAPH_SECONDS=$${SGC_GRAPH_SECONDS:-60} \
-		$(CARGO) test --release -p sgc --locked --test fidelity $(ARGS) a_busy_network -- --nocapture
+		$(CARGO) test --release -p sgc $(FEATURES) --locked --test fidelity $(ARGS) a_busy_network -- --nocapture
 
 # Every transport through NATs, roaming and bad paths, one at a time and five times over; prints what each cost.
 transports: peers
-	SGC_TRANSPORTS_LONG=1 $(CARGO) test -p sgc --locked --test transports $(ARGS) -- --nocapture
+	SGC_TRANSPORTS_LONG=1 $(CARGO) test -p sgc $(FEATURES) --locked --test transports $(ARGS) -- --nocapture
 
 # The whole matrix of DDS vendors, of which the suite runs a part. SGC_VENDORS=direct: with no sgc in between.
 vendors: peers
-	SGC_VENDORS=$${SGC_VENDORS:-full} $(CARGO) test -p sgc --locked --test vendors $(ARGS) -- --nocapture
+	SGC_VENDORS=$${SGC_VENDORS:-full} $(CARGO) test -p sgc $(FEATURES) --locked --test vendors $(ARGS) -- --nocapture
 
 # The tree protocol within larger bounds than in `unit`: minutes, and some GB.
 model-check:

@@ -52,6 +52,8 @@ need 'compiles c++ vector' g++ -- "C++ compiler: Cyclone DDS's build asks for on
 need 'command -v make' make -- "CMake drives it"
 need 'command -v cmake' cmake -- "builds Cyclone DDS (crate cyclors)"
 need has_libclang libclang-dev -- "makes the Rust bindings of Cyclone DDS (bindgen)"
+need 'compiles c openssl/ssl.h' libssl-dev -- "DDS Security in Cyclone DDS, which is linked with the static library"
+need 'command -v pkg-config' pkg-config -- "finds OpenSSL"
 if [ "$what" = test ]; then
     need 'compiles c++ fastcdr/Cdr.h' libfastcdr-dev -- "the Fast DDS test peer"
     need 'compiles c++ fastdds/dds/domain/DomainParticipant.hpp' libfastrtps-dev -- "the Fast DDS test peer"
@@ -61,7 +63,7 @@ if [ "$what" = test ]; then
     need 'test -x "${SGC_CHROMIUM:-/usr/bin/chromium}"' chromium -- "a page that uses the gateway; SGC_CHROMIUM names another browser of its kind"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
-    need 'command -v openssl' openssl -- "a DTLS program that is not ours"
+    need 'command -v openssl' openssl -- "a DTLS program that is not ours, a keystore for DDS Security"
 fi
 if [ "$what" = bench ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"
@@ -69,7 +71,6 @@ if [ "$what" = bench ]; then
     need 'command -v wireguard-go' wireguard-go -- "DDS over WireGuard"
     need 'command -v wg' wireguard-tools -- "DDS over WireGuard: its keys"
     need 'command -v openssl' openssl -- "certificates for Zenoh over TLS, a keystore for DDS Security"
-    need 'compiles c openssl/ssl.h' libssl-dev -- "DDS Security in the load generator's Cyclone DDS"
     need 'command -v ssh' openssh-client -- "files by SSH and SFTP"
     need 'test -x /usr/sbin/sshd' openssh-server -- "files by SSH and SFTP"
     need 'command -v valgrind' valgrind -- "counts instructions (make bench-instructions)"

@@ -9,6 +9,7 @@ use std::net::{IpAddr, Ipv4Addr};
 use sgc_ros::RosError;
 
 use crate::payload::PAYLOAD_BYTES_MAX;
+use crate::security::Security;
 use crate::user_data;
 
 /// How far discovery reaches without static peers: `ROS_AUTOMATIC_DISCOVERY_RANGE`.
@@ -46,6 +47,8 @@ pub struct DdsConfig {
     /// add up. A `<Domain Id="7">` in it applies to the first network that this process opens on
     /// domain 7. If it selects network interfaces, [`DiscoveryRange::LocalHost`] selects none.
     pub cyclonedds_uri: Option<String>,
+    /// The enclave with which the participant joins a network that DDS Security protects.
+    pub security: Option<Security>,
 }
 
 /// Largest ROS domain id: above, the RTPS port numbers (RTPS 2.5, 9.6.2.3) pass 65535.

@@ -1,5 +1,4 @@
-//! Which endpoints are there: a thread that reads DCPSPublication and DCPSSubscription, and DCPSParticipant where the
-//! ROS graph is wanted.
+//! Which endpoints are there: a thread that reads DCPSPublication, DCPSSubscription and DCPSParticipant.
 //!
 //! Reports each endpoint once when it appears, once when it is gone, and as gone and new when what it
 //! offers changes. Endpoints of this participant are never reported, those of other SGC nodes only to a
@@ -23,7 +22,7 @@ use crate::graph::{Announcer, Listener, SharedHandler, lock};
 use crate::network::Participant;
 use crate::reader::CycloneReader;
 use crate::wait::{Stop, WaitSet, join};
-use crate::{qos, user_data};
+use crate::{qos, security, user_data};
 
 /// Samples taken at once.
 const BATCH: usize = 32;
@@ -63,7 +62,7 @@ pub(crate) fn start(
     let graph = announcer.map(|announcer| Listener::new(Arc::clone(&handler), announcer));
     let stop = Stop::new(&participant)?;
     let endpoints = [EndpointKind::Writer, EndpointKind::Reader].map(Told::Endpoint);
-    let told = endpoints.into_iter().chain(graph.is_some().then_some(Told::Participant));
+    let told = endpoints.into_iter().chain([Told::Participant]);
     let readers: Vec<_> =
         told.map(|told| BuiltinReader::new(&participant, told)).collect::<Result<_, _>>()?;
     let conditions: Vec<&Entity> = readers.iter().map(|r| &r.condition).collect();
@@ -244,6 +243,9 @@ impl Discovery {
         if self.participant.owns(&guid) {
             return;
         }
+        if announcement.is_some() {
+            security::forget_silent(&guid);
+        }
         let endpoint =
             announcement.filter(|a| !(a.tagged && self.participant.ignores_tagged())).map(|a| a.endpoint);
         if endpoint.is_some() && self.known.get(&guid) == endpoint.as_ref() {
@@ -261,8 +263,23 @@ impl Discovery {
         lock(&self.handler)(DiscoveryEvent::Appeared(endpoint));
     }
 
+    /// Remembers a participant of ROS 2 of which no endpoint is known.
+    fn note_silence(&self, guid: Guid, user_data: Option<&[u8]>) {
+        let of_ros = user_data.filter(|data| !user_data::is_tagged(data)).and_then(user_data::enclave);
+        match of_ros {
+            Some(enclave) if !self.known.keys().any(|endpoint| endpoint.0[..12] == guid.0[..12]) => {
+                security::note_silent(&guid, enclave);
+            }
+            _ => security::forget_silent(&guid),
+        }
+    }
+
     fn apply_participant(&self, guid: Guid, user_data: Option<&[u8]>) {
-        let Some(graph) = self.graph.as_ref().filter(|_| !self.participant.owns(&guid)) else { return };
+        if self.participant.owns(&guid) {
+            return;
+        }
+        self.note_silence(guid, user_data);
+        let Some(graph) = &self.graph else { return };
         match user_data {
             // What SGC nodes say of the nodes that they stand for is for ROS 2, not for SGC nodes.
             Some(data) if user_data::is_tagged(data) && self.participant.ignores_tagged() => {}

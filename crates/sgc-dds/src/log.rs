@@ -57,13 +57,36 @@ impl Repeats {
     }
 }
 
-static REPEATS: Mutex<[Repeats; 2]> = Mutex::new([Repeats::NONE; 2]);
+static REPEATS: Mutex<[Repeats; 3]> = Mutex::new([Repeats::NONE; 3]);
 
 /// Returns the address of a packet that could not be sent, where Cyclone says so:
 /// `ddsi_udp_conn_write to udp/10.0.0.1:7411 failed with retcode -1`.
 fn unsent_to(message: &str) -> Option<&str> {
     let (to, _) = message.strip_prefix("ddsi_udp_conn_write to ")?.split_once(" failed with retcode")?;
     Some(to.strip_prefix("udp/").unwrap_or(to))
+}
+
+/// Returns the probable cause where Cyclone says that it refuses a secured participant. The words are those of `ddsi_handshake.c`,
+/// `ddsi_security_omg.c` and `ddsi_proxy_participant.c`.
+fn refused_program(message: &str) -> Option<&'static str> {
+    let says = |words: &str| message.contains(words);
+    if says("handshake reply failed") && says("ASN1 integer") {
+        Some(
+            "Fast DDS before 3.2 proposes keys by DH, which it encodes in another way than Cyclone DDS: set its property \
+             dds.sec.auth.builtin.PKI-DH.preferred_key_agreement to ECDH, or name the enclave of sgc `/bridge` (docs/vendors.md)",
+        )
+    } else if says("andshake")
+        || says("Remote secure participant")
+        || says("authenticate_peer_credential_token")
+    {
+        Some(
+            "compare its identity CA and governance with those of this node's enclave, and when both certificates end",
+        )
+    } else if says("does not allow remote participant") {
+        Some("its permissions do not grant it this ROS domain")
+    } else {
+        None
+    }
 }
 
 /// Counts an error, and logs it if its kind was not logged of late.
@@ -74,8 +97,13 @@ fn complain(message: &str, now: Instant) {
         let packets = unsent.as_ref().map_or(0, |unsent| unsent.packets) + 1;
         *unsent = Some(Unsent { packets, to: to.to_owned(), last: now });
     }
-    let [sending, other] = &mut *REPEATS.lock().unwrap_or_else(PoisonError::into_inner);
-    let kind = if to.is_some() { sending } else { other };
+    let refused = refused_program(message);
+    let [sending, security, other] = &mut *REPEATS.lock().unwrap_or_else(PoisonError::into_inner);
+    let kind = match (to, refused) {
+        (Some(_), _) => sending,
+        (None, Some(_)) => security,
+        (None, None) => other,
+    };
     let Some(before) = kind.note(now) else { return };
     let more = if before == 0 { String::new() } else { format!(" ({before} more since the last such line)") };
     match to {
@@ -83,7 +111,12 @@ fn complain(message: &str, now: Instant) {
             "packets to the local ROS 2 network cannot be sent, this one to {to}{more}: no way leads there, or this host's address \
              changed"
         ),
-        None => tracing::warn!(target: "cyclonedds", "{message}{more}"),
+        None => match refused {
+            Some(cause) => {
+                tracing::warn!("a program that DDS Security protects is not let in{more}: {message}; {cause}")
+            }
+            None => tracing::warn!(target: "cyclonedds", "{message}{more}"),
+        },
     }
 }
 
@@ -129,6 +162,8 @@ unsafe extern "C" fn sink(_: *mut c_void, data: *const dds_log_data_t) {
         if !heard {
             complain(message, Instant::now());
         }
+    } else if data.priority & DDS_LC_WARNING != 0 && refused_program(message).is_some() {
+        complain(message, Instant::now());
     } else if data.priority & DDS_LC_WARNING != 0 {
         // Cyclone's warnings name topics and types.
         tracing::debug!(target: "cyclonedds", "{message}");
@@ -147,6 +182,14 @@ mod tests {
         assert_eq!(unsent_to(said), Some("239.255.0.1:7400"));
         assert_eq!(unsent_to("ddsi_udp_conn_write to nowhere"), None);
         assert_eq!(unsent_to("malformed packet received"), None);
+    }
+
+    #[test]
+    fn refused_programs_are_told_with_the_cause() {
+        let said = "Begin handshake reply failed: Failed to convert key string to ASN1 integer: (code: 200)";
+        assert!(refused_program(said).is_some_and(|cause| cause.contains("ECDH")));
+        assert!(refused_program("Remote secure participant 1:2:3:1c1 not allowed").is_some());
+        assert_eq!(refused_program("Non secure remote writer 1:2:3:4 is not allowed."), None);
     }
 
     #[test]

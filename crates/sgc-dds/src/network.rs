@@ -32,6 +32,7 @@ use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
 use crate::same_host::SameHost;
 use crate::sample;
+use crate::security::{Security, SecurityError};
 use crate::service::{CycloneClient, CycloneServer};
 use crate::shown;
 use crate::user_data;
@@ -71,6 +72,7 @@ pub(crate) struct Participant {
     guid: Guid,
     domain_id: u32,
     tag: Option<String>,
+    security: Option<Security>,
     pace: Pace,
     holds: Pace,
     writers: AtomicUsize,
@@ -89,12 +91,27 @@ impl CycloneNetwork {
         let refused = |reason| RosError::Domain { domain: config.domain, reason };
         let domain = create_domain(config)?;
         let qos = NativeQos::new().map_err(refused)?;
-        let enclave = config.graph.then_some(user_data::DEFAULT_ENCLAVE);
+        let security = config.security.as_ref();
+        let unsecured = |security: &Security, e| refused(format!("enclave {}: {e}", security.enclave));
+        if let Some(security) = security {
+            if domain.is_alias() {
+                // Cyclone's plugins compare its own number of the domain with those in governance and permissions.
+                return Err(unsecured(security, SecurityError::NotFirst));
+            }
+            security.apply(&qos).map_err(|e| unsecured(security, e))?;
+        }
+        let named = security.map_or(user_data::DEFAULT_ENCLAVE, |security| &security.enclave);
+        let enclave = config.graph.then_some(named);
         qos.set_user_data(&user_data::of_participant(config.tag.as_deref(), enclave));
         // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
-        let entity =
-            Entity::new(unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) })
-                .map_err(refused)?;
+        let (handle, said) =
+            log::listen(|| unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) });
+        let entity = Entity::new(handle).map_err(|reason| match security {
+            Some(security) if said.is_empty() => unsecured(security, security.refused(reason)),
+            Some(security) => unsecured(security, security.refused(said)),
+            None if said.is_empty() => refused(reason),
+            None => refused(format!("{reason}: {said}")),
+        })?;
         let guid = entity.guid().map_err(refused)?;
         if let Err(reason) = first_messages::install(&domain.entity, &entity) {
             tracing::warn!(
@@ -109,19 +126,29 @@ impl CycloneNetwork {
             guid,
             domain_id: config.domain,
             tag: config.tag.clone(),
+            security: config.security.clone(),
             pace: Pace::new(),
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
             watcher: Mutex::default(),
         };
         // Before there are endpoints to announce.
-        if !participant.complete_announcements().map_err(refused)? {
+        let completed = participant.complete_announcements().or_else(|reason| {
+            // Without a graph an enclave need not have the topic by which it is done.
+            if config.graph {
+                Err(refused(participant.explain(&graph_writer().topic, reason)))
+            } else {
+                Ok(false)
+            }
+        })?;
+        if !completed {
             tracing::warn!(
                 "readers and writers are announced as Cyclone does: Fast DDS 3 shows no node for them"
             );
         }
         let participant = Arc::new(participant);
-        let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(refused)?;
+        let explained = |reason| refused(participant.explain(&graph_writer().topic, reason));
+        let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(explained)?;
         Ok(Self { discovery: Mutex::new(None), announcer: announcer.map(Arc::new), participant })
     }
 
@@ -166,21 +193,22 @@ impl RosNetwork for CycloneNetwork {
 
     fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<CycloneReader, RosError> {
         CycloneReader::new(&self.participant, spec, handler)
-            .map_err(|reason| refuse_endpoint("reader", spec, reason))
+            .map_err(|reason| self.refuse_endpoint("reader", spec, reason))
     }
 
     fn create_writer(&self, spec: &EndpointSpec) -> Result<CycloneWriter, RosError> {
-        CycloneWriter::new(&self.participant, spec).map_err(|reason| refuse_endpoint("writer", spec, reason))
+        CycloneWriter::new(&self.participant, spec)
+            .map_err(|reason| self.refuse_endpoint("writer", spec, reason))
     }
 
     fn create_client(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<CycloneClient, RosError> {
         CycloneClient::new(&self.participant, spec, handler)
-            .map_err(|reason| refuse_endpoint("client", &spec.request, reason))
+            .map_err(|reason| self.refuse_endpoint("client", &spec.request, reason))
     }
 
     fn create_server(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<CycloneServer, RosError> {
         CycloneServer::new(&self.participant, spec, handler)
-            .map_err(|reason| refuse_endpoint("server", &spec.request, reason))
+            .map_err(|reason| self.refuse_endpoint("server", &spec.request, reason))
     }
 
     fn reader_guid(&self, reader: &CycloneReader) -> Guid {
@@ -196,7 +224,8 @@ impl RosNetwork for CycloneNetwork {
             EndpointKind::Reader => "reader",
             EndpointKind::Writer => "writer",
         };
-        shown::create(&self.participant, kind, spec).map_err(|reason| refuse_endpoint(word, spec, reason))
+        shown::create(&self.participant, kind, spec)
+            .map_err(|reason| self.refuse_endpoint(word, spec, reason))
     }
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
@@ -251,6 +280,14 @@ impl Participant {
     /// How much they wait for readers' threads.
     pub(crate) fn holds(&self) -> &Pace {
         &self.holds
+    }
+
+    /// Adds to the reason why an endpoint cannot be made that DDS Security forbids it, if it is that.
+    fn explain(&self, topic: &str, reason: String) -> String {
+        match &self.security {
+            Some(security) => security.explain(topic, reason),
+            None => reason,
+        }
     }
 
     /// True if endpoints made by SGC are to be ignored.
@@ -313,8 +350,11 @@ impl Participant {
     }
 }
 
-fn refuse_endpoint(kind: &'static str, spec: &EndpointSpec, reason: String) -> RosError {
-    RosError::Create { kind, topic: spec.topic.clone(), type_name: spec.type_name.clone(), reason }
+impl CycloneNetwork {
+    fn refuse_endpoint(&self, kind: &'static str, spec: &EndpointSpec, reason: String) -> RosError {
+        let reason = self.participant.explain(&spec.topic, reason);
+        RosError::Create { kind, topic: spec.topic.clone(), type_name: spec.type_name.clone(), reason }
+    }
 }
 
 struct Domain {
@@ -323,6 +363,13 @@ struct Domain {
     id: u32,
     /// None if it loses programs of this host when the host's addresses change.
     same_host: Option<SameHost>,
+}
+
+impl Domain {
+    /// Returns `true` if the id is none of ROS.
+    fn is_alias(&self) -> bool {
+        self.id >= ALIAS_FIRST
+    }
 }
 
 /// Creates the Cyclone domain: under the ROS domain's own id, so that `<Domain Id="…">` in the user's

@@ -176,6 +176,14 @@ impl NativeQos {
         unsafe { dds_qset_data_representation(self.0, ids.len() as u32, ids.as_ptr()) };
     }
 
+    /// Adds a property of a participant, which is not announced.
+    pub(crate) fn set_property(&self, name: &str, value: &str) -> Result<(), String> {
+        let (name, value) = (c_string(name)?, c_string(value)?);
+        // SAFETY: the object is valid, and the call copies both texts.
+        unsafe { dds_qset_prop(self.0, name.as_ptr(), value.as_ptr()) };
+        Ok(())
+    }
+
     pub(crate) fn as_ptr(&self) -> *const dds_qos_t {
         self.0
     }

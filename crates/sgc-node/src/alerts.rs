@@ -82,6 +82,11 @@ pub enum Alert {
         /// Seconds since the last one.
         ago_s: u64,
     },
+    /// Programs of the local ROS 2 network announce themselves and none of their topics.
+    ProtectedPrograms {
+        /// The enclave that they name, `/` if they have none of their own.
+        enclave: String,
+    },
     /// An alert that this version does not know.
     #[serde(other)]
     Other,
@@ -112,6 +117,10 @@ impl Alert {
             }
             Self::LocalNetworkFails { .. } => {
                 "compare `ip addr` and `ip route` with that address; if this host's own address changed, restart the node"
+            }
+            Self::ProtectedPrograms { .. } => {
+                "if DDS Security (SROS2) protects them, set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves, \
+                 with a certificate of their CA and the key of that; if not, look for a firewall that stops UDP between them and sgc"
             }
             Self::Other => "use an `sgc` of the node's version",
         }
@@ -156,6 +165,10 @@ impl fmt::Display for Alert {
             Self::LocalNetworkFails { to, packets, ago_s } => write!(
                 f,
                 "packets to the local ROS 2 network cannot be sent, the last to {to} {ago_s} s ago ({packets} so far)"
+            ),
+            Self::ProtectedPrograms { enclave } => write!(
+                f,
+                "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) does so"
             ),
             Self::Other => f.write_str("the node says something that this version of sgc does not know"),
         }

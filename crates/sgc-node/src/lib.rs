@@ -43,6 +43,7 @@ mod outflow;
 pub mod partners;
 mod peer_rate;
 pub mod policy;
+mod protected;
 mod queue;
 mod records;
 mod refusal_log;

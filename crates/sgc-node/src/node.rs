@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
-use sgc_dds::{CycloneNetwork, DdsConfig};
+use sgc_dds::{CycloneNetwork, DdsConfig, Security};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_gateway::LocalRos;
 use sgc_ros::{RosError, RosNetwork, Routes, ShareRule, UseRule};
@@ -46,6 +46,7 @@ use crate::message_keys;
 use crate::network_slot::NetworkSlot;
 use crate::peer_rate::PeerRates;
 use crate::policy::grantees;
+use crate::protected;
 use crate::reload::{ConfigSource, JoinNetwork, Reloader, Running};
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
@@ -294,6 +295,7 @@ pub async fn run(
         });
         let network = Arc::new(CycloneNetwork::open(&config)?);
         runtime.spawn(discovery_server::watch());
+        runtime.spawn(protected::watch());
         Ok((network, Some(gateway)))
     });
     run_opening(config, identity, open, options, shutdown).await
@@ -694,6 +696,19 @@ fn system_rng() -> Result<ChaCha20Rng, NodeError> {
 }
 
 fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
+    let security = ros.security.as_ref().filter(|security| match security.enclave.check() {
+        Err(error) if !security.enforced => {
+            warn!(
+                "ROS_SECURITY_ENABLE is set and ROS_SECURITY_STRATEGY is not Enforce, so this node goes without DDS Security: {error}"
+            );
+            false
+        }
+        _ => true,
+    });
+    let security = security.map(|security| security.enclave.clone());
+    if let Some(key) = security.as_ref().and_then(Security::exposed_key) {
+        warn!("{}: others can read it, and it is the private key of an enclave: chmod 600 it", key.display());
+    }
     DdsConfig {
         domain: ros.domain_id,
         discovery: match ros.discovery {
@@ -706,5 +721,6 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
         tag: Some(identity.node_name().to_string()),
         graph: ros.graph,
         cyclonedds_uri: ros.cyclonedds_uri.clone(),
+        security,
     }
 }

@@ -6,12 +6,13 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use sgc_dds::Security;
 use sgc_gateway::{Anonymous, Right};
 use sgc_node::audit::AuditRoom;
 use sgc_node::config::{
     ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Mistake, Naming, Origin,
-    Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, Shaping, Table, TokenConfig, TokenSource,
-    TransportConfig, load, load_args, parse,
+    Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping, Table, TokenConfig,
+    TokenSource, TransportConfig, load, load_args, parse,
 };
 use sgc_transport::Congestion;
 use sgc_trust::Suite;
@@ -1274,21 +1275,40 @@ fn mistakes_in_the_environment_name_the_variable() {
 }
 
 #[test]
-fn a_network_that_enforces_security_is_refused_and_a_permissive_one_is_not() {
+fn security_is_what_the_file_says_or_else_the_environment() {
     const ENABLE: (&str, &str) = ("ROS_SECURITY_ENABLE", "true");
-    let parse = |vars: &[(&str, &str)]| parse_with(&format!("{NODE}[ros]"), vars);
-    let said = parse(&[ENABLE, ("ROS_SECURITY_STRATEGY", "Enforce")]).unwrap_err().to_string();
+    const ENFORCE: (&str, &str) = ("ROS_SECURITY_STRATEGY", "Enforce");
+    const KEYSTORE: (&str, &str) = ("ROS_SECURITY_KEYSTORE", "/keys");
+    const OVERRIDE: (&str, &str) = ("ROS_SECURITY_ENCLAVE_OVERRIDE", "/other");
+    let parse = |keys: &str, vars: &[(&str, &str)]| {
+        let config = parse_with(&format!("{NODE}[ros]\n{keys}"), vars);
+        config.map(|config| config.ros.unwrap().security).map_err(|errors| errors.to_string())
+    };
+    let security = |keystore: &str, enclave: &str, enforced| {
+        let enclave = Security { keystore: keystore.into(), enclave: enclave.to_owned() };
+        Ok(Some(SecurityConfig { enclave, enforced }))
+    };
+    let file = "enclave = '/sgc'\nsecurity_root = '/here'";
+    assert_eq!(parse("", &[ENFORCE, KEYSTORE, OVERRIDE]), Ok(None));
+    assert_eq!(parse("", &[ENABLE]), Ok(None), "rcl goes without where no keystore is named");
+    assert_eq!(parse("", &[ENABLE, KEYSTORE]), security("/keys", "/", false));
+    assert_eq!(parse("", &[ENABLE, ENFORCE, KEYSTORE, OVERRIDE]), security("/keys", "/other", true));
+    assert_eq!(parse(file, &[]), security("/here", "/sgc", true));
+    assert_eq!(parse(file, &[ENABLE, KEYSTORE, OVERRIDE]), security("/here", "/sgc", true));
+    assert_eq!(parse("enclave = '/sgc'", &[KEYSTORE]), security("/keys", "/sgc", true));
+    assert_eq!(parse("security_root = '/here'", &[]), security("/here", "/", true));
+
+    let error = |keys: &str, vars: &[(&str, &str)]| parse(keys, vars).unwrap_err();
+    let keystore = "DDS Security is asked for without a keystore: set `security_root`";
+    assert!(error("enclave = '/sgc'", &[]).starts_with(&format!("node.toml:4: {keystore}")));
+    assert!(error("", &[ENABLE, ENFORCE]).starts_with(&format!("environment: {keystore}")));
+    let name = "node.toml:4: `enclave` is \"/../private\"; an enclave is";
+    assert!(error("enclave = '/../private'\nsecurity_root = '/here'", &[]).starts_with(name));
+    let gateway = error(&format!("{file}\n[gateway]"), &[]);
     assert!(
-        said.contains("`ROS_SECURITY_STRATEGY` is \"Enforce\"; networks secured by SROS2 are planned"),
-        "{said}"
+        gateway.contains("`enclave` is given, but `[gateway]` is given: DDS Security admits one"),
+        "{gateway}"
     );
-    for vars in [
-        &[ENABLE][..],
-        &[ENABLE, ("ROS_SECURITY_STRATEGY", "Permissive")],
-        &[("ROS_SECURITY_STRATEGY", "Enforce")],
-    ] {
-        assert!(parse(vars).is_ok(), "{vars:?}");
-    }
 }
 
 #[test]

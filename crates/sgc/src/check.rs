@@ -147,6 +147,19 @@ fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<
     if let Some(alert) = clock_alert(identity, unix_now()) {
         rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
     }
+    if let Some(security) = config.ros.as_ref().and_then(|ros| ros.security.as_ref()) {
+        let enclave = &security.enclave;
+        rows.push(vec![
+            "enclave".to_owned(),
+            format!("{} in {}", enclave.enclave, enclave.keystore.display()),
+        ]);
+        let result = if security.enforced { "does not start like that" } else { "goes without DDS Security" };
+        let unusable = enclave.check().err().map(|error| format!("{error}; the node {result}"));
+        let exposed = enclave.exposed_key().map(|key| {
+            format!("{}: others can read it, and it is a private key: chmod 600 it", key.display())
+        });
+        rows.extend(unusable.or(exposed).map(|text| vec!["warning".to_owned(), text]));
+    }
     if config.ros.is_some() {
         for alert in discovery_server::alerts(&run::environment) {
             rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);

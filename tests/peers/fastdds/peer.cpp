@@ -46,7 +46,7 @@ using Clock = std::chrono::steady_clock;
 constexpr int EXIT_FINE = 0, EXIT_WRONG = 1, EXIT_USAGE = 2, EXIT_INCOMPLETE = 3;
 
 struct Options {
-    std::string role, topic = "/chatter", type = "string";
+    std::string role, topic = "/chatter", type = "string", enclave;
     uint32_t domain = 0;
     uint64_t count = 0, start = 0;
     double timeout = 60, rate = 10, hold = 0, linger = 0;
@@ -227,9 +227,27 @@ void apply(const Options& options, Qos& qos) {
     qos.endpoint().history_memory_policy = eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
 }
 
+// Secures a participant with the files of an enclave, and names the enclave, as rmw_fastrtps does.
+void secure(const std::string& enclave, DomainParticipantQos& qos) {
+    const std::string user_data = "enclave=" + enclave.substr(enclave.rfind('/')) + ";";
+    qos.user_data().setValue(std::vector<unsigned char>(user_data.begin(), user_data.end()));
+    const std::string identity = "dds.sec.auth.builtin.PKI-DH.", access = "dds.sec.access.builtin.Access-Permissions.";
+    const std::pair<std::string, std::string> files[] = {
+        {identity + "identity_ca", "identity_ca.cert.pem"},      {identity + "identity_certificate", "cert.pem"},
+        {identity + "private_key", "key.pem"},                   {access + "permissions_ca", "permissions_ca.cert.pem"},
+        {access + "governance", "governance.p7s"},               {access + "permissions", "permissions.p7s"},
+    };
+    auto& properties = qos.properties().properties();
+    properties.emplace_back("dds.sec.auth.plugin", "builtin.PKI-DH");
+    properties.emplace_back("dds.sec.access.plugin", "builtin.Access-Permissions");
+    properties.emplace_back("dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC");
+    for (const auto& [property, file] : files) properties.emplace_back(property, "file://" + enclave + "/" + file);
+}
+
 DomainParticipantQos participant_qos(const Options& options) {
     DomainParticipantQos qos = PARTICIPANT_QOS_DEFAULT;
     qos.name("/sgc_test_peer");
+    if (!options.enclave.empty()) secure(options.enclave, qos);
     if (!options.localhost && !options.udp_only) return qos;
     auto udp = std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>();
     qos.transport().use_builtin_transports = false;
@@ -441,7 +459,7 @@ Options parse(int argc, char** argv) {
                                    {"size", 1, nullptr, 's'},         {"start", 1, nullptr, 'f'},
                                    {"wait-matched", 1, nullptr, 'w'}, {"hold", 1, nullptr, 'h'},
                                    {"linger", 1, nullptr, 'l'},       {"depth", 1, nullptr, 'k'},
-                                   {"wait-go", 0, nullptr, 'g'},
+                                   {"enclave", 1, nullptr, 'e'},      {"wait-go", 0, nullptr, 'g'},
                                    {"large", 0, nullptr, 'G'},
                                    {"reliable", 0, nullptr, 'R'},     {"best-effort", 0, nullptr, 'B'},
                                    {"transient-local", 0, nullptr, 'T'}, {"localhost", 0, nullptr, 'L'},
@@ -462,6 +480,7 @@ Options parse(int argc, char** argv) {
                 case 'w': options.wait_matched = std::stoi(optarg); break;
                 case 'h': options.hold = std::stod(optarg); break;
                 case 'l': options.linger = std::stod(optarg); break;
+                case 'e': options.enclave = optarg; break;
                 case 'g': options.wait_go = true; break;
                 case 'k': options.depth = std::stoi(optarg); break;
                 case 'R': options.reliable = true; break;

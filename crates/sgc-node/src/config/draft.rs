@@ -94,6 +94,8 @@ pub(super) struct RosDraft {
     pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
     pub(super) graph: Option<Located<bool>>,
     pub(super) definitions: Option<Located<Vec<Located<String>>>>,
+    pub(super) enclave: Option<Located<String>>,
+    pub(super) security_root: Option<Located<String>>,
 }
 
 /// `[[share]]`. What is required is `None` only where an error has been recorded already.

@@ -295,18 +295,20 @@ pub enum Mistake {
         /// All that are allowed.
         known: &'static [&'static str],
     },
-    /// A value of the design that is not implemented yet.
-    #[error("`{key}` is {value:?}; {what} planned but not in this version: {instead}")]
-    PlannedValue {
+    /// Not an enclave of SROS2.
+    #[error("`{key}` is {value:?}; an enclave is \"/\", or like \"/arm/sgc\": letters, digits and `_`")]
+    Enclave {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// Subject and verb, such as `"wildcards are"`.
-        what: &'static str,
-        /// What works now.
-        instead: &'static str,
     },
+    /// An enclave of no keystore.
+    #[error(
+        "DDS Security is asked for without a keystore: set `security_root` in [ros], or ROS_SECURITY_KEYSTORE, to the directory that \
+         `ros2 security create_keystore` made"
+    )]
+    NoKeystore,
     /// Not a ROS 2 topic name.
     #[error("`{key}` is {value:?}; {rule}{}", suggest_value(right.as_deref()))]
     TopicName {

@@ -196,6 +196,8 @@ impl FileReader<'_> {
                 "definitions",
                 "an array of strings, such as [\"/opt/robot/share\"]",
             ),
+            enclave: self.string(ros, "enclave", "a string, such as \"/sgc\""),
+            security_root: self.string(ros, "security_root", "a string, such as \"/opt/robot/keystore\""),
         }
     }
 

@@ -28,6 +28,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::audit::AuditRoom;
+use sgc_dds::Security;
 pub use sgc_ros::{Interface, Naming, Rename, Shaping};
 use sgc_router::MappingKind;
 use sgc_transport::{Congestion, ListenAddr};
@@ -178,13 +179,25 @@ pub struct RosConfig {
     pub definitions: Vec<PathBuf>,
     /// `CYCLONEDDS_URI` as it is: what users of that middleware have set for their network holds here too.
     pub cyclonedds_uri: Option<String>,
+    /// The enclave of a network that DDS Security protects.
+    pub security: Option<SecurityConfig>,
+}
+
+/// The enclave with which the local ROS 2 network is joined.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SecurityConfig {
+    /// The enclave and its keystore.
+    pub enclave: Security,
+    /// `false` if the node goes without security where the keystore has no such enclave, as `ROS_SECURITY_STRATEGY` other than
+    /// `Enforce` means to ROS 2.
+    pub enforced: bool,
 }
 
 impl Default for RosConfig {
     fn default() -> Self {
         let (discovery, static_peers) = (DiscoveryRange::default(), Vec::new());
-        let (definitions, cyclonedds_uri) = (Vec::new(), None);
-        Self { domain_id: 0, discovery, static_peers, graph: true, definitions, cyclonedds_uri }
+        let (definitions, cyclonedds_uri, security) = (Vec::new(), None, None);
+        Self { domain_id: 0, discovery, static_peers, graph: true, definitions, cyclonedds_uri, security }
     }
 }
 

@@ -8,6 +8,7 @@ mod gateway_table;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use sgc_dds::Security;
 use sgc_ros::{Interface, Naming, Rename, Shaping, is_pattern, matches};
 use sgc_router::MappingKind;
 use sgc_transport::Congestion;
@@ -22,8 +23,8 @@ use super::names::{self, Recipient};
 use super::schema::nearest;
 use super::{
     AuditConfig, AuthorityConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
-    RosConfig, RotationConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig,
-    UseConfig, ros_env,
+    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
+    TransportConfig, UseConfig, ros_env,
 };
 use crate::audit::AuditRoom;
 
@@ -117,7 +118,15 @@ pub(super) fn resolve(
         let nothing = RosDraft::default();
         let written = draft.ros.as_ref().unwrap_or(&nothing);
         let ros = ros_env::resolve(written, env, &mut resolver.errors);
-        RosConfig { definitions: resolver.definitions(written), ..ros }
+        let security = resolver.security(written, env);
+        if let (Some(_), Some(_)) = (&security, &draft.gateway) {
+            let (key, other_value) = ("enclave", "given".to_owned());
+            let right = "DDS Security admits one participant of a process, and the gateway is one beside the node's: let a node of its own \
+                         have the gateway";
+            let mistake = Mistake::Contradiction { key, value: "given", other: "[gateway]", other_value, right };
+            resolver.record(&draft.origin, mistake);
+        }
+        RosConfig { definitions: resolver.definitions(written), security, ..ros }
     });
     let partners = resolver.partners(draft);
     let shares = resolver.shares(draft, node_name.as_ref());
@@ -518,6 +527,39 @@ impl Resolver<'_> {
             valid.extend(path);
         }
         valid
+    }
+
+    /// The enclave that the file names, or else the environment, as rcl reads that.
+    fn security(&mut self, written: &RosDraft, env: Environment<'_>) -> Option<SecurityConfig> {
+        let variable = |name| env(name).filter(|value| !value.is_empty());
+        let is_written = written.enclave.is_some() || written.security_root.is_some();
+        if !is_written && variable(ros_env::SECURITY_ENABLE).as_deref() != Some("true") {
+            return None;
+        }
+        let enforced = is_written || variable(ros_env::SECURITY_STRATEGY).as_deref() == Some("Enforce");
+        let keystore = match &written.security_root {
+            Some(root) => self.path(&root.clone().map(PathBuf::from), "\"/opt/robot/keystore\"")?,
+            None => match variable(ros_env::SECURITY_KEYSTORE) {
+                Some(keystore) => PathBuf::from(keystore),
+                None if enforced => {
+                    let origin = written.enclave.as_ref().map_or(Origin::Environment, |e| e.origin.clone());
+                    self.record(&origin, Mistake::NoKeystore);
+                    return None;
+                }
+                None => return None,
+            },
+        };
+        let in_environment = variable(ros_env::SECURITY_ENCLAVE_OVERRIDE);
+        let (key, enclave, origin) = match (&written.enclave, in_environment) {
+            (Some(enclave), _) => (enclave.key, enclave.value.clone(), enclave.origin.clone()),
+            (None, Some(enclave)) => (ros_env::SECURITY_ENCLAVE_OVERRIDE, enclave, Origin::Environment),
+            (None, None) => ("enclave", "/".to_owned(), Origin::Environment),
+        };
+        if !sgc_dds::is_enclave(&enclave) {
+            self.record(&origin, Mistake::Enclave { key, value: enclave });
+            return None;
+        }
+        Some(SecurityConfig { enclave: Security { keystore, enclave }, enforced })
     }
 
     fn rotation(&mut self, draft: &Draft) -> RotationConfig {

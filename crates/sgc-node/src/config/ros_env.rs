@@ -17,8 +17,10 @@ const DOMAIN_ID: &str = "ROS_DOMAIN_ID";
 const LOCALHOST_ONLY: &str = "ROS_LOCALHOST_ONLY";
 const DISCOVERY_RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
 const STATIC_PEERS: &str = "ROS_STATIC_PEERS";
-const SECURITY_ENABLE: &str = "ROS_SECURITY_ENABLE";
-const SECURITY_STRATEGY: &str = "ROS_SECURITY_STRATEGY";
+pub(super) const SECURITY_ENABLE: &str = "ROS_SECURITY_ENABLE";
+pub(super) const SECURITY_STRATEGY: &str = "ROS_SECURITY_STRATEGY";
+pub(super) const SECURITY_KEYSTORE: &str = "ROS_SECURITY_KEYSTORE";
+pub(super) const SECURITY_ENCLAVE_OVERRIDE: &str = "ROS_SECURITY_ENCLAVE_OVERRIDE";
 const CYCLONEDDS_URI: &str = "CYCLONEDDS_URI";
 
 const RANGES: [(&str, &str, DiscoveryRange); 4] = [
@@ -47,7 +49,6 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         None if range.only_localhost || !range.value.asks_peers() => Vec::new(),
         None => keep(env_peers(env), errors).unwrap_or_default(),
     };
-    keep(refuse_enforced_security(env), errors);
     RosConfig {
         domain_id: domain_id.unwrap_or(0),
         discovery: range.value,
@@ -56,20 +57,8 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         // Where paths are taken from is not known here.
         definitions: Vec::new(),
         cyclonedds_uri: variable(env, CYCLONEDDS_URI),
-    }
-}
-
-/// A network that enforces security admits nobody without an enclave: better said than found out by silence. What `rcl` takes
-/// for permission to go without is that here, too.
-fn refuse_enforced_security(env: Environment<'_>) -> Result<(), ConfigError> {
-    match (variable(env, SECURITY_ENABLE).as_deref(), variable(env, SECURITY_STRATEGY).as_deref()) {
-        (Some("true"), Some("Enforce")) => Err(in_environment(Mistake::PlannedValue {
-            key: SECURITY_STRATEGY,
-            value: "Enforce".into(),
-            what: "networks secured by SROS2 are",
-            instead: "a network without security, or without ROS_SECURITY_ENABLE (docs/vendors.md)",
-        })),
-        _ => Ok(()),
+        // Neither is where its keystore is.
+        security: None,
     }
 }
 

@@ -96,9 +96,16 @@ impl Table {
             Self::Node => {
                 &["name", "routers", "resolver", "keep_alive", "identity", "state", "trust", "watch"]
             }
-            Self::Ros => {
-                &["domain_id", "discovery_range", "localhost_only", "static_peers", "graph", "definitions"]
-            }
+            Self::Ros => &[
+                "domain_id",
+                "discovery_range",
+                "localhost_only",
+                "static_peers",
+                "graph",
+                "definitions",
+                "enclave",
+                "security_root",
+            ],
             Self::Share => &[
                 "topic",
                 "service",
@@ -172,8 +179,8 @@ impl Table {
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
             Self::Top => &["profile"],
-            Self::Ros => &["enclave", "security_root"],
-            Self::Node
+            Self::Ros
+            | Self::Node
             | Self::Router
             | Self::Transport
             | Self::Admin

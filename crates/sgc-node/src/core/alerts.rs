@@ -12,6 +12,7 @@ use tracing::{debug, info, warn};
 
 use super::{Core, now};
 use crate::alerts::{Alert, clock_alert};
+use crate::protected;
 
 /// The place of a process that is linked to another router of the mesh.
 const ELSEWHERE: &str = "another router";
@@ -118,6 +119,7 @@ impl<N: RosNetwork> Core<N> {
             let (to, packets) = (unsent.to, unsent.packets);
             (ago_s < UNSENT_SHOWN_S).then_some(Alert::LocalNetworkFails { to, packets, ago_s })
         }));
+        alerts.extend(protected::alerts());
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
             let ahead_ms = self.router.clock_ahead_ms(*id).filter(|ms| clocks_differ(*ms))?;
             let peer = self.called(&entry.link.peer().node_id);

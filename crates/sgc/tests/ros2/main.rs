@@ -15,6 +15,7 @@ mod hosts;
 mod keyed;
 #[path = "../support/lab.rs"]
 mod lab;
+mod secured;
 #[path = "../support/mod.rs"]
 mod support;
 mod why;

@@ -1,0 +1,202 @@
+//! A local network that DDS Security (SROS2) protects, with a keystore as SROS2 lays it out: everything is encrypted, and permissions
+//! name each topic.
+//!
+//! The programs are Fast DDS as Debian builds it, with the properties that rmw_fastrtps sets. The wheels of ROS 2 are built without security.
+
+#![cfg_attr(
+    not(feature = "sros2"),
+    allow(dead_code, unused_imports, reason = "a build without security has one test")
+)]
+
+use std::path::PathBuf;
+use std::process::Command;
+
+use rustix::process::Signal;
+
+use crate::PLAN;
+use crate::lab::{Lab, Site, share, uses};
+use crate::support::{self, Peer, eventually};
+
+/// The enclave of `sgc`. Of two participants the one with the lower id proposes how keys are agreed on, and Cyclone DDS does not read the
+/// proposal of this Fast DDS. The ids are hashes of the names, and this one is below that of `/talker`, `/listener` and most others.
+const ENCLAVE: &str = "/bridge";
+
+/// The topic in each direction, and that of the ROS graph.
+const TOPICS: [&str; 3] = ["rt/out", "rt/in", "ros_discovery_info"];
+
+/// A keystore in a lab's directory.
+struct Keystore(PathBuf);
+
+impl Keystore {
+    fn new(lab: &Lab) -> Self {
+        let keystore = Self(lab.dir().join("keystore"));
+        for enclave in ["/talker", "/listener", ENCLAVE] {
+            keystore.add(enclave, &TOPICS, "1");
+        }
+        keystore
+    }
+
+    /// Makes an enclave that may use these topics, with a certificate of so many days.
+    fn add(&self, enclave: &str, topics: &[&str], days: &str) {
+        let mut command = Command::new(support::repository("tests/peers/keystore.sh"));
+        command.arg(&self.0).arg(enclave).args(topics).env("VALID", days);
+        let made = command.output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    }
+
+    fn directory(&self, enclave: &str) -> PathBuf {
+        self.0.join("enclaves").join(&enclave[1..])
+    }
+}
+
+/// Makes the robot's node one of an enclave.
+fn join(lab: &Lab, enclave: &str) {
+    let keys = format!("static_peers = []\nenclave = \"{enclave}\"\nsecurity_root = \"keystore\"");
+    lab.reconfigure(Site::Robot, "static_peers = []", &keys);
+}
+
+/// Starts a program of an enclave beside the robot's node.
+fn secured(lab: &Lab, keystore: &Keystore, enclave: &str, role: &str, args: &[&str]) -> Peer {
+    let directory = keystore.directory(enclave);
+    lab.peer(Site::Robot, "fastdds", role, &[&["--enclave", directory.to_str().unwrap()], args].concat())
+}
+
+/// Runs the robot's node, which is expected to end at once, and returns its errors.
+fn refusal(lab: &Lab) -> String {
+    // One that starts all the same would end with its standard input, which is empty.
+    let args = ["run", "-c", "robot.toml", "--until-stdin-closes"];
+    let output = lab.sgc(Some(Site::Robot), &args).output().unwrap();
+    assert!(!output.status.success(), "{output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+/// Returns the output of `sgc check` about the robot's node.
+fn check(lab: &Lab) -> String {
+    let output = lab.sgc(None, &["check", "-c", "robot.toml"]).output().unwrap();
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// A lab with a topic in each direction, before its nodes are started.
+fn lab() -> Lab {
+    let robot = share("topic", "/out", "desk") + &uses("topic", "/in", "desk");
+    let desk = share("topic", "/in", "robot") + &uses("topic", "/out", "robot");
+    Lab::silent(PLAN, [robot, desk])
+}
+
+#[cfg(not(feature = "sros2"))]
+#[test]
+fn build_without_security_says_so() {
+    let lab = lab();
+    let _keystore = Keystore::new(&lab);
+    join(&lab, ENCLAVE);
+    let said = "this build has no DDS Security: build sgc with `--features sros2`";
+    assert!(refusal(&lab).contains(said), "{}", refusal(&lab));
+    assert!(check(&lab).contains(said), "{}", check(&lab));
+}
+
+#[cfg(feature = "sros2")]
+#[test]
+fn secured_programs_talk_to_far_unsecured_ones() {
+    let mut lab = lab();
+    let keystore = Keystore::new(&lab);
+    join(&lab, ENCLAVE);
+    lab.start_all();
+    // Images of many fragments.
+    for (topic, to_desk) in [("/out", true), ("/in", false)] {
+        let listen = ["--topic", topic, "--type", "image", "--size", "100000", "--count", "5"];
+        let talk = ["--topic", topic, "--type", "image", "--size", "100000", "--wait-go"];
+        let at_desk = |role: &str, args: &[&str]| lab.peer(Site::Desk, "fastdds", role, args);
+        let (mut listener, mut talker) = if to_desk {
+            (at_desk("sub", &listen), secured(&lab, &keystore, "/talker", "pub", &talk))
+        } else {
+            (secured(&lab, &keystore, "/listener", "sub", &listen), at_desk("pub", &talk))
+        };
+        listener.wait_matched(topic);
+        talker.wait_matched(topic);
+        talker.go();
+        let summary = listener.summary();
+        assert_eq!((summary["received"].as_u64(), summary["lost"].as_u64()), (Some(5), Some(0)), "{summary}");
+    }
+    assert!(!lab.log(Site::Robot).contains("DDS Security"), "{}", lab.log(Site::Robot));
+}
+
+#[cfg(feature = "sros2")]
+#[test]
+fn programs_that_keep_a_node_out_are_named() {
+    let mut lab = lab();
+    let keystore = Keystore::new(&lab);
+    keystore.add("/sgc", &TOPICS, "1");
+    lab.start_all();
+    let before = lab.why(Site::Robot, "/out");
+    assert!(!before.contains("SROS2"), "{before}");
+    let listen = ["--topic", "/out", "--verbose"];
+    let mut listener = lab.peer(Site::Desk, "fastdds", "sub", &listen);
+    let _talker = secured(&lab, &keystore, "/talker", "pub", &["--topic", "/out"]);
+    let said = "a program of enclave /talker announces itself to sgc, but none of its topics: DDS Security (SROS2) does so";
+    eventually("sgc why names the enclave", || lab.why(Site::Robot, "/out").contains(said));
+    eventually("the log names the enclave", || lab.log(Site::Robot).contains(said));
+
+    // An enclave whose id lets Fast DDS propose.
+    lab.end(Site::Robot, Signal::TERM);
+    join(&lab, "/sgc");
+    lab.start(Site::Robot);
+    let said = "a program that DDS Security protects is not let in: Begin handshake reply failed";
+    eventually("the log says why", || lab.log(Site::Robot).contains(said));
+    assert!(lab.log(Site::Robot).contains("preferred_key_agreement to ECDH"), "{}", lab.log(Site::Robot));
+
+    lab.end(Site::Robot, Signal::TERM);
+    lab.reconfigure(Site::Robot, "\"/sgc\"", "\"/bridge\"");
+    lab.start(Site::Robot);
+    listener.wait("a message", |event| event["event"] == "received");
+}
+
+#[cfg(feature = "sros2")]
+#[test]
+fn enclaves_that_cannot_be_used_are_refused_with_the_file() {
+    let mut lab = lab();
+    let keystore = Keystore::new(&lab);
+    keystore.add("/ended", &TOPICS, "-1");
+    keystore.add("/without_graph", &["rt/out"], "1");
+    keystore.add("/without_key", &TOPICS, "1");
+    std::fs::remove_file(keystore.directory("/without_key").join("key.pem")).unwrap();
+    let foreign = Keystore(lab.dir().join("foreign"));
+    foreign.add("/foreign", &TOPICS, "1");
+    keystore.add("/foreign", &TOPICS, "1");
+    let ca = "permissions_ca.cert.pem";
+    std::fs::copy(foreign.directory("/foreign").join(ca), keystore.directory("/foreign").join(ca)).unwrap();
+    let mut enclave = ENCLAVE.to_owned();
+    join(&lab, &enclave);
+    for (wrong, said, at_check) in [
+        (
+            "/absent",
+            "enclaves/absent is not there; the keystore has /bridge, /ended, /foreign, /listener",
+            true,
+        ),
+        ("/without_key", "without_key/key.pem: No such file or directory", true),
+        (
+            "/ended",
+            "enclaves/ended is refused: Error occurred while validating local permission: Certificate not valid",
+            false,
+        ),
+        ("/ended", "certificate has expired", false),
+        ("/foreign", "permissions_ca.cert.pem must belong to the CA that signed", false),
+        (
+            "/without_graph",
+            "without_graph/permissions.p7s does not grant ros_discovery_info to enclave /without_graph",
+            false,
+        ),
+    ] {
+        lab.reconfigure(Site::Robot, &format!("\"{enclave}\""), &format!("\"{wrong}\""));
+        wrong.clone_into(&mut enclave);
+        let refused = refusal(&lab);
+        assert!(refused.contains(said), "{wrong}: {refused}");
+        assert!(!at_check || check(&lab).contains(said), "{wrong}: {}", check(&lab));
+    }
+
+    // The graph's topic is not needed without a graph, and the other one is not granted.
+    lab.reconfigure(Site::Robot, "static_peers = []", "static_peers = []\ngraph = false");
+    lab.start_all();
+    let _talker = lab.peer(Site::Desk, "fastdds", "pub", &["--topic", "/in"]);
+    let said = "without_graph/permissions.p7s does not grant rt/in to enclave /without_graph";
+    eventually("the log names the topic", || lab.log(Site::Robot).contains(said));
+}
