@@ -548,7 +548,10 @@ impl<N: RosNetwork> Core<N> {
                     (Some(sink), Some(writer)) if wanted => {
                         self.graph.writer_there((name, source), writer.guid());
                         sink.set_writer(source, Some(writer));
-                        self.ask_histories(name);
+                        match source {
+                            Some(source) => self.ask_history(name, source),
+                            None => self.ask_histories(name),
+                        }
                     }
                     (_, Some(writer)) => writer.close(),
                     (_, None) => {}

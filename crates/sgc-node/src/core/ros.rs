@@ -269,7 +269,7 @@ impl<N: RosNetwork> Core<N> {
         if self.sinks.get(&name).is_some_and(|sink| sink.move_writer(from, to)) {
             self.graph.writer_moved(name, from, to);
             self.writers.insert((name, Some(to)), spec);
-            return self.ask_histories(name);
+            return self.ask_history(name, to);
         }
         // It is not there yet: whoever makes it finds that it is not wanted any more.
         self.open_writer(name, Some(to), spec);

@@ -1,9 +1,6 @@
 //! Services, actions and parameters of real ROS 2: calls made in the moment in which a server is seen, slow servers, servers that are
 //! started again. And the first messages of publishers, which meet the same fault of the transport.
 
-use std::thread;
-use std::time::Duration;
-
 use serde_json::Value;
 
 use super::lab::{Lab, Site, robot_to_desk};
@@ -178,39 +175,41 @@ fn clients_that_leave_before_a_server_is_there_stop_nothing() {
 
 #[test]
 fn first_messages_of_publishers_reach_far_subscribers() {
-    const PUBLISHERS: &str = "50";
-    const LONE_PUBLISHERS: u64 = 3;
+    const TOGETHER: u64 = 50;
+    const LONE: u64 = 3;
     let topics = DISTRIBUTIONS.map(|d| format!("/first_{d}"));
     let lab = Lab::real(PLAN, robot_to_desk("topic", &topics));
     for pair in PAIRS {
         let topic = format!("/first_{}", pair[0]);
-        let listen = |count: &str| {
-            let args = ["listen", "--topic", &topic, "--count", count];
-            let mut listener = program(&lab, Site::Desk, pair[1], &args);
-            listener.wait("a subscriber", |e| e["event"] == "ready");
-            listener
-        };
-        let publish = |count: &str, first: &str| {
-            let args = ["publish", "--topic", &topic, "--count", count, "--first", first];
+        let publish = |count: u64, first: u64| {
+            let [count, first] = [count, first].map(|number| number.to_string());
+            let args = ["publish", "--topic", &topic, "--count", &count, "--first", &first];
             let mut talker = program(&lab, Site::Robot, pair[0], &args);
             talker.wait("all", |e| e["event"] == "all_sent");
+            let end = first.parse::<u64>().unwrap() + count.parse::<u64>().unwrap();
+            eventually("all are taken", || {
+                let routes = lab.status(Site::Robot)["routes"].take();
+                routes.as_array().unwrap().iter().any(|r| r["topic"] == *topic && r["messages"] == end)
+            });
             talker
         };
-        let mut listener = listen(PUBLISHERS);
-        let mut talker = publish(PUBLISHERS, "0");
-        let heard = listener.summary();
-        assert_eq!([count(&heard, "received"), count(&heard, "duplicated")], [50, 0], "{pair:?}: {heard}");
-        talker.go();
-        talker.summary();
-        // As `ros2 topic pub --once` does, which ends a tenth of a second after its only message.
-        let mut listener = listen(&LONE_PUBLISHERS.to_string());
-        for number in 0..LONE_PUBLISHERS {
-            let mut talker = publish("1", &number.to_string());
-            thread::sleep(Duration::from_millis(100));
+        let end = |mut talker: Peer| {
             talker.go();
             talker.summary();
-        }
+        };
+        let all = TOGETHER + LONE;
+        let args = ["listen", "--topic", &topic, "--count", &all.to_string()];
+        let mut listener = program(&lab, Site::Desk, pair[1], &args);
+        // A publisher waits for a subscriber that `sgc` stands for, wherever the use of the topic is.
+        eventually("the subscriber is found", || {
+            lab.asked(Site::Desk, &["topic", "info", &topic]).contains("Subscribers on the local network: 1")
+        });
+        let together = publish(TOGETHER, 0);
+        // As `ros2 topic pub --once`, which ends once its only message is sent.
+        (TOGETHER..all).for_each(|number| end(publish(1, number)));
         let heard = listener.summary();
-        assert_eq!(count(&heard, "received"), LONE_PUBLISHERS, "{pair:?}: {heard}");
+        eprintln!("\nDESK {}\nROBOT {}", lab.status(Site::Desk), lab.status(Site::Robot));
+        assert_eq!([count(&heard, "received"), count(&heard, "duplicated")], [all, 0], "{pair:?}: {heard}");
+        end(together);
     }
 }

@@ -220,8 +220,13 @@ impl Lab {
 
     /// The text of `sgc why` about a topic at a site.
     pub(crate) fn why(&self, site: Site, topic: &str) -> String {
-        let mut command = self.sgc(Some(site), &["why", topic, "--socket"]);
-        let output = command.arg(self.path(site, "sock")).output().unwrap();
+        self.asked(site, &["why", topic])
+    }
+
+    /// The text with which the command line answers from a node.
+    pub(crate) fn asked(&self, site: Site, args: &[&str]) -> String {
+        let mut command = self.sgc(Some(site), args);
+        let output = command.arg("--socket").arg(self.path(site, "sock")).output().unwrap();
         String::from_utf8(output.stdout).unwrap()
     }
 
