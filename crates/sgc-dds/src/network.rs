@@ -66,7 +66,7 @@ pub struct CycloneNetwork {
 #[derive(Debug)]
 pub(crate) struct Participant {
     entity: Entity,
-    /// Ends before the domain.
+    /// Ends before the domain. None if it loses programs of this host when the host's addresses change.
     _same_host: Option<SameHost>,
     domain: Entity,
     guid: Guid,
@@ -100,6 +100,7 @@ impl CycloneNetwork {
             }
             security.apply(&qos).map_err(|e| unsecured(security, e))?;
         }
+        let same_host = SameHost::install(&domain.entity, domain.id, &qos);
         let named = security.map_or(user_data::DEFAULT_ENCLAVE, |security| &security.enclave);
         let enclave = config.graph.then_some(named);
         qos.set_user_data(&user_data::of_participant(config.tag.as_deref(), enclave));
@@ -112,6 +113,9 @@ impl CycloneNetwork {
             None if said.is_empty() => refused(reason),
             None => refused(format!("{reason}: {said}")),
         })?;
+        if let Err(reason) = &same_host {
+            tracing::warn!(reason, "programs of this host may be lost when its addresses change");
+        }
         let guid = entity.guid().map_err(refused)?;
         if let Err(reason) = first_messages::install(&domain.entity, &entity) {
             tracing::warn!(
@@ -121,7 +125,7 @@ impl CycloneNetwork {
         }
         let participant = Participant {
             entity,
-            _same_host: domain.same_host,
+            _same_host: same_host.ok(),
             domain: domain.entity,
             guid,
             domain_id: config.domain,
@@ -361,8 +365,6 @@ struct Domain {
     entity: Entity,
     /// The id that Cyclone knows it by.
     id: u32,
-    /// None if it loses programs of this host when the host's addresses change.
-    same_host: Option<SameHost>,
 }
 
 impl Domain {
@@ -409,11 +411,7 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
             return Err(refused(format!("{}: {errors}", reason(handle))));
         }
         let entity = Entity::new(handle).map_err(refused)?;
-        let same_host = SameHost::install(&entity, id);
-        if let Err(reason) = &same_host {
-            tracing::warn!(reason, "programs of this host may be lost when its addresses change");
-        }
-        return Ok(Domain { entity, id, same_host: same_host.ok() });
+        return Ok(Domain { entity, id });
     }
     Err(refused("the domain could not be created".into()))
 }

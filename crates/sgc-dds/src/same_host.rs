@@ -30,7 +30,9 @@ use crate::announcement::{self, HEAD_BYTES};
 use crate::config::local_addresses;
 use crate::entity::{Entity, INFINITE, check};
 use crate::host_addresses;
+use crate::log;
 use crate::network::read_file;
+use crate::qos::NativeQos;
 
 /// `DDSI_LOCATOR_KIND_UDPv4`.
 const UDP_V4: i32 = 1;
@@ -144,19 +146,20 @@ impl Drop for SameHost {
 }
 
 impl SameHost {
-    /// Makes a new domain send by this module, before anybody hears of it.
+    /// Makes a new domain send by this module, before anybody hears of it. `qos` is that of the domain's participants: where DDS Security
+    /// protects one, Cyclone ends the others as if it protected them, too.
     ///
     /// # Errors
     /// Where Cyclone is not as this module knows it, or does not use UDP over IPv4.
-    pub(crate) fn install(domain: &Entity, id: u32) -> Result<Self, String> {
+    pub(crate) fn install(domain: &Entity, id: u32, qos: &NativeQos) -> Result<Self, String> {
         host_addresses::follow();
         // SAFETY: takes numbers only; the handle is checked by Cyclone.
         let silence = |on| unsafe { dds_domain_set_deafmute(domain.handle(), on, on, INFINITE) };
         check(silence(true))?;
         // The way to the inside of a domain begins at a participant.
-        // SAFETY: null means the default QoS and no listener.
-        let participant = Entity::new(unsafe { dds_create_participant(id, ptr::null(), ptr::null()) });
-        let installed = participant.and_then(|participant| install(inside(&participant)?));
+        // SAFETY: the QoS object outlives the call, which copies it; null means no listener. Errors are said when the network's own is made.
+        let (handle, _) = log::listen(|| unsafe { dds_create_participant(id, qos.as_ptr(), ptr::null()) });
+        let installed = Entity::new(handle).and_then(|participant| install(inside(&participant)?));
         check(silence(false)).and(installed)
     }
 }
