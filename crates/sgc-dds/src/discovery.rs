@@ -186,8 +186,9 @@ impl Announcement {
         // SAFETY: valid by contract.
         let (topic, type_name) = unsafe { (name(sample.topic_name)?, name(sample.type_name)?) };
         // SAFETY: not null, valid by contract.
-        let (qos, data) =
-            unsafe { (qos::discovered(kind, guid.vendor(), sample.qos), qos::user_data(sample.qos)) };
+        let (qos, data) = unsafe {
+            (qos::discovered(kind, guid.vendor(), guid.is_keyless(), sample.qos), qos::user_data(sample.qos))
+        };
         let endpoint = DiscoveredEndpoint {
             kind,
             guid,

@@ -32,6 +32,7 @@ use cyclors::{
 };
 
 use crate::entity::{Entity, check};
+use crate::identity::FAST_DDS;
 
 /// How long after a match a reader asks for a heartbeat, nanoseconds. Cyclone tells of the match a few instructions before it would
 /// handle a heartbeat for the reader. On a busy machine the first answer may come in between; the second request is counted as if it
@@ -40,9 +41,6 @@ const ASK_DELAYS_NS: [i64; 2] = [1_000_000, 50_000_000];
 
 /// Bytes of `struct dds_domain` in front of the structs that are looked at here; there are some 600.
 const DOMAIN_HEAD_BYTES_MAX: usize = 4096;
-
-/// The vendor id of Fast DDS (RTPS 2.5, 9.3.1.2; list of the OMG).
-const FAST_DDS: [u8; 2] = [1, 15];
 
 /// `DDSI_EK_PROXY_WRITER` (`ddsi_entity.h`).
 const PROXY_WRITER: c_int = 4;

@@ -4,11 +4,30 @@
 //! that length with the other fragments, which announce one each: a fragment that announces more may reach beyond it. What
 //! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here.
 //!
+//! What a packet says behind a sample is read here as well: [`kept_by_writer`].
+//!
 //! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`.
 
 use std::ffi::c_void;
 
 use cyclors::ddsi_rdata;
+
+use crate::inline_qos::{DATA, DATA_FRAG, FLAG_LITTLE_ENDIAN};
+
+/// Submessages behind a sample's that are looked at.
+const SUBMESSAGES_MAX: usize = 4;
+
+/// A heartbeat (RTPS 2.5, 9.4.5.7): its kind, and its length up to the last number, bytes.
+const HEARTBEAT: (u8, usize) = (0x07, 28);
+
+/// INFO_TS and INFO_DST (RTPS 2.5, 9.4.5.11 and 9.4.5.9), which may stand in front of it.
+const INFO: [u8; 2] = [0x09, 0x0e];
+
+/// Where the writer's entity id begins in a sample and in a heartbeat, bytes from the beginning of the submessage.
+const WRITER_OFFSETS: [usize; 2] = [12, 8];
+
+/// Length of the header of a submessage, bytes.
+const SUBMESSAGE_HEAD_BYTES: usize = 4;
 
 /// The beginning of `struct ddsi_rdata` (`ddsi_radmin.h`), a fragment of a received sample.
 #[repr(C)]
@@ -49,4 +68,131 @@ pub(crate) unsafe fn cover_exactly(fragments: *const ddsi_rdata, bytes: usize) -
         at = fragment.next;
     }
     covered == bytes
+}
+
+/// Returns the number of messages that the writer of a sample keeps, if a heartbeat follows in the packet and says that the writer has
+/// dropped older ones.
+///
+/// Fast DDS puts a heartbeat behind each sample of a reliable writer once its history is full, into the same packet
+/// (`StatefulWriter::send_heartbeat_piggyback_nts_`). Its numbers are a row that begins with 1.
+///
+/// # Safety
+/// `fragment` must be one that Cyclone hands to a type of samples, while it does so.
+pub(crate) unsafe fn kept_by_writer(fragment: &ReceivedFragment) -> Option<u64> {
+    let mut at = usize::from(fragment.submessage_offset);
+    // SAFETY: valid by contract, and the packet follows the struct.
+    let (packet, bytes) = unsafe {
+        let bytes = (&raw const (*fragment.message).chunk_bytes).cast::<u32>().read_volatile();
+        (fragment.message.add(1).cast::<u8>(), bytes as usize)
+    };
+    // Cyclone allocates fragments behind the packet, in the same chunk while there is room.
+    let distance = (std::ptr::from_ref(fragment) as usize).wrapping_sub(packet as usize);
+    let end = bytes.min(distance);
+    let read = |at: usize, bytes: usize| {
+        // SAFETY: inside of the packet.
+        at.checked_add(bytes)
+            .filter(|to| *to <= end)
+            .map(|_| unsafe { std::slice::from_raw_parts(packet.add(at), bytes) })
+    };
+    let head = read(at, DATA.1)?;
+    if ![DATA.0, DATA_FRAG.0].contains(&head[0]) {
+        return None;
+    }
+    // Cyclone has put the header of the sample into the byte order of this machine; those behind it are as they came. It goes on with them
+    // after this or at the same time.
+    let writer = u32::from_ne_bytes(*head[WRITER_OFFSETS[0]..].first_chunk()?);
+    let mut length = usize::from(u16::from_ne_bytes([head[2], head[3]]));
+    for _ in 0..SUBMESSAGES_MAX {
+        if length == 0 {
+            // It is the last one.
+            return None;
+        }
+        at += SUBMESSAGE_HEAD_BYTES + length;
+        let head = read(at, SUBMESSAGE_HEAD_BYTES)?;
+        if (head[1] & FLAG_LITTLE_ENDIAN == 0) != cfg!(target_endian = "big") {
+            return None;
+        }
+        length = usize::from(u16::from_ne_bytes([head[2], head[3]]));
+        match head[0] {
+            kind if kind == HEARTBEAT.0 => {
+                let heartbeat = read(at, HEARTBEAT.1)?;
+                let from = *heartbeat[WRITER_OFFSETS[1]..].first_chunk()?;
+                let is_same = [u32::from_be_bytes(from), u32::from_ne_bytes(from)].contains(&writer);
+                return is_same.then(|| kept(heartbeat)).flatten();
+            }
+            kind if INFO.contains(&kind) => {}
+            _ => return None,
+        }
+    }
+    None
+}
+
+/// Returns the number of messages that a heartbeat announces, if they do not begin with the first of all.
+fn kept(heartbeat: &[u8]) -> Option<u64> {
+    let number = |at: usize| {
+        let (high, low) = (heartbeat[at..].first_chunk::<4>()?, heartbeat[at + 4..].first_chunk::<4>()?);
+        u64::try_from(i64::from(i32::from_ne_bytes(*high)) << 32 | i64::from(u32::from_ne_bytes(*low))).ok()
+    };
+    let (first, last) = (number(12)?, number(20)?);
+    (first > 1).then(|| last.checked_sub(first)?.checked_add(1)).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A message of Cyclone's with a packet of one sample and what follows it.
+    #[repr(C)]
+    struct Received {
+        message: ReceivedMessage,
+        packet: [u8; 128],
+    }
+
+    fn kept_in(behind: &[&[u8]], fragments: usize) -> Option<u64> {
+        let mut packet = [0; 128];
+        let sample =
+            [&[DATA.0, FLAG_LITTLE_ENDIAN, 28, 0][..], &[0; 8], &0x1303_u32.to_ne_bytes(), &[0; 16]].concat();
+        let all = [&[0; 20][..], &sample, &behind.concat()].concat();
+        packet[..all.len()].copy_from_slice(&all);
+        let message = ReceivedMessage {
+            references: 1,
+            last_chunk: std::ptr::null_mut(),
+            trace: false,
+            chunk_buffer: std::ptr::null_mut(),
+            chunk_next: std::ptr::null_mut(),
+            chunk_bytes: all.len().min(fragments) as u64,
+        };
+        let received = Received { message, packet };
+        let fragment = ReceivedFragment {
+            message: &raw const received.message,
+            next: std::ptr::null(),
+            first: 0,
+            end: 4,
+            submessage_offset: 20,
+            payload_offset: 44,
+        };
+        // SAFETY: as Cyclone has it.
+        unsafe { kept_by_writer(&fragment) }
+    }
+
+    fn heartbeat(writer: u8, first: u8, last: u8) -> Vec<u8> {
+        let head = [HEARTBEAT.0, FLAG_LITTLE_ENDIAN, 28, 0, 0, 0, 0, 4, 0, 0, 0x13, writer];
+        [&head[..], &[0, 0, 0, 0, first, 0, 0, 0], &[0, 0, 0, 0, last, 0, 0, 0], &[1, 0, 0, 0]].concat()
+    }
+
+    #[test]
+    fn a_heartbeat_behind_a_sample_tells_how_much_its_writer_keeps() {
+        let destination = [&[0x0e, FLAG_LITTLE_ENDIAN, 12, 0][..], &[7; 12]].concat();
+        assert_eq!(kept_in(&[&heartbeat(3, 6, 10)], 128), Some(5));
+        assert_eq!(kept_in(&[&destination, &heartbeat(3, 10, 10)], 128), Some(1));
+        assert_eq!(kept_in(&[], 128), None);
+        assert_eq!(kept_in(&[&heartbeat(3, 1, 10)], 128), None, "it has dropped none");
+        assert_eq!(kept_in(&[&heartbeat(4, 6, 10)], 128), None, "it is another writer's");
+        assert_eq!(kept_in(&[&heartbeat(3, 10, 6)], 128), None, "numbers fall");
+        assert_eq!(kept_in(&[&destination, &destination[..3]], 128), None, "the packet ends");
+        assert_eq!(kept_in(&[&heartbeat(3, 6, 10)], 79), None, "the heartbeat is cut");
+        let mut big_endian = heartbeat(3, 6, 10);
+        big_endian[1] = 0;
+        assert_eq!(kept_in(&[&big_endian], 128), None);
+    }
 }

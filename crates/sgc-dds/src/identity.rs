@@ -34,6 +34,9 @@ pub const NUMBER_UNKNOWN: i64 = -1 << 32;
 /// Vendor id of Cyclone DDS.
 pub(crate) const CYCLONE: [u8; 2] = [0x01, 0x10];
 
+/// The vendor id of Fast DDS (RTPS 2.5, 9.3.1.2; list of the OMG).
+pub(crate) const FAST_DDS: [u8; 2] = [0x01, 0x0f];
+
 /// Where a program puts the identity of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mapping {

@@ -50,6 +50,9 @@ pub(crate) const INLINE_QOS_BASE: usize = 8;
 /// The flag of submessages with inline QoS (RTPS 2.5, 9.4.5.4.1).
 pub(crate) const FLAG_INLINE_QOS: u8 = 0x02;
 
+/// The flag of submessages in little-endian byte order (RTPS 2.5, 9.4.5.1.2).
+pub(crate) const FLAG_LITTLE_ENDIAN: u8 = 0x01;
+
 /// Length of the sentinel that ends a list of parameters, bytes.
 const SENTINEL_BYTES: usize = 4;
 

@@ -31,6 +31,7 @@ pub mod identity;
 mod inline_qos;
 mod intake;
 mod known_writers;
+mod late;
 mod log;
 mod network;
 pub mod payload;

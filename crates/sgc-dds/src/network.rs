@@ -76,6 +76,7 @@ pub(crate) struct Participant {
     pace: Pace,
     holds: Pace,
     writers: AtomicUsize,
+    late_writers: AtomicUsize,
     /// The handler that discovery tells, while it is under way.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
 }
@@ -134,6 +135,7 @@ impl CycloneNetwork {
             pace: Pace::new(),
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
+            late_writers: AtomicUsize::new(0),
             watcher: Mutex::default(),
         };
         // Before there are endpoints to announce.
@@ -266,6 +268,11 @@ impl Participant {
     /// Writers of samples that live.
     pub(crate) fn writers(&self) -> &AtomicUsize {
         &self.writers
+    }
+
+    /// Those of them whose publisher did not announce its depth.
+    pub(crate) fn late_writers(&self) -> &AtomicUsize {
+        &self.late_writers
     }
 
     /// Has readers tell this handler of writers' liveliness, for as long as discovery keeps it.

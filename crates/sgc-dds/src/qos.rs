@@ -16,7 +16,7 @@ use sgc_ros::KEYED_SAMPLES_MAX;
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
 use crate::entity::{INFINITE, c_string};
-use crate::identity::CYCLONE;
+use crate::identity::{CYCLONE, FAST_DDS};
 
 /// Deepest history kept by an endpoint made here, and what a reader that asks for all is given: Cyclone's
 /// own bound on a reader stops delivery to *every* reader of the domain while it is reached, so a handler
@@ -272,12 +272,18 @@ fn finite(ns: i64) -> Option<u64> {
 /// the specification (DDS 1.4, 2.2.3). `None` if it cannot be carried: too many or too long partitions.
 ///
 /// Few vendors announce history, and Cyclone fills in what is missing before anybody sees it, so that it looks like a history of a
-/// single sample. Cyclone's own programs mean that; for others the depth of the durability service is taken for late joiners, and
-/// for volatile endpoints [`UNSAID_DEPTH`].
+/// single sample. Cyclone's own programs mean that; for others the depth of the durability service is taken for late joiners, and for
+/// volatile endpoints [`UNSAID_DEPTH`]. Reliable writers of Fast DDS on topics without keys tell the depth later, with their messages
+/// ([`crate::fragments::kept_by_writer`]): until then it is [`History::UNSAID`].
 ///
 /// # Safety
 /// `qos` must be a valid QoS object.
-pub(crate) unsafe fn discovered(kind: EndpointKind, vendor: [u8; 2], qos: *const dds_qos_t) -> Option<Qos> {
+pub(crate) unsafe fn discovered(
+    kind: EndpointKind,
+    vendor: [u8; 2],
+    keyless: bool,
+    qos: *const dds_qos_t,
+) -> Option<Qos> {
     let mut reliability = match kind {
         EndpointKind::Reader => dds_reliability_kind_DDS_RELIABILITY_BEST_EFFORT,
         EndpointKind::Writer => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
@@ -290,6 +296,7 @@ pub(crate) unsafe fn discovered(kind: EndpointKind, vendor: [u8; 2], qos: *const
     let mut limits = [0_i32; 3];
     let [max_samples, max_instances, max_per_instance] = &mut limits;
     let [blocking, cleanup] = &mut unused;
+    let mut is_unsaid = false;
     // SAFETY: `qos` is valid by contract; getters write only to the places given, and only if the policy
     // is present.
     unsafe {
@@ -310,6 +317,12 @@ pub(crate) unsafe fn discovered(kind: EndpointKind, vendor: [u8; 2], qos: *const
                     max_instances,
                     max_per_instance,
                 );
+                // The messages of a keyed topic that a writer keeps are not a row, so no depth follows from them.
+                is_unsaid = kind == EndpointKind::Writer
+                    && (vendor, keyless) == (FAST_DDS, true)
+                    && reliability == dds_reliability_kind_DDS_RELIABILITY_RELIABLE
+                    && history == dds_history_kind_DDS_HISTORY_KEEP_LAST
+                    && depth == 1;
             }
         }
         dds_qget_deadline(qos, &mut deadline);
@@ -328,7 +341,9 @@ pub(crate) unsafe fn discovered(kind: EndpointKind, vendor: [u8; 2], qos: *const
             dds_durability_kind_DDS_DURABILITY_PERSISTENT => Durability::Persistent,
             _ => Durability::Volatile,
         },
-        history: if history == dds_history_kind_DDS_HISTORY_KEEP_ALL {
+        history: if is_unsaid {
+            History::UNSAID
+        } else if history == dds_history_kind_DDS_HISTORY_KEEP_ALL {
             History::KeepAll
         } else {
             History::KeepLast(u32::try_from(depth).unwrap_or(1).max(1))
@@ -425,15 +440,13 @@ pub(crate) unsafe fn user_data(qos: *const dds_qos_t) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    const FAST_DDS: [u8; 2] = [0x01, 0x0f];
-
     /// Reads back what was set, as discovery does with what was announced.
     fn round_trip(kind: EndpointKind, qos: &Qos, keyless: bool) -> Qos {
         let native = NativeQos::endpoint(kind, qos, keyless, b"sgc=x;").unwrap();
         // SAFETY: a valid object that outlives the calls.
         unsafe {
             assert_eq!(user_data(native.as_ptr()), b"sgc=x;");
-            discovered(kind, CYCLONE, native.as_ptr()).unwrap()
+            discovered(kind, CYCLONE, keyless, native.as_ptr()).unwrap()
         }
     }
 
@@ -489,8 +502,8 @@ mod tests {
         // SAFETY: a valid object that outlives the calls.
         let (reader, writer) = unsafe {
             (
-                discovered(EndpointKind::Reader, FAST_DDS, native.as_ptr()).unwrap(),
-                discovered(EndpointKind::Writer, FAST_DDS, native.as_ptr()).unwrap(),
+                discovered(EndpointKind::Reader, FAST_DDS, true, native.as_ptr()).unwrap(),
+                discovered(EndpointKind::Writer, FAST_DDS, true, native.as_ptr()).unwrap(),
             )
         };
         assert_eq!(reader.reliability, Reliability::BestEffort);
@@ -501,8 +514,8 @@ mod tests {
 
     /// Whoever omits its history is seen with the default of the specification, which Cyclone fills in.
     #[test]
-    fn the_single_sample_of_who_says_nothing_of_its_history_is_none() {
-        let read = |vendor, durability, history, service_depth| {
+    fn a_single_sample_of_another_vendor_is_no_depth() {
+        let read_of = |keyless, vendor, durability, history, service_depth| {
             let native = NativeQos::endpoint(
                 EndpointKind::Writer,
                 &Qos { durability, history, ..Qos::default() },
@@ -522,15 +535,18 @@ mod tests {
                     unlimited,
                     unlimited,
                 );
-                discovered(EndpointKind::Writer, vendor, native.as_ptr()).unwrap().history
+                discovered(EndpointKind::Writer, vendor, keyless, native.as_ptr()).unwrap().history
             }
         };
         let (volatile, latched) = (Durability::Volatile, Durability::TransientLocal);
         let last = History::KeepLast;
+        let read = |vendor, durability, history, depth| read_of(true, vendor, durability, history, depth);
         assert_eq!(read(FAST_DDS, volatile, last(1), 1), last(UNSAID_DEPTH as u32));
         assert_eq!(read(FAST_DDS, volatile, last(5), 1), last(5));
         assert_eq!(read(FAST_DDS, volatile, History::KeepAll, 1), History::KeepAll);
-        assert_eq!(read(FAST_DDS, latched, last(1), 1), last(1));
+        assert_eq!(read(FAST_DDS, latched, last(1), 1), History::UNSAID);
+        assert_eq!(read_of(false, FAST_DDS, latched, last(1), 1), last(1));
+        assert_eq!(read([0x01, 0x12], latched, last(1), 1), last(1));
         assert_eq!(read(FAST_DDS, latched, last(1), 7), last(7));
         assert_eq!(read(CYCLONE, volatile, last(1), 1), last(1));
         assert_eq!(read(CYCLONE, latched, last(1), 7), last(1));

@@ -17,6 +17,9 @@ use crate::sample::SampleRef;
 /// Bound on the writers of one reader that are remembered as lapsed.
 const LAPSED_MAX: usize = 1024;
 
+/// Bound on the writers of one reader whose depths are told.
+const DEPTHS_MAX: usize = 1024;
+
 /// A raw reader; dropping it ends its thread, waits for a handler that is at work, and deletes the entities.
 #[derive(Debug)]
 pub struct CycloneReader(Intake<Samples>);
@@ -33,6 +36,7 @@ impl CycloneReader {
             newest_only: spec.qos.history == History::KeepLast(1),
             writers: KnownWriters::default(),
             lapsed: HashSet::new(),
+            depths: spec.qos.is_transient_local().then(HashSet::new),
             participant: Arc::clone(participant),
             held: None,
             handler,
@@ -52,14 +56,16 @@ struct Content {
     kind: SampleKind,
     key_hash: Option<KeyHash>,
     payload: Bytes,
+    /// The number of messages that its writer keeps, if that is told.
+    kept: Option<u64>,
 }
 
 impl Taken for Content {
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
         // SAFETY: a reference to a sample of this crate's type, by contract and by the topic of this module's readers.
         let sample = unsafe { SampleRef::from_raw(sample) };
-        let key_hash = sample.origin().and_then(|origin| origin.key_hash);
-        let content = Self { kind: sample.kind(), key_hash, payload: sample.into_payload() };
+        let (key_hash, kept) = sample.origin().map_or((None, None), |origin| (origin.key_hash, origin.kept));
+        let content = Self { kind: sample.kind(), key_hash, payload: sample.into_payload(), kept };
         if content.payload.len() < HEADER_BYTES {
             tracing::debug!(
                 bytes = content.payload.len(),
@@ -83,6 +89,8 @@ struct Samples {
     writers: KnownWriters,
     /// Writers whose lease ran out.
     lapsed: HashSet<dds_instance_handle_t>,
+    /// Writers whose depth was told; none are if late joiners get nothing.
+    depths: Option<HashSet<dds_instance_handle_t>>,
     participant: Arc<Participant>,
     /// Handed over when it is known whether another follows: after the look that finds the next one, or none. That the
     /// handler hears of the last one is a promise.
@@ -97,6 +105,23 @@ impl Samples {
         self.ignores_tagged && writer.is_some_and(|w| w.tagged)
     }
 
+    /// Returns the depth of a writer's history where that is news.
+    fn new_depth(&self, arrival: &Arrival<Content>) -> Option<u32> {
+        let told = self.depths.as_ref()?;
+        let depth =
+            arrival.sample.kept.filter(|_| !told.contains(&arrival.writer) && told.len() < DEPTHS_MAX)?;
+        Some(u32::try_from(depth).unwrap_or(u32::MAX))
+    }
+
+    /// Tells discovery of the depth of a writer's history where that is news.
+    fn tell_depth(&mut self, arrival: &Arrival<Content>, writer: Option<KnownWriter>) {
+        if let (Some(depth), Some(KnownWriter { guid, .. })) = (self.new_depth(arrival), writer) {
+            self.depths.get_or_insert_default().insert(arrival.writer);
+            tracing::debug!(writer = ?guid, depth, "the depth of a publisher's history is known");
+            self.participant.tell(DiscoveryEvent::HistoryDepth { guid, depth });
+        }
+    }
+
     /// Tells discovery of a writer's liveliness where that is news.
     fn tell_liveliness(&mut self, reader: dds_entity_t, LivelinessChange { writer, now }: LivelinessChange) {
         let (is_news, is_alive) = match now {
@@ -105,6 +130,9 @@ impl Samples {
             // Discovery tells of it by itself.
             WriterState::Gone => {
                 self.lapsed.remove(&writer);
+                if let Some(depths) = &mut self.depths {
+                    depths.remove(&writer);
+                }
                 return;
             }
         };
@@ -116,8 +144,8 @@ impl Samples {
     }
 }
 
-fn sample(content: Content, writer: Option<KnownWriter>, source_timestamp_ns: i64) -> Sample {
-    let Content { kind, key_hash, payload } = content;
+fn sample_of(content: Content, writer: Option<KnownWriter>, source_timestamp_ns: i64) -> Sample {
+    let Content { kind, key_hash, payload, .. } = content;
     Sample { kind, writer: writer.map(|w| w.guid), source_timestamp_ns, key_hash, payload, more: false }
 }
 
@@ -136,7 +164,8 @@ impl Receiver for Samples {
                 LivelinessChange { writer: arrival.writer, now: WriterState::Alive },
             );
         }
-        let next = sample(arrival.sample, writer, arrival.source_timestamp_ns);
+        self.tell_depth(&arrival, writer);
+        let next = sample_of(arrival.sample, writer, arrival.source_timestamp_ns);
         if self.newest_only {
             // None is held that a handler that blocks would make old.
             self.handler.handle(next);
@@ -154,10 +183,15 @@ impl Receiver for Samples {
         if self.is_ignored(writer) {
             return Ok(());
         }
+        // To tell it may block.
+        if self.new_depth(&arrival).is_some() {
+            return Err(arrival);
+        }
         let Arrival { sample: content, source_timestamp_ns, .. } = arrival;
-        let refused = self.handler.handle_at_once(sample(content, writer, source_timestamp_ns));
+        let kept = content.kept;
+        let refused = self.handler.handle_at_once(sample_of(content, writer, source_timestamp_ns));
         refused.map_err(|Sample { kind, key_hash, payload, .. }| Arrival {
-            sample: Content { kind, key_hash, payload },
+            sample: Content { kind, key_hash, payload, kept },
             ..arrival
         })
     }

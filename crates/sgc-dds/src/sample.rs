@@ -30,9 +30,10 @@ use sgc_ros::{EndpointSpec, KeyHash, SampleKind};
 use crate::entity::{Entity, c_string};
 use crate::fragments::{self, ReceivedFragment};
 use crate::identity::{
-    CYCLONE, PID_KEY_HASH, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity, key_hash,
+    CYCLONE, FAST_DDS, PID_KEY_HASH, PID_NOT_FOR_CYCLONE, PID_RELATED, PID_RELATED_FAST, SampleIdentity,
+    key_hash,
 };
-use crate::inline_qos::{self, DATA, FLAG_INLINE_QOS, INLINE_QOS_BASE, Parameter};
+use crate::inline_qos::{self, DATA, FLAG_INLINE_QOS, FLAG_LITTLE_ENDIAN, INLINE_QOS_BASE, Parameter};
 use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 
@@ -41,8 +42,8 @@ use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 /// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
 /// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), `struct ddsi_sertype_plist`
 /// (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of `ddsi_serdata_to_ser_ref`, and the functions
-/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; and all that
-/// `first_messages.rs` and `same_host.rs` name.
+/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; all that `first_messages.rs` and
+/// `same_host.rs` name; and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
@@ -76,6 +77,8 @@ pub(crate) struct Origin {
     pub(crate) related: Option<SampleIdentity>,
     /// The hash of its key.
     pub(crate) key_hash: Option<KeyHash>,
+    /// The number of messages that its writer keeps, if the packet tells.
+    pub(crate) kept: Option<u64>,
 }
 
 /// Facts that go with a payload that is sent.
@@ -219,7 +222,7 @@ impl SampleRef {
             }
             // Readers of the same participant are given this very sample.
             let Extra { related, key_hash, .. } = extra;
-            (*sample).origin = Some(Origin { vendor: CYCLONE, number: 0, related, key_hash });
+            (*sample).origin = Some(Origin { vendor: CYCLONE, number: 0, related, key_hash, kept: None });
             (*sample).common.timestamp.v = source_timestamp_ns;
             (*sample).common.hash = extra.instance;
         }
@@ -331,9 +334,6 @@ unsafe extern "C" {
 /// Where the sequence number is in either submessage: bytes from its beginning.
 const NUMBER_OFFSET: usize = 16;
 
-/// The flag of submessages in little endian (RTPS 2.5, 9.4.5.1.2).
-const FLAG_LITTLE_ENDIAN: u8 = 0x01;
-
 /// Length of the RTPS header, bytes (RTPS 2.5, 9.4.4).
 const RTPS_HEADER_BYTES: usize = 20;
 
@@ -413,7 +413,7 @@ unsafe fn origin(fragment: &ReceivedFragment) -> Option<Origin> {
     let big_endian = flags & FLAG_LITTLE_ENDIAN == 0;
     let related = inline_qos.and_then(|qos| SampleIdentity::related(qos, big_endian));
     let key_hash = inline_qos.and_then(|qos| key_hash(qos, big_endian));
-    Some(Origin { vendor, number, related, key_hash })
+    Some(Origin { vendor, number, related, key_hash, kept: None })
 }
 
 /// A table of functions that Cyclone reads from any thread.
@@ -514,6 +514,11 @@ unsafe extern "C" fn from_ser(
             if end > had {
                 let start = fragment.message.add(1).cast::<u8>().add(usize::from(fragment.payload_offset));
                 Content::push(sample, std::slice::from_raw_parts(start.add(had - first), end - had));
+            }
+            if let Some(origin) =
+                (*sample).origin.as_mut().filter(|o| fragment.next.is_null() && o.vendor == FAST_DDS)
+            {
+                origin.kept = fragments::kept_by_writer(fragment);
             }
             at = fragment.next;
         }

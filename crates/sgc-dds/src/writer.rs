@@ -3,9 +3,9 @@
 //! Writes on the caller's thread, which may block for [`crate::qos::WRITE_BLOCK_MAX_MS`]; it must not be a
 //! thread of Cyclone's or of an async runtime.
 
-use std::collections::HashMap;
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::{HashMap, VecDeque};
+use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -15,11 +15,13 @@ use cyclors::{
     dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
+use sgc_wire::{History, Qos};
 
 use crate::entity::{Entity, INFINITE, check, reason};
+use crate::late;
 use crate::network::Participant;
 use crate::payload::Frame;
-use crate::qos::{Unacknowledged, keys_kept};
+use crate::qos::{Unacknowledged, history_of, keys_kept};
 use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
 
@@ -35,7 +37,7 @@ const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 pub struct CycloneWriter {
     writer: Entity,
     _group: Option<Entity>,
-    _topic: Entity,
+    topic: Entity,
     participant: Arc<Participant>,
     guid: Guid,
     keyless: bool,
@@ -45,23 +47,98 @@ pub struct CycloneWriter {
     written: AtomicU32,
     /// The instances of keys, where those are kept apart.
     keys: Option<Mutex<Keys>>,
+    /// The history for late joiners, if it may turn out to be shorter than it is.
+    late: Option<(Mutex<Late>, Counted)>,
     _counted: Counted,
+}
+
+/// Bytes of samples that a writer whose publisher did not announce its depth keeps, for late joiners and for readers that have not
+/// acknowledged them; one sample may be longer.
+const LATE_BYTES_MAX: usize = 64 << 20;
+
+/// The same of all such writers of a network together.
+const LATE_BYTES_IN_ALL: usize = 256 << 20;
+
+/// The history of a transient-local writer whose publisher did not announce its depth.
+#[derive(Debug)]
+struct Late {
+    /// The depth that it was made with.
+    history: u32,
+    /// The publisher's.
+    wanted: u32,
+    /// Samples that late joiners get.
+    depth: u32,
+    /// The lengths of the samples that it keeps, whether readers have acknowledged them or not.
+    lengths: VecDeque<usize>,
+    bytes: usize,
+    /// Bytes that it may keep.
+    bytes_max: usize,
+}
+
+impl Late {
+    fn new(spec: &EndpointSpec) -> Option<Self> {
+        if !spec.qos.is_transient_local() || !spec.qos.is_reliable() || !spec.qos.history.is_unsaid() {
+            return None;
+        }
+        let (_, depth) = history_of(EndpointKind::Writer, spec.qos.history, spec.keyless);
+        let history = u32::try_from(depth).unwrap_or(1);
+        let (wanted, depth, bytes_max) = (history, history, LATE_BYTES_MAX);
+        Some(Self { history, wanted, depth, lengths: VecDeque::new(), bytes: 0, bytes_max })
+    }
+
+    /// Takes note of a sample of so many bytes, by one of so many writers. Returns the number of samples that may stay, if older ones may not.
+    fn note(&mut self, bytes: usize, writers: usize) -> Option<u32> {
+        self.bytes_max = (LATE_BYTES_IN_ALL / writers.max(1)).min(LATE_BYTES_MAX);
+        self.bytes += bytes;
+        self.lengths.push_back(bytes);
+        self.trim()
+    }
+
+    /// Takes note of the publisher's depth. Returns the same.
+    fn want(&mut self, depth: u32) -> Option<u32> {
+        self.wanted = depth.clamp(1, self.wanted);
+        self.trim()
+    }
+
+    fn trim(&mut self) -> Option<u32> {
+        let (mut is_over, depth) = (false, self.wanted as usize);
+        while self.lengths.len() > depth || (self.bytes > self.bytes_max && self.lengths.len() > 1) {
+            // Cyclone itself drops what is beyond the depth that the writer was made with.
+            is_over |= self.bytes > self.bytes_max || self.wanted < self.history;
+            self.bytes -= self.lengths.pop_front().unwrap_or(0);
+        }
+        is_over.then(|| u32::try_from(self.lengths.len()).unwrap_or(self.wanted))
+    }
+
+    /// Samples that late joiners may get.
+    fn allowed(&self) -> u32 {
+        let newest = self.lengths.back().copied().unwrap_or(0);
+        // Another like it would push one out.
+        let is_full = self.bytes.saturating_add(newest) > self.bytes_max;
+        let kept = u32::try_from(self.lengths.len()).unwrap_or(self.wanted).max(1);
+        if is_full { kept.min(self.wanted) } else { self.wanted }
+    }
+
+    /// Samples of so many bytes that it keeps for readers.
+    fn kept(&self, bytes: usize) -> u32 {
+        u32::try_from(self.bytes_max / bytes.max(1)).unwrap_or(u32::MAX).clamp(1, self.wanted)
+    }
 }
 
 /// Counts a writer of its network for as long as it lives.
 #[derive(Debug)]
-struct Counted(Arc<Participant>);
+struct Counted(Arc<Participant>, fn(&Participant) -> &AtomicUsize);
 
 impl Counted {
-    fn new(participant: &Arc<Participant>) -> Self {
-        participant.writers().fetch_add(1, Ordering::Relaxed);
-        Self(Arc::clone(participant))
+    fn new(participant: &Arc<Participant>, counter: fn(&Participant) -> &AtomicUsize) -> Self {
+        counter(participant).fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(participant), counter)
     }
 }
 
 impl Drop for Counted {
     fn drop(&mut self) {
-        self.0.writers().fetch_sub(1, Ordering::Relaxed);
+        (self.1)(&self.0).fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -117,18 +194,30 @@ impl CycloneWriter {
         })?;
         // SAFETY: takes numbers, checked by Cyclone.
         check(unsafe { dds_set_status_mask(writer.handle(), READERS_MATCHED) })?;
+        let late = Late::new(spec);
+        if let Some(Late { history, depth, .. }) = late
+            && !late::set_depth(writer.handle(), topic.handle(), history, [depth; 2], None)
+        {
+            tracing::warn!(
+                topic = spec.topic,
+                "late joiners get the last message: depths cannot be changed here"
+            );
+            let qos = Qos { history: History::KeepLast(1), ..spec.qos.clone() };
+            return Self::new(participant, &EndpointSpec { qos, ..spec.clone() });
+        }
         let guid = writer.guid()?;
         Ok(Self {
             writer,
             _group: group,
-            _topic: topic,
+            topic,
             participant: Arc::clone(participant),
             guid,
             keyless: spec.keyless,
             unacknowledged,
             written: AtomicU32::new(0),
             keys: keys_kept(&spec.qos, spec.keyless).map(|max| Mutex::new(Keys::new(max))),
-            _counted: Counted::new(participant),
+            late: late.map(|late| (Mutex::new(late), Counted::new(participant, Participant::late_writers))),
+            _counted: Counted::new(participant, Participant::writers),
         })
     }
 
@@ -138,10 +227,29 @@ impl CycloneWriter {
         self.unacknowledged.map_or(1, |kept| kept.instances(bytes, writers))
     }
 
+    /// Changes the history for late joiners, given the number of writers like this one, and brings Cyclone's in line with it. The change returns the
+    /// number of samples that may stay, if others may not.
+    fn change_late(&self, change: impl FnOnce(&mut Late, usize) -> Option<u32>) {
+        let Some((late, _)) = &self.late else { return };
+        let mut late = lock(late);
+        let stay = change(&mut late, self.participant.late_writers().load(Ordering::Relaxed));
+        let allowed = late.allowed();
+        if allowed != late.depth || stay.is_some() {
+            let (writer, topic) = (self.writer.handle(), self.topic.handle());
+            if late::set_depth(writer, topic, late.history, [late.depth, allowed], stay) {
+                late.depth = allowed;
+            }
+        }
+    }
+
     /// GUID of the writer, as others discover it.
     pub fn guid(&self) -> Guid {
         self.guid
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl RosWriter for CycloneWriter {
@@ -156,8 +264,14 @@ impl RosWriter for CycloneWriter {
         }
     }
 
+    fn set_late_depth(&self, depth: u32) {
+        self.change_late(|late, _| late.want(depth));
+    }
+
     fn kept(&self, bytes: usize) -> Option<u32> {
-        Some(self.unacknowledged?.depth.saturating_mul(self.instances(bytes)))
+        let kept = self.unacknowledged?.depth.saturating_mul(self.instances(bytes));
+        let late = self.late.as_ref().map(|(late, _)| lock(late).kept(bytes));
+        Some(late.map_or(kept, |late| late.min(kept)))
     }
 
     fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError> {
@@ -202,7 +316,10 @@ impl RosWriter for CycloneWriter {
                 Err(RosError::WriteTimeout { waited_ms: started.elapsed().as_millis() as u64 })
             }
             ret if ret < 0 => Err(failed(reason(ret))),
-            _ => Ok(()),
+            _ => {
+                self.change_late(|late, writers| late.note(payload.len(), writers));
+                Ok(())
+            }
         }
     }
 

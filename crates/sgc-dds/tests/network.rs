@@ -471,6 +471,63 @@ fn late_joiners_get_history_of_the_depth_asked_for() {
     assert_eq!(next(&live).payload, padded(&string_cdr("live")), "a volatile reader gets no history");
 }
 
+fn latched(topic: &str, history: History) -> EndpointSpec {
+    with(spec(topic), |qos| (qos.durability, qos.history) = (Durability::TransientLocal, history))
+}
+
+/// A publisher that announced no depth is written for with one that is set later.
+#[test]
+fn late_joiners_get_history_of_a_depth_that_is_set_later() {
+    let (ros, sgc) = (open(57, None), open(57, Some("arm-1")));
+    let writer = sgc.create_writer(&latched("map", History::UNSAID)).unwrap();
+    let (_early, early) = read(&ros, &latched("map", History::KeepLast(50)));
+    matched(&writer, 1);
+    let texts: Vec<String> = (0..20).map(|i| i.to_string()).collect();
+    let assert_late = |first: usize, last: usize| {
+        let (_late, samples) = read(&ros, &latched("map", History::KeepLast(50)));
+        for text in &texts[first..last] {
+            assert_eq!(next(&samples).payload, padded(&string_cdr(text)));
+        }
+    };
+    for text in &texts[..10] {
+        write(&writer, &string_cdr(text));
+    }
+    assert_late(0, 10);
+    writer.set_late_depth(5);
+    assert_late(5, 10);
+    for text in &texts[10..20] {
+        write(&writer, &string_cdr(text));
+    }
+    // Readers of one participant get what is under way to any of them.
+    for text in &texts[..20] {
+        assert_eq!(next(&early).payload, padded(&string_cdr(text)), "all come, once");
+    }
+    assert_late(15, 20);
+}
+
+/// However many such writers there are, and however long their samples.
+#[test]
+fn history_of_unknown_depth_is_bounded_in_bytes() {
+    const LONG_BYTES: usize = 4 << 20;
+    let (ros, sgc) = (open(58, None), open(58, Some("arm-1")));
+    let long = |n: u8| Bytes::from([&[0, 1, 0, 0, n, 0, 0, 0][..], &vec![n; LONG_BYTES - 8]].concat());
+    let heard = |topic: &str, count: usize| {
+        let (_late, samples) = read(&ros, &latched(topic, History::KeepLast(50)));
+        (0..count).map(|_| next(&samples).payload[4]).collect::<Vec<_>>()
+    };
+    let first = sgc.create_writer(&latched("first", History::UNSAID)).unwrap();
+    for n in 0..20 {
+        write(&first, &long(n));
+    }
+    assert_eq!(heard("first", 16), (4..20).collect::<Vec<_>>(), "64 MiB of one");
+    let writers: Vec<_> = (1..32)
+        .map(|n| sgc.create_writer(&latched(&format!("other_{n}"), History::UNSAID)).unwrap())
+        .collect();
+    write(&first, &long(20));
+    assert_eq!(heard("first", 2), [19, 20], "256 MiB of 32");
+    drop(writers);
+}
+
 #[test]
 fn source_time_and_writer_are_preserved() {
     let (ros, sgc) = (open(81, None), open(81, Some("arm-1")));

@@ -102,16 +102,9 @@ impl History {
         self.late.add(&message);
         self.recent.add(&message);
         self.kept.push_back(message);
-        let front = self.kept.front().map_or(next, |m| m.seq);
+        self.trim_late();
+        let front = self.front();
         let at = |tail: &Tail| (tail.from - front) as usize;
-        // Marks are small, and count for late joiners in nothing but bytes.
-        while self.depth > 0
-            && (self.late.messages > self.depth || self.late.bytes > self.bytes_max)
-            && let Some(first) = self.kept.get(at(&self.late))
-            && (first.is_mark() || self.late.messages > 1)
-        {
-            self.late.drop_first(first);
-        }
         while self.recovery.messages_max > 0
             && (self.recent.numbers > self.recovery.messages_max
                 || self.recent.bytes > self.recovery.bytes_max)
@@ -126,10 +119,40 @@ impl History {
         if self.recovery.messages_max == 0 {
             self.recent = Tail { from: next, numbers: 0, messages: 0, bytes: 0 };
         }
+        self.drop_unused();
+    }
+
+    /// Keeps so many messages for late joiners from here on, at least one if it kept any.
+    pub(crate) fn set_depth(&mut self, depth: usize) {
+        if self.depth > 0 {
+            self.depth = depth.max(1);
+            self.trim_late();
+            self.drop_unused();
+        }
+    }
+
+    fn trim_late(&mut self) {
+        let front = self.front();
+        // Marks are small, and count for late joiners in nothing but bytes.
+        while self.depth > 0
+            && (self.late.messages > self.depth || self.late.bytes > self.bytes_max)
+            && let Some(first) = self.kept.get((self.late.from - front) as usize)
+            && (first.is_mark() || self.late.messages > 1)
+        {
+            self.late.drop_first(first);
+        }
+    }
+
+    fn drop_unused(&mut self) {
         let from = self.late.from.min(self.recent.from);
         while self.kept.front().is_some_and(|m| m.seq < from) {
             self.kept.pop_front();
         }
+    }
+
+    /// The number that is kept longest; that of late joiners if none is.
+    fn front(&self) -> u64 {
+        self.kept.front().map_or(self.late.from, |m| m.seq)
     }
 
     /// Lets go what was dated before `ns`, up to the first that was not: messages of one publisher are dated in turn. What has
@@ -204,6 +227,25 @@ mod tests {
         assert_eq!(seqs(&history, 0), [4, 5, 6, 7, 8]);
         assert_eq!(seqs(&history, 7), [7, 8]);
         assert_eq!(seqs(&history, 9), []);
+    }
+
+    #[test]
+    fn late_joiners_get_no_more_once_the_depth_is_known() {
+        let mut history = history(100, 10_000, 2, 10_000);
+        for n in 1..=9_i64 {
+            let head = MessageHead::new(if n == 7 { MessageKind::Mark } else { MessageKind::Write }, n * 10);
+            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+        }
+        history.set_depth(3);
+        assert_eq!((history.late_from(), seqs(&history, 0)), (6, vec![6, 7, 8, 9]));
+        push(&mut history, MessageKind::Write, 8);
+        assert_eq!(history.late_from(), 7);
+        history.set_depth(0);
+        assert_eq!(history.late_from(), 10);
+        let mut volatile = self::history(0, 10_000, 2, 10_000);
+        volatile.set_depth(5);
+        push(&mut volatile, MessageKind::Write, 8);
+        assert_eq!(volatile.late_from(), 2);
     }
 
     #[test]

@@ -297,6 +297,12 @@ impl Source {
         self.progress.oldest.store(self.history.late_from(), Release);
     }
 
+    /// Keeps so many messages for late joiners from here on, if it keeps any for them.
+    pub fn set_history_depth(&mut self, depth: usize) {
+        self.history.set_depth(depth);
+        self.progress.oldest.store(self.history.late_from(), Release);
+    }
+
     /// Its id.
     pub fn id(&self) -> SourceId {
         self.config.id

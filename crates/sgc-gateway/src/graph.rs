@@ -151,7 +151,7 @@ impl GraphState {
                 self.endpoints.remove(&guid);
             }
             // The graph shows endpoints for as long as they are there, as in ROS 2.
-            DiscoveryEvent::Liveliness { .. } => {}
+            DiscoveryEvent::Liveliness { .. } | DiscoveryEvent::HistoryDepth { .. } => {}
             DiscoveryEvent::Nodes { participant, nodes } if nodes.is_empty() => {
                 self.nodes.remove(&participant);
             }

@@ -119,7 +119,7 @@ pub struct Qos {
     pub reliable: bool,
     /// Volatile 0, transient local 1, transient 2, persistent 3.
     pub durability: u8,
-    /// History depth; none keeps all.
+    /// History depth; none keeps all, [`Self::UNSAID_DEPTH`] is not known.
     pub depth: Option<u32>,
     /// Deadline.
     pub deadline_ns: Option<u64>,
@@ -168,6 +168,12 @@ impl From<&sgc_wire::Qos> for Qos {
 }
 
 impl Qos {
+    /// The depth of a transient-local publisher that has not announced it, until it is known.
+    pub const UNSAID_DEPTH: Option<u32> = match History::UNSAID {
+        History::KeepLast(depth) => Some(depth),
+        History::KeepAll => None,
+    };
+
     /// Reliability as ROS 2 spells it.
     pub fn reliability(&self) -> &'static str {
         if self.reliable { "RELIABLE" } else { "BEST_EFFORT" }

@@ -276,6 +276,11 @@ impl LocalSink {
         true
     }
 
+    /// The writer that was opened for this source, or for all that have none of their own.
+    pub(crate) fn open_writer(&self, source: Option<SourceId>) -> Option<Arc<WriterQueue>> {
+        self.writers.load().get(&source).cloned()
+    }
+
     /// What was not taken for want of a writer has to be asked for where there is one now.
     fn ask_for_missed(&self, state: &mut State) {
         for source in std::mem::take(&mut state.missed) {
@@ -577,11 +582,19 @@ pub(crate) struct Behind {
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
     /// Returns `true` if a short message, taken now, waits for nobody, and overwrites none that a reader may lack.
     is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
+    /// Has it give late joiners so many messages. May block.
+    resize: Box<dyn Fn(u32) + Send + Sync>,
 }
 
 impl Default for Behind {
     fn default() -> Self {
-        Self { guid: Guid([0; 16]), recent: None, matched: Box::new(|| 0), is_free: Box::new(|_| false) }
+        Self {
+            guid: Guid([0; 16]),
+            recent: None,
+            matched: Box::new(|| 0),
+            is_free: Box::new(|_| false),
+            resize: Box::new(|_| ()),
+        }
     }
 }
 
@@ -602,6 +615,11 @@ impl Recent {
             History::KeepLast(n) => (n as usize).min(RECENT_MAX),
         };
         Some(Mutex::new(Self { depth, heads: VecDeque::new(), again: false }))
+    }
+
+    fn keep(&mut self, depth: usize) {
+        self.depth = depth.clamp(1, RECENT_MAX);
+        self.heads.drain(..self.heads.len().saturating_sub(self.depth));
     }
 }
 
@@ -632,8 +650,14 @@ impl WriterQueue {
                 && room.spacing().wait(Instant::now(), message.source, published_ns).is_none()
                 && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, published_ns))
         });
+        let to_resize = weak.clone();
+        let resize = Box::new(move |depth| {
+            if let Some(writer) = to_resize.upgrade() {
+                writer.set_late_depth(depth);
+            }
+        });
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free };
+        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let mut key_hash = None;
@@ -824,6 +848,12 @@ impl WriterQueue {
                 Err(_) => {}
             }
         }
+    }
+
+    /// Gives late joiners so many messages from here on. May block.
+    pub(crate) fn resize(&self, depth: u32) {
+        self.with_recent(|recent| recent.keep(depth as usize));
+        (self.behind.resize)(depth);
     }
 
     /// From here on what was written before may come once more.

@@ -70,13 +70,16 @@ pub(crate) struct SourceSlot {
     pub reliable: bool,
     /// How long its messages are of use.
     pub lifespan: Option<Duration>,
+    /// Messages that it keeps for late joiners.
+    pub depth: usize,
 }
 
 impl SourceSlot {
     /// A source for a share.
     pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
         let (id, progress) = (source.id(), source.progress());
-        Self { id, source: Arc::new(Mutex::new(source)), progress, keeps_history, reliable, lifespan: None }
+        let source = Arc::new(Mutex::new(source));
+        Self { id, source, progress, keeps_history, reliable, lifespan: None, depth: 0 }
     }
 }
 
@@ -220,6 +223,12 @@ impl LocalShare {
             published: AtomicU64::new(0),
             taps: Taps::default(),
         }
+    }
+
+    /// Has a source keep so many messages for late joiners.
+    pub(crate) fn set_history_depth(&self, slot: &SourceSlot, depth: usize) {
+        let source = slot.source.clone();
+        self.run_blocking(move || lock(&source).set_history_depth(depth));
     }
 
     /// Who looks at what is published.

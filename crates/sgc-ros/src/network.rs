@@ -110,6 +110,13 @@ pub enum DiscoveryEvent {
         /// Whether it lives.
         is_alive: bool,
     },
+    /// The depth of the history of a writer that announced none is known. Told of writers that a reader made here is matched with.
+    HistoryDepth {
+        /// The writer.
+        guid: Guid,
+        /// Messages that it keeps for late joiners.
+        depth: u32,
+    },
     /// All nodes that a participant has from now on; none if it is gone. Their endpoints may appear before or after.
     Nodes {
         /// The participant.
@@ -398,6 +405,12 @@ pub trait RosWriter: Send + Sync + 'static {
 
     /// Lets leave what was written ahead.
     fn flush(&self) {}
+
+    /// Gives late joiners the last samples, so many, from here on. Only a writer made with [`sgc_wire::History::UNSAID`] does, and never more
+    /// than before.
+    fn set_late_depth(&self, depth: u32) {
+        let _ = depth;
+    }
 
     /// Returns the number of samples of so many bytes that it keeps for reliable readers that have not acknowledged them yet. Beyond it each write
     /// takes the place of the oldest, whether somebody lacks that or not. None if it waits for its readers rather.

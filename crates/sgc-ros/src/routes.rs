@@ -424,6 +424,7 @@ impl<R: RngCore> Routes<R> {
                 }
             }
             DiscoveryEvent::Liveliness { guid, is_alive } => self.handle_liveliness(guid, is_alive),
+            DiscoveryEvent::HistoryDepth { guid, depth } => self.handle_depth(&guid, depth),
             DiscoveryEvent::Nodes { participant, nodes } => self.handle_nodes(participant, nodes),
         }
     }

@@ -144,6 +144,12 @@ impl Bench {
         self.commands()
     }
 
+    fn keeps(&mut self, n: u8, depth: u32) -> Vec<Command> {
+        let event = DiscoveryEvent::HistoryDepth { guid: Guid([n; 16]), depth };
+        self.routes.handle_discovery(self.now, event);
+        self.commands()
+    }
+
     fn catalogue(&mut self, entries: Vec<CatalogueEntry>) -> Vec<Command> {
         self.routes.handle_catalogue(self.now, OWNER, Catalogue { version: 1, entries });
         self.commands()
@@ -470,6 +476,70 @@ fn a_publisher_whose_node_started_anew_keeps_its_writer() {
     assert!(twice.iter().all(|c| !matches!(c, Command::MoveWriter { .. })));
     let thrice = b.catalogue(list(&[source(1, 6), source(1, 7), source(1, 8)]));
     assert_eq!(thrice.iter().filter(|c| matches!(c, Command::MoveWriter { .. })).count(), 2, "{thrice:?}");
+}
+
+#[test]
+fn a_depth_that_becomes_known_is_listed_and_replaces_no_source() {
+    let unsaid = Qos { history: History::UNSAID, ..latched() };
+    let mut b = bench(&[("/map", "")], &[]);
+    let begun = b.appears(writer(1, "/map", unsaid.clone()));
+    let mapped = |commands: &[Command]| {
+        let own = commands.iter().find_map(|c| match c {
+            Command::MapSources { own, .. } => Some(own.clone()),
+            _ => None,
+        });
+        own.unwrap().into_iter().map(|(_, source, qos)| (source, qos.history)).collect::<Vec<_>>()
+    };
+    let source = mapped(&begun)[0].0;
+    assert_eq!(mapped(&begun), [(source, History::UNSAID)]);
+    let learned = b.keeps(1, 5);
+    assert_eq!(mapped(&learned), [(source, History::KeepLast(5))]);
+    let lists = |command: &Command| matches!(command, Command::UpdateShare { sources, .. } if sources[0].qos.history == History::KeepLast(5));
+    assert!(has(&learned, lists) && !opens_reader(&learned), "{learned:?}");
+    // It does not change, and what was announced is not changed.
+    assert_eq!(b.keeps(1, 6), []);
+    // Messages that expired look like dropped ones.
+    let mut b = bench(&[("/map", "")], &[]);
+    b.appears(writer(1, "/map", Qos { lifespan_ns: Some(1), ..unsaid }));
+    assert_eq!(b.keeps(1, 5), []);
+}
+
+#[test]
+fn a_depth_that_becomes_known_or_unknown_leaves_the_writer_open() {
+    let mut b = bench(&[], &[("/map", None)]);
+    let name = theirs("/map", STRING);
+    let source = |run| SourceId::of_publisher([1; 8], [run; 8]);
+    let list = |run, history| {
+        let mut entry = entry("/map", STRING, latched(), &[1]);
+        (entry.sources[0].source, entry.sources[0].qos.history) = (source(run), history);
+        vec![entry]
+    };
+    b.catalogue(list(1, History::UNSAID));
+    b.routes.handle_granted(&name, None);
+    assert_eq!(b.commands().len(), 1);
+    let [Command::ResizeWriter { source: of, spec, .. }] = &b.catalogue(list(1, History::KeepLast(5)))[..]
+    else {
+        panic!("it is not resized")
+    };
+    assert_eq!((*of, spec.qos.history), (Some(source(1)), History::KeepLast(5)));
+    // Its node starts anew, does not know the depth any more, and learns it again.
+    let moved = b.catalogue(list(2, History::UNSAID));
+    assert_eq!(moved, [Command::MoveWriter { name, from: source(1), to: source(2) }]);
+    assert_eq!(b.catalogue(list(2, History::KeepLast(5))), []);
+    // It starts anew before and after the depth is known.
+    let mut b = bench(&[], &[("/map", None)]);
+    b.catalogue(list(1, History::UNSAID));
+    b.routes.handle_granted(&name, None);
+    b.commands();
+    let [Command::MoveWriter { .. }, Command::ResizeWriter { source: of, .. }] =
+        &b.catalogue(list(2, History::KeepLast(5)))[..]
+    else {
+        panic!("it is not moved and resized")
+    };
+    assert_eq!(*of, Some(source(2)));
+    // Another depth is another writer.
+    let other = b.catalogue(list(2, History::KeepLast(6)));
+    assert!(has(&other, |c| matches!(c, Command::OpenWriter { .. })), "{other:?}");
 }
 
 #[test]

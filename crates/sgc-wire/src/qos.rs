@@ -36,6 +36,17 @@ pub enum History {
     KeepAll,
 }
 
+impl History {
+    /// The history of a transient-local publisher that did not announce its depth: as deep as memory allows, until the depth is known.
+    /// DDS has no deeper one (DDS 1.4, 2.2.3.18: a signed number).
+    pub const UNSAID: Self = Self::KeepLast(i32::MAX as u32);
+
+    /// Returns `true` if the depth was not announced and is not known.
+    pub fn is_unsaid(self) -> bool {
+        self == Self::UNSAID
+    }
+}
+
 /// Liveliness kind (DDS 1.4, 2.2.3.11).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Liveliness {

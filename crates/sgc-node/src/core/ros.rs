@@ -147,6 +147,7 @@ impl<N: RosNetwork> Core<N> {
                     sink.set_writer(source, None);
                 }
             }
+            Command::ResizeWriter { name, source, spec } => self.resize_writer(name, source, spec),
             Command::MoveWriter { name, from, to } => self.move_writer(name, from, to),
             Command::SetNode { name, source, owner, node } => {
                 self.graph.set_node((name, source), owner, node)
@@ -169,13 +170,13 @@ impl<N: RosNetwork> Core<N> {
         let share_of = |bytes: usize, sources: usize| (bytes / sources).max(RECOVERY_BYTES_MIN);
         // Keys are in payloads, at which nobody looks here: what several instances keep is one row, as in the local writers.
         let instances = if self.endpoint.is_keyed(&name) { KEYED_INSTANCES_KEPT } else { 1 };
+        let depth_of = |qos: &Qos| match qos.history {
+            _ if !qos.is_transient_local() => 0,
+            History::KeepAll => HISTORY_KEEP_ALL_MAX,
+            History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
+        };
         let slot = |id, qos: &Qos, sources: usize| {
-            let keeps_history = qos.is_transient_local();
-            let depth = match qos.history {
-                _ if !keeps_history => 0,
-                History::KeepAll => HISTORY_KEEP_ALL_MAX,
-                History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
-            };
+            let (keeps_history, depth) = (qos.is_transient_local(), depth_of(qos));
             let config = SourceConfig {
                 name,
                 id,
@@ -187,14 +188,25 @@ impl<N: RosNetwork> Core<N> {
             };
             let source = Source::new(config, &grant, message_key.clone())?;
             let lifespan = qos.lifespan_ns.map(Duration::from_nanos);
-            Some(SourceSlot { lifespan, ..SourceSlot::new(source, keeps_history, qos.is_reliable()) })
+            Some(SourceSlot { lifespan, depth, ..SourceSlot::new(source, keeps_history, qos.is_reliable()) })
         };
+        // Some publishers may have one source together, which keeps what the deepest of them does.
+        let mut depths = BTreeMap::<SourceId, usize>::new();
+        for (_, id, qos) in &own {
+            let depth = depths.entry(*id).or_default();
+            *depth = depth_of(qos).max(*depth);
+        }
         // A source is never made twice under one id: its sequence numbers are nonces.
         let mut map = SourceMap { per_writer: !own.is_empty(), ..SourceMap::default() };
         for (guid, id, qos) in own {
             let kept = map.slot(&id).or_else(|| old.slot(&id));
             let sources = map.own.len() + 1;
-            if let Some(slot) = kept.or_else(|| slot(id, &qos, sources)) {
+            if let Some(mut slot) = kept.or_else(|| slot(id, &qos, sources)) {
+                let depth = depths.get(&id).copied().unwrap_or_default();
+                if slot.depth != depth {
+                    share.set_history_depth(&slot, depth);
+                    slot.depth = depth;
+                }
                 map.own.insert(guid, slot);
             }
         }
@@ -259,6 +271,21 @@ impl<N: RosNetwork> Core<N> {
                 })
                 .ok();
             let _ = events.blocking_send(CoreEvent::WriterReady { name, source, spec, writer });
+        });
+    }
+
+    /// Has a writer give late joiners fewer messages.
+    fn resize_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
+        let History::KeepLast(depth) = spec.qos.history else { return };
+        let Some(writer) = self.sinks.get(&name).and_then(|sink| sink.open_writer(source)) else {
+            // It is not there yet: whoever makes it finds that it is not wanted any more.
+            return self.open_writer(name, source, spec);
+        };
+        self.writers.insert((name, source), spec);
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            writer.resize(depth);
         });
     }
 

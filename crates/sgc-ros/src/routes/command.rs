@@ -165,6 +165,15 @@ pub enum Command {
         /// What to create.
         spec: EndpointSpec,
     },
+    /// A writer gives late joiners fewer samples from here on, and goes on with what it has otherwise.
+    ResizeWriter {
+        /// The joined name.
+        name: Name,
+        /// The source that it is for, by now.
+        source: Option<SourceId>,
+        /// As it would be opened now.
+        spec: EndpointSpec,
+    },
     /// A writer is for another source from here on: its publisher is the same, and what it has written already is not to be
     /// written again.
     MoveWriter {

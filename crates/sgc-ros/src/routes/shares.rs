@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use rand_core::RngCore;
 use sgc_trust::derive_name;
-use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Liveliness, Name, Qos, SinkId, SourceId};
+use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, History, Kind, Liveliness, Name, Qos, SinkId, SourceId};
 
 use super::services::interface;
 use super::{
@@ -155,6 +155,25 @@ impl<R: RngCore> Routes<R> {
         for (name, share) in &mut self.shares {
             if let Some(own) = share.own.get_mut(&guid).filter(|own| is_concerned(own)) {
                 own.is_lapsed = !is_alive;
+                names.push(*name);
+            }
+        }
+        for name in names {
+            self.refresh_share(name);
+        }
+    }
+
+    /// Lists the depth of a local publisher that did not announce it. Messages that expired look like dropped ones, so the depth of a publisher with
+    /// a lifespan is not known by that.
+    pub(super) fn handle_depth(&mut self, writer: &Guid, depth: u32) {
+        let is_unsaid = |qos: &Qos| qos.history.is_unsaid() && qos.lifespan_ns.is_none();
+        let Some(endpoint) = self.endpoints.get_mut(writer).filter(|e| is_unsaid(&e.qos)) else { return };
+        endpoint.qos.history = History::KeepLast(depth.max(1));
+        let history = endpoint.qos.history;
+        let mut names = Vec::new();
+        for (name, share) in &mut self.shares {
+            if let Some(endpoint) = share.writers.get_mut(writer) {
+                endpoint.qos.history = history;
                 names.push(*name);
             }
         }

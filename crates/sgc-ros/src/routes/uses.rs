@@ -6,7 +6,9 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_trust::name_of;
-use sgc_wire::{Catalogue, CatalogueEntry, ENTRY_SOURCES_MAX, Metadata, Name, NodeId, Qos, SourceId};
+use sgc_wire::{
+    Catalogue, CatalogueEntry, ENTRY_SOURCES_MAX, History, Metadata, Name, NodeId, Qos, SourceId,
+};
 
 use super::{
     Cause, Command, Direction, ENTRIES_PER_RULE_MAX, Problem, ROUTES_PER_WILDCARD_MAX, Routes, Settling,
@@ -290,7 +292,8 @@ impl<R: RngCore> Routes<R> {
             wanted.insert(None, spec(&entry.qos));
         }
         // A publisher whose node started anew has another source. To the local network it is the one that it was.
-        let mut moved = BTreeSet::new();
+        let (mut moved, mut resized) = (BTreeSet::new(), BTreeSet::new());
+        let mut stand_ins = BTreeMap::new();
         for (to, spec) in wanted.iter().filter_map(|(to, spec)| Some(((*to)?, spec))) {
             let is_gone = |from: &SourceId| {
                 !wanted.contains_key(&Some(*from))
@@ -298,12 +301,25 @@ impl<R: RngCore> Routes<R> {
                     && !moved.contains(from)
             };
             let mut alike =
-                route.writers.iter().filter(|(_, old)| *old == spec).filter_map(|(from, _)| *from);
+                route.writers.iter().filter(|(_, old)| serves(old, spec)).filter_map(|(from, _)| *from);
             let from = alike.find(is_gone);
             if let Some(from) = from.filter(|_| !route.writers.contains_key(&Some(to))) {
                 moved.extend([from, to]);
+                stand_ins.insert(Some(to), Some(from));
                 self.commands.push_back(Command::MoveWriter { name, from, to });
             }
+        }
+        for (source, spec) in &mut wanted {
+            let old = route.writers.get(stand_ins.get(source).unwrap_or(source));
+            let Some(old) = old.filter(|old| *old != spec && serves(old, spec)) else { continue };
+            if spec.qos.history.is_unsaid() {
+                // The depth of a publisher does not change. It was known before its node started anew.
+                spec.qos.history = old.qos.history;
+            } else {
+                let (source, spec) = (*source, spec.clone());
+                self.commands.push_back(Command::ResizeWriter { name, source, spec });
+            }
+            resized.insert(*source);
         }
         // Those that their owner has to find first stay as they are.
         if matches!(self.settling.get(&self.use_rules[route.rule].owner), Some(Settling::Until(_))) {
@@ -315,13 +331,13 @@ impl<R: RngCore> Routes<R> {
         }
         let has_moved = |source: &Option<SourceId>| source.is_some_and(|source| moved.contains(&source));
         for (source, old) in &route.writers {
-            if wanted.get(source) != Some(old) && !has_moved(source) {
+            if wanted.get(source) != Some(old) && !has_moved(source) && !resized.contains(source) {
                 route.nodes.remove(source);
                 self.commands.push_back(Command::CloseWriter { name, source: *source });
             }
         }
         for (source, spec) in &wanted {
-            if route.writers.get(source) != Some(spec) && !has_moved(source) {
+            if route.writers.get(source) != Some(spec) && !has_moved(source) && !resized.contains(source) {
                 let spec = spec.clone();
                 self.commands.push_back(Command::OpenWriter { name, source: *source, spec });
             }
@@ -355,4 +371,16 @@ impl<R: RngCore> Routes<R> {
             self.report(Cause::Catalogue(self.use_rules[rule].owner), problem);
         }
     }
+}
+
+/// Whether an open writer can be used where this one is wanted: they are the same, or differ in a depth that was not known when the open one was
+/// made, or is not known again.
+fn serves(open: &EndpointSpec, wanted: &EndpointSpec) -> bool {
+    let differ_in_depth = open.qos.history.is_unsaid() && matches!(wanted.qos.history, History::KeepLast(_))
+        || wanted.qos.history.is_unsaid() && matches!(open.qos.history, History::KeepLast(_));
+    let as_open = || {
+        let qos = Qos { history: open.qos.history, ..wanted.qos.clone() };
+        EndpointSpec { qos, ..wanted.clone() }
+    };
+    open == wanted || (wanted.qos.is_transient_local() && differ_in_depth && *open == as_open())
 }

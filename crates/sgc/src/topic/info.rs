@@ -117,6 +117,7 @@ fn qos(qos: &Qos) -> Vec<String> {
         "  QoS profile:".to_owned(),
         format!("    Reliability: {}", qos.reliability()),
         match qos.depth {
+            depth if depth == Qos::UNSAID_DEPTH => "    History (Depth): UNKNOWN".to_owned(),
             Some(depth) => format!("    History (Depth): KEEP_LAST ({depth})"),
             None => "    History (Depth): KEEP_ALL".to_owned(),
         },

@@ -8,6 +8,7 @@
 mod all;
 mod bugs;
 mod calls;
+mod durable;
 mod events;
 mod flow;
 mod graph;

@@ -1,0 +1,174 @@
+//! `transient_local`: late joiners on the far side get as much as natively, though Fast DDS announces no depth.
+
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::lab::{Lab, Site, robot_to_desk};
+use crate::support::{Peer, eventually};
+use crate::{PAIRS, PLAN, count};
+
+const MESSAGES: u64 = 20;
+
+/// Names of topics, the depths of their publishers (`load.c`: 0 keeps all), and the number of messages that late joiners get.
+const LATCHED: [(&str, &str, u64); 4] =
+    [("last", "1", 1), ("five", "5", 5), ("ten", "10", 10), ("all", "0", MESSAGES)];
+
+/// A publisher that has sent so many messages, once so many readers are matched, and stays.
+fn latch(
+    lab: &Lab,
+    site: Site,
+    distribution: &str,
+    topic: &str,
+    depth: &str,
+    count: u64,
+    matched: &str,
+) -> Peer {
+    let count = count.to_string();
+    let said = ["pub", "--topic", topic, "--transient-local", "--depth", depth, "--count", &count];
+    let stays = ["--rate", "50", "--wait-matched", matched, "--hold", "110", "--timeout", PLAN.peer_life];
+    started(lab.load(site, distribution, &[&said[..], &stays].concat()))
+}
+
+/// A program that has joined its network. Those of Fast DDS that join at the same instant do not all find others.
+fn started(mut program: Peer) -> Peer {
+    program.wait("an endpoint", |event| event["event"] == "ready");
+    program
+}
+
+fn has_sent(publisher: &mut Peer) {
+    publisher.wait("all sent", |event| event["event"] == "all_sent");
+}
+
+/// A subscriber at the desk that waits for so many messages, and then for more.
+fn listen(lab: &Lab, distribution: &str, topic: &str, expected: u64) -> Peer {
+    let expected = expected.to_string();
+    let asks = ["sub", "--topic", topic, "--transient-local", "--depth", "0", "--count", &expected];
+    let stays = ["--linger", "1", "--timeout", PLAN.peer_life];
+    started(lab.load(Site::Desk, distribution, &[&asks[..], &stays].concat()))
+}
+
+/// Asserts that these came, once each and in their order.
+fn assert_heard(summary: &Value, first: u64, expected: u64, what: &str) {
+    let counts =
+        ["received", "first", "last", "duplicated", "altered", "reordered"].map(|key| count(summary, key));
+    assert_eq!(counts, [expected, first, MESSAGES - 1, 0, 0, 0], "{what}: {summary}");
+}
+
+/// A topic of these publishers alone: one that was killed is missed some time later.
+fn topic(under: &str, name: &str) -> String {
+    format!("/{under}/{name}")
+}
+
+/// Publishers of all depths, which have sent all.
+fn latch_all(lab: &Lab, site: Site, talks: &str, under: &str, matched: &str) -> [Peer; 4] {
+    let latch = |(name, depth, _)| latch(lab, site, talks, &topic(under, name), depth, MESSAGES, matched);
+    let mut publishers = LATCHED.map(latch);
+    publishers.iter_mut().for_each(has_sent);
+    publishers
+}
+
+/// Asserts that late joiners at the desk get as much as the publishers keep.
+fn assert_late_joiners(lab: &Lab, listens: &str, under: &str, what: &str) {
+    let late = LATCHED.map(|(name, _, expected)| listen(lab, listens, &topic(under, name), expected));
+    for (mut late, (name, _, expected)) in late.into_iter().zip(LATCHED) {
+        let what = format!("{what}, {under} to {listens}, {name}");
+        assert_heard(&late.summary(), MESSAGES - expected, expected, &what);
+    }
+}
+
+/// Waits until so many messages have reached the desk.
+fn wait_for_messages(lab: &Lab, topic: &str, count: u64) {
+    eventually(&format!("the messages of {topic} have come"), || messages(lab, Site::Desk, topic) >= count);
+}
+
+#[test]
+fn late_joiners_get_as_much_as_their_publishers_keep() {
+    let topics: Vec<_> =
+        PAIRS.iter().flat_map(|[talks, _]| LATCHED.map(|(name, ..)| topic(talks, name))).collect();
+    let mut lab = Lab::real(PLAN, robot_to_desk("topic", topics));
+    for [talks, listens] in PAIRS {
+        // Topics that `sgc` has nothing to do with.
+        let under = format!("native/{talks}");
+        let _publishers = latch_all(&lab, Site::Desk, talks, &under, "0");
+        assert_late_joiners(&lab, listens, &under, "natively");
+    }
+    for [talks, listens] in PAIRS {
+        let mut early = listen(&lab, listens, &topic(talks, "five"), MESSAGES + 1);
+        let _publishers = latch_all(&lab, Site::Robot, talks, talks, "1");
+        for (name, ..) in LATCHED {
+            wait_for_messages(&lab, &topic(talks, name), MESSAGES);
+        }
+        assert_late_joiners(&lab, listens, talks, "late");
+        // The node at the robot comes back: a subscriber that heard it all does not hear it again, one that is late does.
+        let repeated = || lab.status(Site::Desk)["drops"]["repeated"].as_u64().unwrap_or(0);
+        let wanted = repeated() + LATCHED.iter().map(|(.., expected)| expected).sum::<u64>();
+        lab.end(Site::Robot, Signal::KILL);
+        lab.start(Site::Robot);
+        eventually("the history is known again", || {
+            lab.status(Site::Desk)["drops"]["repeated"].as_u64() >= Some(wanted)
+        });
+        assert_late_joiners(&lab, listens, talks, "after a restart");
+        early.end();
+        assert_heard(&early.summary(), 0, MESSAGES, "all along");
+    }
+}
+
+/// Each latched publisher of a topic is heard by a late joiner, not the last of them alone.
+#[test]
+fn late_joiners_hear_each_latched_publisher_of_a_topic() {
+    let topics = PAIRS.map(|[talks, _]| topic(talks, "tf_static"));
+    let lab = Lab::real(PLAN, robot_to_desk("topic", &topics));
+    for ([talks, listens], topic) in PAIRS.into_iter().zip(&topics) {
+        // Their last messages are those with the numbers 2, 4 and 6, and the first of them may be lost on their own network.
+        let _publishers = [3, 5, 7].map(|count| {
+            let publisher = latch(&lab, Site::Robot, talks, topic, "1", count, "1");
+            let count = count.to_string();
+            let ends = ["sub", "--topic", topic, "--transient-local", "--last", &count];
+            lab.load(Site::Desk, listens, &[&ends[..], &["--timeout", PLAN.peer_life]].concat()).summary();
+            publisher
+        });
+        let mut late = listen(&lab, listens, topic, 3);
+        let summary = late.summary();
+        let counts = ["received", "first", "last", "duplicated"].map(|key| count(&summary, key));
+        assert_eq!(counts, [3, 2, 6, 0], "{talks} to {listens}: {summary}");
+    }
+}
+
+/// A map, and what nodes log, reach a late subscriber as they would on the publisher's network.
+#[test]
+fn late_joiners_get_the_map_and_the_log() {
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/map", "/rosout"]));
+    let rclpy = |site, distribution, role, topic| {
+        lab.rclpy(site, distribution, "latched.py", &[role, "--topic", topic, "--timeout", PLAN.peer_life])
+    };
+    for [talks, listens] in PAIRS {
+        let mut map = rclpy(Site::Robot, talks, "map", "/map");
+        has_sent(&mut map);
+        wait_for_messages(&lab, "/map", 3);
+        let mut sees = rclpy(Site::Desk, listens, "hear", "/map");
+        sees.wait("the last map", |event| event["event"] == "received" && event["seq"] == 2);
+        sees.end();
+        let summary = sees.summary();
+        assert_eq!([count(&summary, "received"), count(&summary, "duplicated")], [1, 0], "{summary}");
+        // Lines are of use for ten seconds.
+        let before = messages(&lab, Site::Desk, "/rosout");
+        let mut log = rclpy(Site::Robot, talks, "log", "/rosout");
+        has_sent(&mut log);
+        eventually("the lines have come", || messages(&lab, Site::Desk, "/rosout") >= before + 3);
+        let mut reads = rclpy(Site::Desk, listens, "hear", "/rosout");
+        for seq in 0..3 {
+            reads.wait("a line", |event| event["event"] == "received" && event["seq"] == seq);
+        }
+        reads.end();
+        assert_eq!(count(&reads.summary(), "duplicated"), 0);
+        map.end();
+        map.summary();
+    }
+}
+
+fn messages(lab: &Lab, site: Site, topic: &str) -> u64 {
+    let status = lab.status(site);
+    let routes = status["routes"].as_array().cloned().unwrap_or_default();
+    let of_topic = routes.iter().filter(|route| route["topic"] == topic);
+    of_topic.filter_map(|route| route["messages"].as_u64()).sum()
+}
