@@ -74,6 +74,7 @@ pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners
         suite: share.suite,
         class: share.priority,
         shaping: share.shaping,
+        qos: share.qos,
         dedicated: share.dedicated,
     };
     share.interface.parts().iter().map(rule).collect()

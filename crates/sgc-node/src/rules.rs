@@ -132,6 +132,7 @@ impl Rules {
             token: Some((token.name(), token.metadata)),
             class: None,
             shaping: Shaping::default(),
+            qos: wanted.qos,
             dedicated: wanted.dedicated,
         });
         Ok(())
@@ -170,6 +171,7 @@ fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
         token: None,
         class: rule.priority,
         shaping: rule.shaping,
+        qos: rule.qos,
         dedicated: rule.dedicated,
     };
     rule.interface.parts().iter().map(part).collect()

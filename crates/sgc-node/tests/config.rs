@@ -210,7 +210,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\ncolour = 1",
             &[
-                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `token`, `link`",
+                "node.toml:6: [[use]] has no key `colour`; it has `from`, `topic`, `service`, `action`, `parameters`, `except`, `as`, `namespace`, `frame_prefix`, `type`, `publish`, `priority`, `max_rate`, `max_bandwidth`, `max_age`, `compress`, `encoding`, `reliability`, `durability`, `history`, `depth`, `deadline`, `lifespan`, `token`, `link`",
             ],
         ),
         ("\n\n[shares]\na = 1", &["node.toml:5: the top level has no key `shares`; did you mean `share`?"]),
@@ -1066,7 +1066,13 @@ fn a_token_says_owner_and_topic_itself() {
     let source = TokenSource::File("/etc/sgc/tokens/pose.token".into());
     assert_eq!(
         config.tokens,
-        [TokenConfig { source, naming: Default::default(), frame_prefix: None, dedicated: false }]
+        [TokenConfig {
+            source,
+            naming: Default::default(),
+            frame_prefix: None,
+            qos: Default::default(),
+            dedicated: false
+        }]
     );
     let config = good(&format!("{NODE}[[use]]\ntoken = 'tokens/pose.token'\nlink = 'dedicated'"));
     assert!(config.tokens[0].dedicated);
@@ -1864,4 +1870,46 @@ fn the_examples_of_the_reference_are_valid() {
     for example in examples {
         good(example);
     }
+}
+
+#[test]
+fn policies_are_named_as_in_ros_2_and_contradict_each_other_nowhere() {
+    use sgc_node::config::QosOverride;
+    use sgc_wire::{Durability, History, Reliability};
+
+    const SHARE: &str = "[[share]]\ntopic = '/a'\nto = ['b']\n";
+    const USE: &str = "[[use]]\nfrom = 'b'\ntopic = '/a'\n";
+    let set = "reliability = 'reliable'\ndurability = 'transient_local'\nhistory = 'keep_last'\ndepth = 5\n\
+               deadline = '100ms'\nlifespan = '2s'";
+    let expected = QosOverride {
+        reliability: Some(Reliability::Reliable),
+        durability: Some(Durability::TransientLocal),
+        history: Some(History::KeepLast(5)),
+        deadline_ns: Some(100_000_000),
+        lifespan_ns: Some(2_000_000_000),
+    };
+    assert_eq!(good(&format!("{NODE}{SHARE}{set}")).shares[0].qos, expected);
+    assert_eq!(good(&format!("{NODE}{USE}{set}")).uses[0].qos, expected);
+    let all = good(&format!("{NODE}{USE}history = 'keep_all'")).uses[0].qos;
+    assert_eq!(all, QosOverride { history: Some(History::KeepAll), ..QosOverride::default() });
+    assert_eq!(good(&format!("{NODE}{SHARE}")).shares[0].qos, QosOverride::default());
+    for (wrong, said) in [
+        ("reliability = 'best-effort'", "`reliability` is \"best-effort\""),
+        ("durability = 'persistent'", "`durability` is \"persistent\""),
+        ("depth = 0", "`depth` is 0; it takes a number of messages from 1 to 4096"),
+        ("history = 'keep_last'", "`history` is keep_last, and there is no `depth`"),
+        ("history = 'keep_all'\ndepth = 3", "`history` is keep_all, but `depth` is 3"),
+        ("deadline = '5'", "`deadline` is \"5\""),
+        (
+            "reliability = 'best_effort'\ndurability = 'transient_local'",
+            "`durability` is transient_local, but `reliability` is best_effort",
+        ),
+    ] {
+        let found = said_about(&format!("{SHARE}{wrong}"));
+        assert!(found.len() == 1 && found[0].contains(said), "{found:?}");
+    }
+    let there = said_about(&format!("{USE}publish = true\ndepth = 3"));
+    assert!(there.len() == 1 && there[0].contains("`depth` is for what comes here"), "{there:?}");
+    let service = said_about("[[use]]\nfrom = 'b'\nservice = '/a'\nlifespan = '1s'");
+    assert!(service.len() == 1 && service[0].contains("`lifespan` is for topics"), "{service:?}");
 }

@@ -10,7 +10,7 @@ use std::sync::mpsc::channel;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata};
+use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata};
 use sgc_trust::Suite;
 use sgc_wire::{Class, History, Qos, Reliability};
 use support::*;
@@ -150,6 +150,7 @@ fn commands_overtake_images_on_a_full_link() {
         publish: vec![],
         priority,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
         suite: Suite::Group,
         metadata: ShareMetadata::default(),

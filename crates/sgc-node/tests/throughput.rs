@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
-use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_node::{RunOptions, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_transport::{ListenAddr, Scheme};
@@ -149,6 +149,7 @@ impl Way {
             publish: vec![],
             priority: Class::Default,
             shaping: Shaping::default(),
+            qos: QosOverride::default(),
             dedicated: false,
             suite,
             metadata: ShareMetadata::default(),
@@ -165,6 +166,7 @@ impl Way {
             type_name: None,
             priority: None,
             shaping: Shaping::default(),
+            qos: QosOverride::default(),
             dedicated: false,
         };
         let desk = Config { uses: vec![from], ..config("desk") };

@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
-use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, TokenConfig, TokenSource};
+use sgc_node::config::{
+    Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
+};
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_node::{RunOptions, create_state_dir, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
@@ -143,6 +145,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         publish: vec![],
         priority: Class::Default,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
         suite: Suite::DEFAULT,
         metadata: ShareMetadata::default(),
@@ -187,6 +190,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         source: TokenSource::Text(Box::new(token.clone())),
         naming: Default::default(),
         frame_prefix: None,
+        qos: Default::default(),
         dedicated: false,
     }];
     let config = Config { routers: vec![nowhere], tokens, ..base("cart") };

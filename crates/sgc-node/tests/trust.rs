@@ -783,7 +783,13 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     let with = |tokens: &[&ShareToken]| {
         let by = |t: &&ShareToken| {
             let source = TokenSource::Text(Box::new((*t).clone()));
-            TokenConfig { source, naming: Default::default(), frame_prefix: None, dedicated: false }
+            TokenConfig {
+                source,
+                naming: Default::default(),
+                frame_prefix: None,
+                qos: Default::default(),
+                dedicated: false,
+            }
         };
         let all: Vec<_> = tokens.iter().map(by).collect();
         move |c: &mut Config| c.tokens = all.clone()
@@ -868,6 +874,7 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
             source: TokenSource::Text(Box::new(token.clone())),
             naming: Default::default(),
             frame_prefix: None,
+            qos: Default::default(),
             dedicated: false,
         }]
     });

@@ -21,7 +21,7 @@ pub use network::{
     Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
 };
 pub use qos::{
-    KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosPolicy, RELIABLE_READER_DEPTH_MIN,
+    KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosOverride, QosPolicy, RELIABLE_READER_DEPTH_MIN,
     SERVICE_DEPTH, mismatches, of_all_instances, reader_for, service_qos, weakest,
 };
 pub use routes::{

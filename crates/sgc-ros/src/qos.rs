@@ -36,6 +36,36 @@ pub fn service_qos() -> Qos {
     Qos { history: History::KeepLast(SERVICE_DEPTH), ..Qos::default() }
 }
 
+/// Policies that the user gives a topic in place of its publishers'.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct QosOverride {
+    /// Whether samples are acknowledged.
+    pub reliability: Option<Reliability>,
+    /// Whether late joiners get what was said before.
+    pub durability: Option<Durability>,
+    /// How much of that.
+    pub history: Option<History>,
+    /// How often something is said, nanoseconds.
+    pub deadline_ns: Option<u64>,
+    /// How long a sample is of use, nanoseconds.
+    pub lifespan_ns: Option<u64>,
+}
+
+impl QosOverride {
+    /// What is offered in the place of this.
+    #[must_use]
+    pub fn apply(&self, qos: &Qos) -> Qos {
+        Qos {
+            reliability: self.reliability.unwrap_or(qos.reliability),
+            durability: self.durability.unwrap_or(qos.durability),
+            history: self.history.unwrap_or(qos.history),
+            deadline_ns: self.deadline_ns.or(qos.deadline_ns),
+            lifespan_ns: self.lifespan_ns.or(qos.lifespan_ns),
+            ..qos.clone()
+        }
+    }
+}
+
 /// What a set of writers offers together: of each policy the weakest, so that every reader that matches the
 /// result would have matched each of them; of depth and lifespan the longest, of partitions and data representations all.
 pub fn weakest<'a>(offers: impl IntoIterator<Item = &'a Qos>) -> Option<Qos> {

@@ -36,6 +36,7 @@ use sgc_wire::{
 
 use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, Guid, ServiceSpec};
+use crate::qos::QosOverride;
 
 use problems::{Cause, Problems};
 use settling::Settling;
@@ -77,6 +78,8 @@ pub struct ShareRule {
     pub class: Class,
     /// How much of it goes out.
     pub shaping: Shaping,
+    /// Policies in place of its publishers'.
+    pub qos: QosOverride,
     /// Whether it has a connection of its own to the next node.
     pub dedicated: bool,
 }
@@ -131,6 +134,8 @@ pub struct UseRule {
     pub class: Option<Class>,
     /// How much of it goes on, whichever way.
     pub shaping: Shaping,
+    /// Policies of the writers here in place of the far publishers'.
+    pub qos: QosOverride,
     /// Whether it has a connection of its own to the next node.
     pub dedicated: bool,
 }
@@ -276,7 +281,7 @@ impl ShareRoute {
             class: share.class,
             keyless,
             type_hash: writer.as_ref().and_then(|w| w.type_hash.clone()),
-            qos: writer.as_ref().map(|w| w.qos.clone()).unwrap_or_default(),
+            qos: writer.as_ref().map(|w| share.qos.apply(&w.qos)).unwrap_or_default(),
             sources: Vec::new(),
         };
         let route = Self {

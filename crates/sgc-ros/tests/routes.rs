@@ -9,8 +9,8 @@ use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
     Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, GraphNode, Guid, Naming, Problem,
-    REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, Routes, SINKLESS_HOLD, Shaping, ShareRule,
-    UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    QosOverride, REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, Routes, SINKLESS_HOLD, Shaping,
+    ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -50,6 +50,7 @@ fn share(topic: &str, type_name: &str) -> ShareRule {
         suite: Suite::Group,
         class: Class::Default,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
     }
 }
@@ -68,6 +69,7 @@ fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
         token: None,
         class: None,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
     }
 }
 
@@ -502,6 +504,43 @@ fn a_depth_that_becomes_known_is_listed_and_replaces_no_source() {
     let mut b = bench(&[("/map", "")], &[]);
     b.appears(writer(1, "/map", Qos { lifespan_ns: Some(1), ..unsaid }));
     assert_eq!(b.keeps(1, 5), []);
+}
+
+#[test]
+fn policies_of_a_rule_are_offered_in_the_place_of_those_that_are_found() {
+    let latches = QosOverride {
+        durability: Some(Durability::TransientLocal),
+        history: Some(History::KeepLast(3)),
+        ..QosOverride::default()
+    };
+    let mut b = bench_of(vec![ShareRule { qos: latches, ..share("/a", "") }], vec![]);
+    let begun = b.appears(writer(1, "/a", Qos::default()));
+    let is_latched = |qos: &Qos| qos.is_transient_local() && qos.history == History::KeepLast(3);
+    assert!(has(
+        &begun,
+        |c| matches!(c, Command::UpdateShare { qos, sources, .. } if is_latched(qos) && is_latched(&sources[0].qos))
+    ));
+    // It is read from the start, as it is.
+    let reads = |c: &Command| matches!(c, Command::OpenReader { spec, .. } if !spec.qos.is_transient_local());
+    assert!(has(&begun, reads), "{begun:?}");
+    let careless = QosOverride { reliability: Some(Reliability::BestEffort), ..QosOverride::default() };
+    let changed = b.reconfigured(vec![ShareRule { qos: careless, ..share("/a", "") }], vec![]);
+    let best_effort = |qos: &Qos| !qos.is_reliable() && !qos.is_transient_local();
+    assert!(
+        has(&changed, |c| matches!(c, Command::UpdateShare { qos, .. } if best_effort(qos))),
+        "{changed:?}"
+    );
+    // Policies of a use are those of the writers here.
+    let rule = UseRule { qos: careless, ..use_of(OWNER, "/map", None) };
+    let mut b = bench_of(vec![], vec![rule]);
+    let name = theirs("/map", STRING);
+    b.catalogue(vec![entry("/map", STRING, latched(), &[1])]);
+    let opened = b.granted(name, None);
+    let writes = |c: &Command| matches!(c, Command::OpenWriter { spec, .. } if !spec.qos.is_reliable());
+    assert!(has(&opened, writes), "{opened:?}");
+    let changed = b.reconfigured(vec![], vec![use_of(OWNER, "/map", None)]);
+    let writes = |c: &Command| matches!(c, Command::OpenWriter { spec, .. } if spec.qos == latched());
+    assert!(has(&changed, writes), "{changed:?}");
 }
 
 #[test]

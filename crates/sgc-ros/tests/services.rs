@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::LostReason;
 use sgc_ros::{
-    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Naming, Routes,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Naming, QosOverride, Routes,
     SINKLESS_HOLD, ServiceTopic, Shaping, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, service_qos,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
@@ -40,6 +40,7 @@ fn served() -> (Routes<ChaCha8Rng>, Name) {
         suite: Suite::Group,
         class: Class::Default,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
     };
     (routes(vec![rule], vec![]), derive_name(&secret(), &ME, &metadata("me", Kind::Service)))
@@ -151,6 +152,7 @@ fn a_remote_service_is_here_while_it_is_granted_and_a_topic_of_its_name_is_not()
         token: None,
         class: None,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
     };
     let mut routes = routes(vec![], vec![rule]);
     let entry = |kind| CatalogueEntry {

@@ -12,6 +12,7 @@ from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 MAP_CELLS = 100_000
+MAP_PAUSE_S = 0.3
 MAP_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Takes all that there is.
 HEAR_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -41,7 +42,10 @@ def main() -> None:
 
     if options.role == "map":
         publisher = node.create_publisher(OccupancyGrid, options.topic, MAP_QOS)
+        while publisher.get_subscription_count() == 0 and not stopped:
+            time.sleep(0.01)
         for seq in range(options.count):
+            time.sleep(MAP_PAUSE_S)
             grid = OccupancyGrid(data=[0] * MAP_CELLS)
             grid.info.width = seq
             publisher.publish(grid)

@@ -116,7 +116,28 @@ pub(super) struct ShareDraft {
     pub(super) unique: Option<Located<String>>,
     pub(super) node: Option<Located<String>>,
     pub(super) shaping: ShapingDraft,
+    pub(super) qos: QosDraft,
     pub(super) naming: NamingDraft,
+}
+
+/// Policies in place of the publishers'.
+#[derive(Debug, Default)]
+pub(super) struct QosDraft {
+    pub(super) reliability: Option<Located<String>>,
+    pub(super) durability: Option<Located<String>>,
+    pub(super) history: Option<Located<String>>,
+    pub(super) depth: Option<Located<i64>>,
+    pub(super) deadline: Option<Located<String>>,
+    pub(super) lifespan: Option<Located<String>>,
+}
+
+impl QosDraft {
+    /// Where each policy that is set stands.
+    pub(super) fn written(&self) -> impl Iterator<Item = (&'static str, &Origin)> {
+        let texts = [&self.reliability, &self.durability, &self.history, &self.deadline, &self.lifespan];
+        let texts = texts.into_iter().flatten().map(|one| (one.key, &one.origin));
+        texts.chain(self.depth.iter().map(|one| (one.key, &one.origin)))
+    }
 }
 
 /// What is left out, and other names.
@@ -148,6 +169,7 @@ pub(super) struct UseDraft {
     pub(super) token: Option<Located<String>>,
     pub(super) priority: Option<Located<String>>,
     pub(super) shaping: ShapingDraft,
+    pub(super) qos: QosDraft,
     pub(super) naming: NamingDraft,
     pub(super) frame_prefix: Option<Located<String>>,
     pub(super) link: Option<Located<String>>,

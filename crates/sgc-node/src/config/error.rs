@@ -778,6 +778,18 @@ pub enum Mistake {
         /// The longest, in bytes.
         max: usize,
     },
+    /// Policies of what goes elsewhere.
+    #[error("`{key}` is for what comes here: take it out, or `publish`; the owner sets it in its [[share]]")]
+    QosElsewhere {
+        /// The key.
+        key: &'static str,
+    },
+    /// A history of so many messages, without the number.
+    #[error("`{key}` is keep_last, and there is no `depth`: say how many messages, such as depth = 10")]
+    HistoryWithoutDepth {
+        /// The key.
+        key: &'static str,
+    },
     /// Frames of what goes elsewhere.
     #[error("`{key}` is for what comes here: take it out, or `publish`")]
     FramesElsewhere {

@@ -12,8 +12,8 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::draft::{
-    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, Located, NamingDraft, PartnerDraft, RosDraft,
-    RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, Words,
+    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, Located, NamingDraft, PartnerDraft, QosDraft,
+    RosDraft, RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
@@ -225,6 +225,7 @@ impl FileReader<'_> {
             unique: self.string(share, "unique", TEXT),
             node: self.string(share, "node", TEXT),
             shaping: self.shaping(share),
+            qos: self.qos(share),
             naming: self.naming(share),
         }
     }
@@ -244,6 +245,7 @@ impl FileReader<'_> {
             publish: self.boolean(one, "publish", "true or false"),
             priority: self.string(one, "priority", "a string, such as \"realtime\""),
             shaping: self.shaping(one),
+            qos: self.qos(one),
             naming: self.naming(one),
             frame_prefix: self.string(one, "frame_prefix", "a string, such as \"robot1/\""),
             link: self.string(one, "link", "a string, \"shared\" or \"dedicated\""),
@@ -276,6 +278,18 @@ impl FileReader<'_> {
             max_age: self.string(topic, "max_age", "a string, such as \"500ms\""),
             compress: self.string(topic, "compress", "a string, \"zstd\", \"lz4\" or \"none\""),
             encoding: self.string(topic, "encoding", "a string, \"cdr\" or \"json\""),
+        }
+    }
+
+    fn qos(&mut self, topic: Option<&Section<'_, '_>>) -> QosDraft {
+        const TIME: &str = "a string, such as \"500ms\"";
+        QosDraft {
+            reliability: self.string(topic, "reliability", "a string, \"reliable\" or \"best_effort\""),
+            durability: self.string(topic, "durability", "a string, \"transient_local\" or \"volatile\""),
+            history: self.string(topic, "history", "a string, \"keep_last\" or \"keep_all\""),
+            depth: self.integer(topic, "depth", "a number, such as 10"),
+            deadline: self.string(topic, "deadline", TIME),
+            lifespan: self.string(topic, "lifespan", TIME),
         }
     }
 

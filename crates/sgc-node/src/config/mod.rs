@@ -29,7 +29,7 @@ use std::time::Duration;
 
 use crate::audit::AuditRoom;
 use sgc_dds::Security;
-pub use sgc_ros::{Interface, Naming, Rename, Shaping};
+pub use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping};
 use sgc_router::MappingKind;
 use sgc_transport::{Congestion, ListenAddr};
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
@@ -234,6 +234,8 @@ pub struct ShareConfig {
     pub priority: Class,
     /// How much of it goes out.
     pub shaping: Shaping,
+    /// Policies in place of its publishers'.
+    pub qos: QosOverride,
     /// Whether it has a connection of its own to the next node.
     pub dedicated: bool,
     /// How its payloads are sealed.
@@ -281,6 +283,8 @@ pub struct UseConfig {
     pub priority: Option<Class>,
     /// How much of it goes on, whichever way.
     pub shaping: Shaping,
+    /// Policies here in place of the far publishers'.
+    pub qos: QosOverride,
     /// Whether it has a connection of its own to the next node.
     pub dedicated: bool,
 }
@@ -294,6 +298,8 @@ pub struct TokenConfig {
     pub naming: Naming,
     /// What the names of frames in tf messages get in front.
     pub frame_prefix: Option<String>,
+    /// Policies here in place of the far publishers'.
+    pub qos: QosOverride,
     /// Whether it has a connection of its own to the next node.
     pub dedicated: bool,
 }

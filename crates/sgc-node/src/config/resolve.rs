@@ -9,14 +9,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use sgc_dds::Security;
-use sgc_ros::{Interface, Naming, Rename, Shaping, is_pattern, matches};
+use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, is_pattern, matches};
 use sgc_router::MappingKind;
 use sgc_transport::Congestion;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
-use sgc_wire::{Class, METADATA_FIELD_BYTES_MAX, PayloadEncoding, PayloadForm};
+use sgc_wire::{
+    Class, Durability, History, METADATA_FIELD_BYTES_MAX, PayloadEncoding, PayloadForm, Reliability,
+};
 
 use super::draft::{
-    Draft, Located, NamingDraft, PartnerDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
+    Draft, Located, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
@@ -307,7 +309,7 @@ impl Resolver<'_> {
             .as_ref()
             .and_then(|name| self.keep(name, |key, value| names::interface_type(key, value, interface)));
         let publishes = share.publish.as_ref().map(|publish| (publish.key, &publish.origin));
-        self.check_topics_only(interface, publishes, &share.shaping);
+        self.check_topics_only(interface, publishes, &share.shaping, &share.qos);
         let pattern = topic.as_ref().filter(|topic| is_pattern(topic));
         if let (Some(publish), Some(topic)) = (&share.publish, pattern) {
             let topic = topic.clone();
@@ -322,6 +324,7 @@ impl Resolver<'_> {
         let dedicated = self.dedicated(share.link.as_ref());
         let suite = share.suite.as_ref().and_then(|name| self.keep(name, suite));
         let shaping = self.shaping(&share.shaping);
+        let qos = self.qos(&share.qos);
         let naming = self.naming(&share.naming, topic.as_deref());
         let metadata = ShareMetadata {
             description: self.metadata(share.description.as_ref()),
@@ -340,6 +343,7 @@ impl Resolver<'_> {
             type_name,
             priority: priority.unwrap_or_default(),
             shaping,
+            qos,
             dedicated,
             suite: suite.unwrap_or(Suite::DEFAULT),
             metadata,
@@ -664,7 +668,8 @@ impl Resolver<'_> {
                 self.record(&written.origin, Mistake::TokenTwice { key: written.key, other });
             } else {
                 let dedicated = self.dedicated(one.link.as_ref());
-                first.push((TokenConfig { source, naming, frame_prefix, dedicated }, written));
+                let qos = self.qos(&one.qos);
+                first.push((TokenConfig { source, naming, frame_prefix, qos, dedicated }, written));
             }
         }
         first.into_iter().map(|(token, _)| token).collect()
@@ -750,7 +755,7 @@ impl Resolver<'_> {
             .as_ref()
             .and_then(|name| self.keep(name, |key, value| names::interface_type(key, value, interface)));
         let publishes = one.publish.as_ref().map(|publish| (publish.key, &publish.origin));
-        self.check_topics_only(interface, publishes, &one.shaping);
+        self.check_topics_only(interface, publishes, &one.shaping, &one.qos);
         let publish = one.publish.as_ref().is_some_and(|publish| publish.value);
         let sends = publish || interface != Interface::Topic;
         if let Some(written) = one.priority.as_ref().filter(|_| !sends) {
@@ -764,6 +769,10 @@ impl Resolver<'_> {
         }
         let priority = one.priority.as_ref().and_then(|priority| self.keep(priority, priority_class));
         let shaping = self.shaping(&one.shaping);
+        for (key, origin) in one.qos.written().filter(|_| publish) {
+            self.record(origin, Mistake::QosElsewhere { key });
+        }
+        let qos = self.qos(&one.qos);
         let dedicated = self.dedicated(one.link.as_ref());
         if let Some(written) = one.frame_prefix.as_ref().filter(|_| publish) {
             self.record(&written.origin, Mistake::FramesElsewhere { key: written.key });
@@ -779,6 +788,7 @@ impl Resolver<'_> {
             publish,
             priority,
             shaping,
+            qos,
             dedicated,
         })
     }
@@ -855,14 +865,64 @@ impl Resolver<'_> {
         interface: Interface,
         publish: Option<(&'static str, &Origin)>,
         shaping: &ShapingDraft,
+        qos: &QosDraft,
     ) {
         if interface == Interface::Topic {
             return;
         }
         let shaping = [&shaping.max_rate, &shaping.max_bandwidth, &shaping.max_age, &shaping.encoding];
         let written = shaping.into_iter().flatten().map(|one| (one.key, &one.origin));
-        for (key, origin) in publish.into_iter().chain(written) {
+        for (key, origin) in publish.into_iter().chain(written).chain(qos.written()) {
             self.record(origin, Mistake::TopicsOnly { key, interface: interface.key() });
+        }
+    }
+
+    fn qos(&mut self, written: &QosDraft) -> QosOverride {
+        let reliability = written.reliability.as_ref().and_then(|r| self.keep(r, reliability));
+        let durability = written.durability.as_ref().and_then(|d| self.keep(d, durability));
+        let keeps_all = written.history.as_ref().and_then(|h| self.keep(h, keeps_all));
+        let bounds = (1, HISTORY_DEPTH_MAX);
+        let depth = written.depth.as_ref().and_then(|d| self.number(d, "a number of messages", bounds));
+        let depth = depth.and_then(|depth| u32::try_from(depth).ok());
+        if let (Some(true), Some(depth)) = (keeps_all, &written.depth) {
+            let (other, other_value) = (depth.key, depth.value.to_string());
+            let right = "take one of them out";
+            let mistake =
+                Mistake::Contradiction { key: "history", value: "keep_all", other, other_value, right };
+            self.record(&depth.origin, mistake);
+        }
+        if let (Some(false), Some(history), None) = (keeps_all, &written.history, &written.depth) {
+            self.record(&history.origin, Mistake::HistoryWithoutDepth { key: history.key });
+        }
+        if let (Some(Reliability::BestEffort), Some(Durability::TransientLocal), Some(origin)) =
+            (reliability, durability, written.durability.as_ref().map(|d| &d.origin))
+        {
+            let (other, other_value) = ("reliability", "best_effort".to_owned());
+            let right =
+                "late joiners get what was said before from reliable publishers alone; take one of them out";
+            let mistake = Mistake::Contradiction {
+                key: "durability",
+                value: "transient_local",
+                other,
+                other_value,
+                right,
+            };
+            self.record(origin, mistake);
+        }
+        let mut ns = |time: &Option<Located<String>>| {
+            let time = self.keep(time.as_ref()?, names::age)?;
+            u64::try_from(time.as_nanos()).ok()
+        };
+        QosOverride {
+            reliability,
+            durability,
+            history: if keeps_all == Some(true) {
+                Some(History::KeepAll)
+            } else {
+                depth.map(History::KeepLast)
+            },
+            deadline_ns: ns(&written.deadline),
+            lifespan_ns: ns(&written.lifespan),
         }
     }
 
@@ -892,6 +952,9 @@ impl Resolver<'_> {
         Some(path)
     }
 }
+
+/// The deepest history that can be set.
+const HISTORY_DEPTH_MAX: u64 = 4096;
 
 /// The kind of a table's interface, after the key of its name, or after the last word of an argument's key.
 fn interface_of(named: Option<&Located<String>>) -> Interface {
@@ -923,6 +986,30 @@ fn encoding(key: &'static str, value: &str) -> Result<PayloadForm, Mistake> {
         "cdr" => Ok(PayloadForm::Cdr),
         "json" => Ok(PayloadForm::Json),
         _ => Err(unknown_word(key, value, &["cdr", "json"])),
+    }
+}
+
+fn reliability(key: &'static str, value: &str) -> Result<Reliability, Mistake> {
+    match value {
+        "reliable" => Ok(Reliability::Reliable),
+        "best_effort" => Ok(Reliability::BestEffort),
+        _ => Err(unknown_word(key, value, &["reliable", "best_effort"])),
+    }
+}
+
+fn durability(key: &'static str, value: &str) -> Result<Durability, Mistake> {
+    match value {
+        "volatile" => Ok(Durability::Volatile),
+        "transient_local" => Ok(Durability::TransientLocal),
+        _ => Err(unknown_word(key, value, &["volatile", "transient_local"])),
+    }
+}
+
+fn keeps_all(key: &'static str, value: &str) -> Result<bool, Mistake> {
+    match value {
+        "keep_last" => Ok(false),
+        "keep_all" => Ok(true),
+        _ => Err(unknown_word(key, value, &["keep_last", "keep_all"])),
     }
 }
 

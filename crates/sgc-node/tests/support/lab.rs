@@ -19,7 +19,7 @@ use base64::engine::general_purpose::STANDARD;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::LockedFleet;
 use sgc_node::audit::{self, AuditRecord};
-use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_testkit::FakeDomain;
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, Identity, Suite};
@@ -204,6 +204,7 @@ pub fn share(topic: &str, to: &[&str]) -> ShareConfig {
         publish: vec![],
         priority: Class::Default,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
         suite: Suite::DEFAULT,
         metadata: ShareMetadata::default(),
@@ -221,6 +222,7 @@ pub fn uses(topic: &str) -> UseConfig {
         type_name: None,
         priority: None,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
     }
 }

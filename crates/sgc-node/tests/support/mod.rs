@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::admin::AdminRequest;
-use sgc_node::config::{Config, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
+use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_node::{ConfigSource, NodeError, OpenNetwork, RunOptions, run_on, run_opening};
 use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
@@ -319,6 +319,7 @@ pub fn shared_topic(topic: &str) -> ShareConfig {
         publish: vec![],
         priority: Class::Default,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
         suite: Suite::Group,
         metadata: ShareMetadata::default(),
@@ -337,6 +338,7 @@ pub fn used_topic(topic: &str) -> UseConfig {
         type_name: None,
         priority: None,
         shaping: Shaping::default(),
+        qos: QosOverride::default(),
         dedicated: false,
     }
 }

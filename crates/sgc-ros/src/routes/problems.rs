@@ -169,7 +169,8 @@ impl<R: RngCore> Routes<R> {
             // What writers there are, or will be.
             let offers = entry.sources.iter().map(|source| &source.qos);
             let offers = offers.chain(entry.sources.is_empty().then_some(&entry.qos));
-            for mismatch in offers.flat_map(|offer| mismatches(offer, &endpoint.qos)) {
+            let set = self.use_rules[route.rule].qos;
+            for mismatch in offers.flat_map(|offer| mismatches(&set.apply(offer), &endpoint.qos)) {
                 let (topic, owner) = (topic.clone(), owner.clone());
                 problems.insert(Problem::LocalQos { topic, owner, mismatch });
             }

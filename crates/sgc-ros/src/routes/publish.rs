@@ -28,7 +28,9 @@ impl<R: RngCore> Routes<R> {
             keyless: share.keyless,
             asks_key_hash: false,
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
-            qos: Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() },
+            qos: self.share_rules[share.rule]
+                .qos
+                .apply(&Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() }),
         });
         if share.writer.is_some() == spec.is_some() {
             return;

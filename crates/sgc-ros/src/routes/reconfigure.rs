@@ -47,12 +47,16 @@ impl<R: RngCore> Routes<R> {
             if route.writers.is_empty() && !self.share_rules[index].is_inbound() {
                 route.writerless_until.get_or_insert(now);
             }
-            let ShareRule { policy, shaping, .. } = &self.share_rules[index];
+            let ShareRule { policy, shaping, qos, .. } = &self.share_rules[index];
+            let has_other_qos = *qos != before.qos;
             if *policy != before.policy {
                 self.commands.push_back(Command::UpdatePolicy { name, policy: policy.clone() });
             }
             if *shaping != before.shaping {
                 self.commands.push_back(Command::Shape { name, shaping: *shaping });
+            }
+            if has_other_qos {
+                self.refresh_share(name);
             }
         }
         self.begin_inbound();
@@ -102,7 +106,8 @@ impl<R: RngCore> Routes<R> {
             self.drop_use(name);
         }
         for (name, place, before) in kept {
-            let UseRule { shaping, frame_prefix, .. } = &self.use_rules[place];
+            let UseRule { shaping, frame_prefix, qos, .. } = &self.use_rules[place];
+            let has_other_qos = *qos != old[before].qos;
             if *shaping != old[before].shaping {
                 self.commands.push_back(Command::Shape { name, shaping: *shaping });
             }
@@ -111,6 +116,9 @@ impl<R: RngCore> Routes<R> {
             }
             if let Some(route) = self.uses.get_mut(&name) {
                 route.rule = place;
+            }
+            if has_other_qos && !self.publishes(place) {
+                self.refresh_use(name);
             }
             if let Some(token) = self.tokens.get_mut(&name) {
                 token.rule = place;
@@ -140,7 +148,7 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// Whether a share of this type goes on under a changed rule: only its policy and shaping may differ.
+/// Whether a share of this type goes on under a changed rule: only its policy, shaping and QoS may differ.
 fn continues(before: &ShareRule, after: &ShareRule, local_name: &str, type_name: &str) -> bool {
     let wanted = &after.metadata.type_name;
     (wanted.is_empty() || wanted == type_name)

@@ -185,7 +185,11 @@ impl<R: RngCore> Routes<R> {
     /// Brings catalogue, sources and reader of a share in line with its writers and sinks.
     pub(super) fn refresh_share(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
-        let offer = match weakest(share.writers.values().map(|w| &w.qos)) {
+        let wanted = self.share_rules[share.rule].qos;
+        // What they offer here is what can be read; what is set is offered elsewhere.
+        let found = weakest(share.writers.values().map(|w| &w.qos));
+        let offers: Vec<_> = share.writers.values().map(|w| wanted.apply(&w.qos)).collect();
+        let offer = match weakest(&offers) {
             Some(offer) => offer,
             None if !self.share_rules[share.rule].is_inbound() => return,
             // What the publishers elsewhere offer is not known here; ROS 2's default serves commands well.
@@ -197,7 +201,7 @@ impl<R: RngCore> Routes<R> {
         share.own.retain(|_, own| own.gone.is_none() || !transient_local);
         let mut problems = BTreeSet::new();
         for (guid, writer) in share.writers.iter().filter(|_| !is_service) {
-            let qos = carried(&writer.qos, &offer);
+            let qos = carried(&wanted.apply(&writer.qos), &offer);
             match share.own.get_mut(guid) {
                 // Another kind of source is another source.
                 Some(own) if own.gone.is_none() && same_kind(&own.qos, &qos) => own.qos = qos,
@@ -215,8 +219,8 @@ impl<R: RngCore> Routes<R> {
             }
         }
         let Some(share) = self.shares.get(&name) else { return };
-        if share.writers.values().any(|w| {
-            (w.qos.reliability, w.qos.durability, w.qos.representations)
+        if offers.iter().any(|qos| {
+            (qos.reliability, qos.durability, qos.representations)
                 != (offer.reliability, offer.durability, offer.representations)
         }) {
             let topic = share.local_name.clone();
@@ -242,6 +246,13 @@ impl<R: RngCore> Routes<R> {
         // A transient-local topic is read from the start: late joiners are promised its history.
         let wanted = offer.is_transient_local() || !share.sinks.is_empty() || share.sinkless_until.is_some();
         let wanted = wanted && !share.writers.is_empty();
+        let read = Qos {
+            reliability: found.as_ref().map_or(offer.reliability, |found| found.reliability),
+            durability: found
+                .as_ref()
+                .map_or(offer.durability, |found| found.durability.min(offer.durability)),
+            ..offer
+        };
         if !share.sinks.is_empty() {
             share.sinkless_until = None;
         }
@@ -251,7 +262,7 @@ impl<R: RngCore> Routes<R> {
             keyless: share.keyless,
             asks_key_hash: asks_key_hash(share.keyless, share.writers.keys()),
             type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
-            qos: reader_for(&offer, share.writers.len()),
+            qos: reader_for(&read, share.writers.len()),
         });
         if !same_reader(share.reader.as_ref(), spec.as_ref()) {
             if share.reader.is_some() {

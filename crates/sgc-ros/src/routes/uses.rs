@@ -276,13 +276,14 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn refresh_use(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
         let entry = &route.entry;
+        let set = self.use_rules[route.rule].qos;
         let spec = |qos: &Qos| EndpointSpec {
             topic: dds_topic(&route.local_name),
             type_name: dds_type(&entry.metadata.type_name),
             keyless: entry.keyless,
             asks_key_hash: false,
             type_hash: entry.type_hash.clone(),
-            qos: qos.clone(),
+            qos: set.apply(qos),
         };
         // One whose lease ran out is missed at once by who watches its liveliness.
         let alive = entry.sources.iter().filter(|s| !s.source.is_lapsed());

@@ -7,7 +7,7 @@ use std::io;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
-use sgc_node::config::{SOCKET_PATH_BYTES_MAX, Shaping, ShareConfig, ShareMetadata};
+use sgc_node::config::{QosOverride, SOCKET_PATH_BYTES_MAX, Shaping, ShareConfig, ShareMetadata};
 use sgc_trust::{EnrollRequest, Fleet, Identity, NodeName, Suite};
 use sgc_wire::{Class, Name};
 use tempfile::TempDir;
@@ -128,6 +128,7 @@ impl Stage {
             publish: Vec::new(),
             priority: Class::default(),
             shaping: Shaping::default(),
+            qos: QosOverride::default(),
             dedicated: false,
             suite: Suite::Group,
             metadata: ShareMetadata::default(),

@@ -76,9 +76,11 @@ fn assert_late_joiners(lab: &Lab, listens: &str, under: &str, what: &str) {
     }
 }
 
-/// Waits until so many messages have reached the desk.
-fn wait_for_messages(lab: &Lab, topic: &str, count: u64) {
-    eventually(&format!("the messages of {topic} have come"), || messages(lab, Site::Desk, topic) >= count);
+/// Waits until the last of so many messages has reached the desk.
+fn wait_for_last(lab: &Lab, distribution: &str, topic: &str, count: u64) {
+    let count = count.to_string();
+    let ends = ["sub", "--topic", topic, "--transient-local", "--last", &count, "--timeout", PLAN.peer_life];
+    lab.load(Site::Desk, distribution, &ends).summary();
 }
 
 #[test]
@@ -96,7 +98,7 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
         let mut early = listen(&lab, listens, &topic(talks, "five"), MESSAGES + 1);
         let _publishers = latch_all(&lab, Site::Robot, talks, talks, "1");
         for (name, ..) in LATCHED {
-            wait_for_messages(&lab, &topic(talks, name), MESSAGES);
+            wait_for_last(&lab, listens, &topic(talks, name), MESSAGES);
         }
         assert_late_joiners(&lab, listens, talks, "late");
         // The node at the robot comes back: a subscriber that heard it all does not hear it again, one that is late does.
@@ -109,7 +111,10 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
         });
         assert_late_joiners(&lab, listens, talks, "after a restart");
         early.end();
-        assert_heard(&early.summary(), 0, MESSAGES, "all along");
+        // It may have been matched after the first messages.
+        let summary = early.summary();
+        let first = count(&summary, "first");
+        assert_heard(&summary, first, MESSAGES - first, "all along");
     }
 }
 
@@ -122,9 +127,7 @@ fn late_joiners_hear_each_latched_publisher_of_a_topic() {
         // Their last messages are those with the numbers 2, 4 and 6, and the first of them may be lost on their own network.
         let _publishers = [3, 5, 7].map(|count| {
             let publisher = latch(&lab, Site::Robot, talks, topic, "1", count, "1");
-            let count = count.to_string();
-            let ends = ["sub", "--topic", topic, "--transient-local", "--last", &count];
-            lab.load(Site::Desk, listens, &[&ends[..], &["--timeout", PLAN.peer_life]].concat()).summary();
+            wait_for_last(&lab, listens, topic, count);
             publisher
         });
         let mut late = listen(&lab, listens, topic, 3);
@@ -137,18 +140,24 @@ fn late_joiners_hear_each_latched_publisher_of_a_topic() {
 /// A map, and what nodes log, reach a late subscriber as they would on the publisher's network.
 #[test]
 fn late_joiners_get_the_map_and_the_log() {
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/map", "/rosout"]));
-    let rclpy = |site, distribution, role, topic| {
-        lab.rclpy(site, distribution, "latched.py", &[role, "--topic", topic, "--timeout", PLAN.peer_life])
-    };
     for [talks, listens] in PAIRS {
+        // Anew: the log of the other pair is of use for a while.
+        let lab = Lab::real(PLAN, robot_to_desk("topic", ["/map", "/rosout"]));
+        let rclpy = |site, distribution, role, topic| {
+            let extra = ["--topic", topic, "--timeout", PLAN.peer_life];
+            lab.rclpy(site, distribution, "latched.py", &[&[role][..], &extra].concat())
+        };
         let mut map = rclpy(Site::Robot, talks, "map", "/map");
         has_sent(&mut map);
-        wait_for_messages(&lab, "/map", 3);
-        let mut sees = rclpy(Site::Desk, listens, "hear", "/map");
-        sees.wait("the last map", |event| event["event"] == "received" && event["seq"] == 2);
-        sees.end();
-        let summary = sees.summary();
+        let sees = || {
+            let mut sees = rclpy(Site::Desk, listens, "hear", "/map");
+            sees.wait("the last map", |event| event["event"] == "received" && event["seq"] == 2);
+            sees.end();
+            sees.summary()
+        };
+        // The first one may come while maps are sent.
+        sees();
+        let summary = sees();
         assert_eq!([count(&summary, "received"), count(&summary, "duplicated")], [1, 0], "{summary}");
         // Lines are of use for ten seconds.
         let before = messages(&lab, Site::Desk, "/rosout");
@@ -171,4 +180,19 @@ fn messages(lab: &Lab, site: Site, topic: &str) -> u64 {
     let routes = status["routes"].as_array().cloned().unwrap_or_default();
     let of_topic = routes.iter().filter(|route| route["topic"] == topic);
     of_topic.filter_map(|route| route["messages"].as_u64()).sum()
+}
+
+/// Policies of a share and of a use hold in the place of those that publishers have.
+#[test]
+fn late_joiners_get_what_a_share_says() {
+    let [shared, used] = robot_to_desk("topic", ["/kept"]);
+    let lab = Lab::real(PLAN, [shared + "durability = \"transient_local\"\ndepth = 3\n", used]);
+    let talk =
+        ["pub", "--topic", "/kept", "--count", "20", "--rate", "50", "--hold", "60", "--timeout", "90"];
+    // Volatile.
+    let mut publisher = started(lab.load(Site::Robot, "jazzy", &talk));
+    has_sent(&mut publisher);
+    // It may have sent all before the desk was granted the topic.
+    eventually("the history has come", || messages(&lab, Site::Desk, "/kept") >= 3);
+    assert_heard(&listen(&lab, "kilted", "/kept", 3).summary(), MESSAGES - 3, 3, "of a volatile publisher");
 }
