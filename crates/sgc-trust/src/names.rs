@@ -75,41 +75,31 @@ pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
 /// The blind under which the authority of a fleet is asked for certificates: known to all who know its CA, also to
 /// routers, which hold no secret.
 pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
-    let mut context = digest::Context::new(&digest::SHA256);
-    context.update(b"sgc renewal v1");
-    context.update(&ca.0);
-    let mut out = [0; 32];
-    out.copy_from_slice(context.finish().as_ref());
-    Blind(out)
+    blind_of(b"sgc renewal v1", &ca.0)
 }
 
 /// The blind under which the authority of a fleet is asked to carry out operations on it.
 pub fn operations_blind(ca: &CaFingerprint) -> Blind {
-    let mut context = digest::Context::new(&digest::SHA256);
-    context.update(b"sgc operations v1");
-    context.update(&ca.0);
-    let mut out = [0; 32];
-    out.copy_from_slice(context.finish().as_ref());
-    Blind(out)
+    blind_of(b"sgc operations v1", &ca.0)
 }
 
 /// The blind under which an owner is asked what the types of its interfaces look like: known to all who know the owner,
 /// also to partners, which cannot derive its catalogue's.
 pub fn types_blind(owner: &NodeId) -> Blind {
-    let mut context = digest::Context::new(&digest::SHA256);
-    context.update(b"sgc types v1");
-    context.update(&owner.0);
-    let mut out = [0; 32];
-    out.copy_from_slice(context.finish().as_ref());
-    Blind(out)
+    blind_of(b"sgc types v1", &owner.0)
 }
 
 /// The blind under which an owner asks a node for the consumers of its interfaces: known to all who know the node, also to
 /// owners of other fleets.
 pub fn consumers_blind(node: &NodeId) -> Blind {
+    blind_of(b"sgc consumers v1", &node.0)
+}
+
+/// `SHA-256(label ‖ id)`, a blind that needs no secret.
+fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     let mut context = digest::Context::new(&digest::SHA256);
-    context.update(b"sgc consumers v1");
-    context.update(&node.0);
+    context.update(label);
+    context.update(id);
     let mut out = [0; 32];
     out.copy_from_slice(context.finish().as_ref());
     Blind(out)
