@@ -38,6 +38,15 @@ fn all_types(lab: &Lab, [talks, listens]: [&str; 2], talks_at: Site, [published,
 }
 
 /// Patterns, a name for others and a namespace carry the topics of all types.
+/// Networks in which the robot shares a service and a topic, or patterns of them, with the desk.
+fn with_service_and_topic(service: &str, topic: &str) -> Lab {
+    let [mut robot, mut desk] = robot_to_desk("service", [service]);
+    let [shared, used] = robot_to_desk("topic", [topic]);
+    robot += &shared;
+    desk += &used;
+    Lab::real(PLAN, [robot, desk])
+}
+
 #[test]
 fn every_message_type_arrives_by_value() {
     let robot = share("topic", "/types/**", "desk") + "as = \"/arm/types/**\"\n";
@@ -58,11 +67,7 @@ fn every_message_type_arrives_by_value() {
 
 #[test]
 fn lifecycle_of_a_far_node_is_led_as_that_of_a_near_one() {
-    let mut tables = robot_to_desk("service", ["/robot/camera/*"]);
-    for (table, more) in tables.iter_mut().zip(robot_to_desk("topic", ["/robot/camera/*"])) {
-        *table += &more;
-    }
-    let lab = Lab::real(PLAN, tables);
+    let lab = with_service_and_topic("/robot/camera/*", "/robot/camera/*");
     for [serves, manages] in PAIRS {
         let [native, carried] = [(Site::Desk, "/near"), (Site::Robot, "/robot")].map(|(site, namespace)| {
             let camera = start(&lab, site, serves, &["camera", "--namespace", namespace]);
@@ -117,11 +122,7 @@ fn events_of_a_call(watcher: &Peer) -> Vec<Value> {
 /// The events of a service tell the same of a call, but who made it: the server's are of the client that `sgc` is to it.
 #[test]
 fn events_of_far_services_are_heard_with_their_contents() {
-    let mut tables = robot_to_desk("service", ["/add"]);
-    for (table, more) in tables.iter_mut().zip(robot_to_desk("topic", ["/add/_service_event"])) {
-        *table += &more;
-    }
-    let lab = Lab::real(PLAN, tables);
+    let lab = with_service_and_topic("/add", "/add/_service_event");
     for [serves, calls] in PAIRS {
         let [native, carried] = [(Site::Desk, "/near"), (Site::Robot, "/add")].map(|(site, name)| {
             let of = ["--topic", name];
