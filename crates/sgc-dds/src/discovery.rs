@@ -1,4 +1,4 @@
-//! Which endpoints are there: a thread that reads DCPSPublication, DCPSSubscription and DCPSParticipant.
+//! The endpoints of the local network: a thread that reads DCPSPublication, DCPSSubscription and DCPSParticipant.
 //!
 //! Reports each endpoint once when it appears, once when it is gone, and as gone and new when what it
 //! offers changes. Endpoints of this participant are never reported, those of other SGC nodes only to a

@@ -4,7 +4,7 @@
 //! that length with the other fragments, which announce one each: a fragment that announces more may reach beyond it. What
 //! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here.
 //!
-//! What a packet says behind a sample is read here as well: [`kept_by_writer`].
+//! The submessages behind a sample in its packet are read here as well: [`kept_by_writer`].
 //!
 //! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`.
 

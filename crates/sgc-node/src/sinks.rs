@@ -792,7 +792,7 @@ impl WriterQueue {
         Ok(this)
     }
 
-    /// Who takes a message now: if that does not block, and nothing is ahead of it. Only for who queues, while nobody else does.
+    /// The taker, if it takes a message now without blocking, and nothing is ahead of it. Only one caller queues at a time.
     fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, Take>> {
         let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };

@@ -218,7 +218,7 @@ fn subscribers_of_a_shared_topic_appear_at_its_owner_and_vanish() {
     shows_ends(net, &[("/sgc_robot", 1, 0)]);
     desk = trio.desk(&["/a"]);
     shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
-    // What is not used any more is not told any more.
+    // Consumers of a use that is gone are told no longer.
     desk.reload(|config| config.uses.clear());
     shows_ends(net, &[("/sgc_robot", 1, 0)]);
     drop(view);

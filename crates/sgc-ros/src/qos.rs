@@ -52,7 +52,7 @@ pub struct QosOverride {
 }
 
 impl QosOverride {
-    /// What is offered in the place of this.
+    /// The offer with these policies in the place of its own.
     #[must_use]
     pub fn apply(&self, qos: &Qos) -> Qos {
         Qos {

@@ -115,7 +115,7 @@ impl TypeStore {
         found.map(|entry| entry.described.clone())
     }
 
-    /// What messages of a type look like. The request and the response of a service are found by each hash that its endpoints
+    /// The layout of messages of a type. The request and the response of a service are found by each hash that its endpoints
     /// announce ([`Described::is_announced_as`]).
     pub fn layout(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Layout>> {
         if let Some(described) = self.described(name, type_hash) {

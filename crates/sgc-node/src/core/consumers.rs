@@ -34,7 +34,7 @@ pub(crate) struct ConsumerKey {
     pub(super) id: [u8; 8],
 }
 
-/// What the local network shows for one consumer.
+/// The local endpoints that stand for one consumer.
 struct ShownConsumer {
     node: RosNode,
     ends: Vec<(EndpointKind, EndpointSpec)>,

@@ -1,4 +1,4 @@
-//! What the local ROS graph shows of this proxy: the far nodes that its endpoints stand for, and one of its own for the
+//! The nodes of this proxy in the local ROS graph: the far nodes that its endpoints stand for, and one of its own for the
 //! rest.
 
 use std::collections::BTreeMap;

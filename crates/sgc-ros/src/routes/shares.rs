@@ -186,7 +186,7 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn refresh_share(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
         let wanted = self.share_rules[share.rule].qos;
-        // What they offer here is what can be read; what is set is offered elsewhere.
+        // The reader asks for no more than the writers offer; the policies of the rule are offered elsewhere.
         let found = weakest(share.writers.values().map(|w| &w.qos));
         let offers: Vec<_> = share.writers.values().map(|w| wanted.apply(&w.qos)).collect();
         let offer = match weakest(&offers) {
