@@ -1,4 +1,4 @@
-//! Consumers over the wire: a node tells the owners of what it uses which ROS 2 subscribers and service clients it has of that.
+//! Consumers over the wire: a node tells the owners of what it uses which ROS 2 subscribers, publishers and service clients it has of that.
 //!
 //! A node is asked at a name of its own by owners that granted it something. The answer is sealed to the owner, holds what uses
 //! interfaces of that owner alone, and is given again whenever that changes. Which of it is shown is for the owner's driver.

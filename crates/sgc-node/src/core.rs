@@ -266,7 +266,7 @@ pub(crate) struct Core<N: RosNetwork> {
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     /// Which nodes the local graph shows for them.
     graph: LocalGraph,
-    /// The subscribers and service clients that owners are told, and those elsewhere that are shown here.
+    /// The subscribers, publishers and service clients that owners are told, and those elsewhere that are shown here.
     consumers: FarConsumers,
     history_due: BTreeMap<(Name, SourceId), Instant>,
     /// When the keys of past epochs of a joined name are dropped.

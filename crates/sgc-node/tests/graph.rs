@@ -225,6 +225,37 @@ fn subscribers_of_a_shared_topic_appear_at_its_owner_and_vanish() {
 }
 
 #[test]
+fn publishers_of_others_on_a_shared_topic_appear_at_its_owner_as_many_as_they_are() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let _cloud = lab.cloud();
+    let _robot = lab.start("robot", |config| {
+        let mut cmd = share("/cmd", &["desk"]);
+        cmd.publish = lab::nodes(&["desk"]);
+        cmd.type_name = Some("std_msgs/msg/String".into());
+        config.shares = vec![cmd];
+    });
+    let _desk = lab.start("desk", |config| {
+        config.uses = vec![uses("/cmd")];
+        config.uses[0].publish = true;
+    });
+    let (robot, desk) = (lab.net("robot"), lab.net("desk"));
+    let counts = || (writers(&robot, "/cmd"), robot.count("shown:rt/cmd", EndpointKind::Writer));
+    wait("a writer for what others publish", || counts() == (1, 0));
+    shows(&robot, &[("/sgc_robot", 1)]);
+    let teleop = RosProcess::new(&desk, "teleop", &["/cmd", "/private"]);
+    shows(&robot, &[("/robot/teleop", 1), ("/sgc_robot", 0)]);
+    assert_eq!(counts(), (1, 0));
+    let second = RosProcess::new(&desk, "second", &["/cmd"]);
+    shows(&robot, &[("/robot/second", 1), ("/robot/teleop", 1), ("/sgc_robot", 0)]);
+    assert_eq!(counts(), (1, 1), "one writer has the messages of both");
+    drop(teleop);
+    shows(&robot, &[("/robot/second", 1), ("/sgc_robot", 0)]);
+    wait("the writer that is left is the real one", || counts() == (1, 0));
+    drop(second);
+    shows(&robot, &[("/sgc_robot", 1)]);
+}
+
+#[test]
 fn subscribers_of_a_node_that_is_lost_go_after_a_while_and_a_restarted_router_changes_nothing() {
     let trio = Trio::new();
     let (mut cloud, _robot, desk) = (trio.cloud(), trio.robot(&["/a"], "desk"), trio.desk(&["/a"]));

@@ -11,7 +11,7 @@ use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
-    Metadata, Name, Packet, Qos, RosNode, SinkId, SourceId, SourceOffer,
+    Metadata, Name, Packet, Qos, Role, RosNode, SinkId, SourceId, SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -486,6 +486,7 @@ impl World {
             let consumer = Consumer {
                 interface: self.name(*owner, topic),
                 id: n.to_be_bytes(),
+                role: Role::Subscribe,
                 node: RosNode::new("/", ros_node, None).expect("a name that ROS 2 accepts"),
                 type_hash: None,
                 qos: Qos::default(),

@@ -1,6 +1,7 @@
-//! Consumers: the ROS 2 subscribers and service clients of a node, as it tells them to the owner of what they use.
+//! Consumers: the ROS 2 subscribers, publishers and service clients of a node, as it tells them to the owner of what they use.
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::control::Role;
 use crate::ids::Name;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
@@ -11,18 +12,21 @@ pub const CONSUMERS_MAX: usize = 512;
 /// Most consumers of one interface that a node tells, and that its owner shows of that node.
 pub const CONSUMERS_PER_INTERFACE_MAX: usize = 16;
 
-/// A subscriber or a service client.
+/// A subscriber, a service client, or a publisher on a topic that another node owns.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Consumer {
     /// The interface that it uses.
     pub interface: Name,
     /// The same for as long as the consumer lives; tells apart those of one node and interface.
     pub id: [u8; 8],
+    /// The role in which its node joined the interface: [`Role::Subscribe`] of a subscriber, [`Role::Publish`] of a publisher and of a
+    /// service client.
+    pub role: Role,
     /// The ROS 2 node that it belongs to.
     pub node: RosNode,
     /// `RIHS01_…` type hash, if its network says it.
     pub type_hash: Option<String>,
-    /// The QoS that it requests; of a service client, ROS 2's for services.
+    /// The QoS that it requests or offers; of a service client, ROS 2's for services.
     pub qos: Qos,
 }
 
@@ -30,6 +34,7 @@ impl Encode for Consumer {
     fn encode(&self, w: &mut Writer) {
         self.interface.encode(w);
         w.raw(&self.id);
+        w.bool(self.role == Role::Publish);
         self.node.encode(w);
         w.option(self.type_hash.as_ref(), |w, hash| w.str(hash));
         self.qos.encode(w);
@@ -41,6 +46,7 @@ impl Decode for Consumer {
         Ok(Self {
             interface: Name::decode(r)?,
             id: r.array("consumer")?,
+            role: if r.bool("role")? { Role::Publish } else { Role::Subscribe },
             node: RosNode::decode(r)?,
             type_hash: r.option("type hash", |r| r.str("type hash", TYPE_HASH_BYTES_MAX))?,
             qos: Qos::decode(r)?,
@@ -57,7 +63,8 @@ mod tests {
     fn consumer(name: &str) -> Consumer {
         let node = RosNode::new("/desk", name, None).unwrap();
         let (interface, type_hash) = (Name([7; 32]), Some("RIHS01_ab".to_owned()));
-        Consumer { interface, id: *b"consumer", node, type_hash, qos: Qos::default() }
+        let (id, role) = (*b"consumer", Role::Subscribe);
+        Consumer { interface, id, role, node, type_hash, qos: Qos::default() }
     }
 
     /// The bytes are normative.
@@ -66,6 +73,7 @@ mod tests {
         let bytes = [
             &[7; 32][..],
             b"consumer",
+            &[0],
             &[0, 0, 0, 5],
             b"/desk",
             &[0, 0, 0, 4],
@@ -77,6 +85,9 @@ mod tests {
         .concat();
         assert_eq!(consumer("rviz").to_vec(), bytes);
         assert_eq!(Consumer::from_slice(&bytes), Ok(consumer("rviz")));
+        let publisher = Consumer { role: Role::Publish, ..consumer("rviz") };
+        assert_eq!(publisher.to_vec(), [&bytes[..40], &[1], &bytes[41..]].concat());
+        assert_eq!(Consumer::from_slice(&publisher.to_vec()), Ok(publisher));
         let content = GrantContent::Consumers(vec![consumer("rviz")]);
         assert_eq!(content.to_vec(), [&[5, 0, 0, 0, 1][..], &bytes].concat());
         assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));

@@ -1,15 +1,16 @@
-//! Subscribers and service clients across nodes: those here are told to the owners of what they use, and those elsewhere that use what
-//! this node shares are shown on its local network.
+//! Subscribers, publishers and service clients across nodes: those here are told to the owners of what they use, and those elsewhere that
+//! use what this node shares are shown on its local network.
 //!
 //! One reader takes the messages of a shared topic, however many subscribers there are elsewhere; those are shown by endpoints that
-//! nothing matches ([`RosNetwork::show`]).
+//! nothing matches ([`RosNetwork::show`]). One writer gives the messages of all publishers elsewhere: it is shown as that of the first of
+//! them, and each other one by an endpoint that nothing matches.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::LostReason;
 use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
-use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, RosNode, SinkId};
+use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, Role, RosNode, SinkId};
 use tracing::debug;
 
 use super::{Core, CoreEvent, drop_elsewhere};
@@ -57,7 +58,7 @@ pub(super) struct FarConsumers {
     tell_due: Option<Instant>,
     /// When the local network is brought in line with what was told.
     show_due: Option<Instant>,
-    sinks: BTreeMap<NodeId, BTreeMap<Name, Sinks>>,
+    sinks: BTreeMap<NodeId, BTreeMap<(Name, Role), Sinks>>,
     asked: BTreeSet<NodeId>,
     told: BTreeMap<NodeId, Vec<Consumer>>,
     /// Nodes that are out of reach, and until when their consumers stay.
@@ -68,8 +69,8 @@ pub(super) struct FarConsumers {
 }
 
 impl FarConsumers {
-    pub(super) fn sink_joined(&mut self, now: Instant, peer: NodeId, name: Name, sink: SinkId) {
-        let sinks = self.sinks.entry(peer).or_default().entry(name).or_default();
+    pub(super) fn sink_joined(&mut self, now: Instant, peer: NodeId, name: Name, sink: SinkId, role: Role) {
+        let sinks = self.sinks.entry(peer).or_default().entry((name, role)).or_default();
         sinks.granted.insert(sink);
         sinks.until = None;
         self.show_soon(now);
@@ -77,9 +78,11 @@ impl FarConsumers {
 
     /// A sink is gone. Without another one its node counts as granted until then, so that a restarted router changes nothing.
     pub(super) fn sink_left(&mut self, peer: NodeId, name: Name, sink: SinkId, until: Instant) {
-        let Some(sinks) = self.sinks.get_mut(&peer).and_then(|names| names.get_mut(&name)) else { return };
-        if sinks.granted.remove(&sink) && sinks.granted.is_empty() {
-            sinks.until = Some(until);
+        let of_peer = self.sinks.get_mut(&peer).into_iter().flatten();
+        for (_, sinks) in of_peer.filter(|((of, _), _)| *of == name) {
+            if sinks.granted.remove(&sink) && sinks.granted.is_empty() {
+                sinks.until = Some(until);
+            }
         }
     }
 
@@ -92,15 +95,15 @@ impl FarConsumers {
         self.show_due.get_or_insert(now + SHOW_AFTER);
     }
 
-    /// The type hashes that the consumers of a share announce, with their SGC nodes.
-    pub(super) fn hashes(&self, interface: Name) -> impl Iterator<Item = (NodeId, &str)> {
+    /// The type hashes that the subscribers or clients of a share announce, with their SGC nodes.
+    pub(super) fn hashes(&self, interface: Name, role: Role) -> impl Iterator<Item = (NodeId, &str)> {
+        let of = (interface, role);
         self.told
             .iter()
-            .filter(move |(peer, _)| {
-                self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&interface))
-            })
+            .filter(move |(peer, _)| self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&of)))
             .flat_map(move |(peer, consumers)| {
-                let of_it = consumers.iter().filter(move |consumer| consumer.interface == interface);
+                let is_it = move |consumer: &&Consumer| (consumer.interface, consumer.role) == of;
+                let of_it = consumers.iter().filter(is_it);
                 of_it.filter_map(|consumer| consumer.type_hash.as_deref()).map(|hash| (*peer, hash))
             })
     }
@@ -133,7 +136,9 @@ impl FarConsumers {
         for (peer, consumers) in &self.told {
             let Some(granted) = self.sinks.get(peer) else { continue };
             let mut of_interface = BTreeMap::<Name, usize>::new();
-            for consumer in consumers.iter().filter(|consumer| granted.contains_key(&consumer.interface)) {
+            let is_granted =
+                |consumer: &&Consumer| granted.contains_key(&(consumer.interface, consumer.role));
+            for consumer in consumers.iter().filter(is_granted) {
                 let known = of_interface.entry(consumer.interface).or_default();
                 if *known >= CONSUMERS_PER_INTERFACE_MAX || wanted.len() >= SHOWN_MAX {
                     left_out += 1;
@@ -215,11 +220,22 @@ impl<N: RosNetwork> Core<N> {
     fn show_consumers(&mut self) {
         let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else { return };
         let (wanted, left_out) = self.consumers.wanted();
-        let wanted: BTreeMap<_, _> = wanted
+        let mut publishers = BTreeMap::new();
+        let mut wanted: BTreeMap<_, _> = wanted
             .into_iter()
             .map(|(key, consumer)| (key, (consumer.node.clone(), routes.consumer_ends(consumer))))
             .filter(|(_, (_, ends))| !ends.is_empty())
             .collect();
+        // The ends of a service client are two.
+        wanted.retain(|key, (node, ends)| {
+            let is_writer = ends.iter().all(|(kind, _)| *kind == EndpointKind::Writer);
+            let is_first = is_writer && !publishers.contains_key(&key.interface);
+            if is_first {
+                publishers.insert(key.interface, (key.peer, node.clone()));
+            }
+            !is_first
+        });
+        self.graph.set_publishers(publishers);
         self.count_left_out(1, "consumers_unshown", left_out);
         let is_gone = |key: &ConsumerKey, shown: &ShownConsumer| {
             wanted.get(key).is_none_or(|(_, ends)| *ends != shown.ends)
@@ -297,4 +313,34 @@ impl<N: RosNetwork> Core<N> {
 
 fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> Vec<(EndpointKind, sgc_ros::Guid)> {
     endpoints.iter().map(|(kind, endpoint)| (*kind, endpoint.guid)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sgc_wire::Qos;
+
+    #[test]
+    fn consumers_are_shown_in_a_role_that_their_node_was_granted() {
+        let (peer, interface, now) = (NodeId([1; 32]), Name([2; 32]), Instant::now());
+        let consumer = |role| Consumer {
+            interface,
+            id: [role as u8; 8],
+            role,
+            node: RosNode::new("/", "teleop", None).unwrap(),
+            type_hash: None,
+            qos: Qos::default(),
+        };
+        let mut far = FarConsumers::default();
+        far.told.insert(peer, [Role::Subscribe, Role::Publish].map(consumer).into());
+        let wanted = |far: &FarConsumers| far.wanted().0.values().map(|one| one.role).collect::<Vec<_>>();
+        assert_eq!(wanted(&far), []);
+        far.sink_joined(now, peer, interface, SinkId([3; 16]), Role::Subscribe);
+        assert_eq!(wanted(&far), [Role::Subscribe]);
+        far.sink_joined(now, peer, interface, SinkId([4; 16]), Role::Publish);
+        assert_eq!(wanted(&far), [Role::Subscribe, Role::Publish]);
+        far.sink_left(peer, interface, SinkId([4; 16]), now);
+        assert!(far.forget(now));
+        assert_eq!(wanted(&far), [Role::Subscribe]);
+    }
 }

@@ -11,7 +11,7 @@ use sgc_ros::{
 };
 use sgc_transport::Link as _;
 use sgc_trust::{Grantees, Policy};
-use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm};
+use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm, Role};
 use tokio::sync::oneshot;
 
 use super::Core;
@@ -122,8 +122,9 @@ impl<N: RosNetwork> Core<N> {
                     .into_iter()
                     .map(|(_, peer)| self.called(&peer))
                     .collect();
+                let role = if is_service { Role::Publish } else { Role::Subscribe };
                 let mut consumer_hashes = BTreeMap::<_, BTreeSet<_>>::new();
-                for (peer, hash) in self.consumers.hashes(route.name) {
+                for (peer, hash) in self.consumers.hashes(route.name, role) {
                     consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
                 }
                 let refused = self.refused.get(&route.name).into_iter().flatten();

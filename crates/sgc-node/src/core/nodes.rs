@@ -28,6 +28,8 @@ pub(super) struct LocalGraph {
     /// Each with the node of SGC that it is of: nodes of two robots may have one name.
     nodes: BTreeMap<WriterKey, (NodeId, RosNode)>,
     readers: BTreeMap<Name, Guid>,
+    /// Whose the writer of a share is that gives what others publish, where that is known.
+    publishers: BTreeMap<Name, (NodeId, RosNode)>,
     /// Endpoints that stand for consumers elsewhere.
     consumers: BTreeMap<ConsumerKey, ConsumerEnds>,
     has_changed: bool,
@@ -45,6 +47,7 @@ impl LocalGraph {
             writers: BTreeMap::new(),
             nodes: BTreeMap::new(),
             readers: BTreeMap::new(),
+            publishers: BTreeMap::new(),
             consumers: BTreeMap::new(),
             has_changed: true,
             wanted: Arc::default(),
@@ -101,6 +104,11 @@ impl LocalGraph {
         };
     }
 
+    /// Whose the writers for what others publish are, and no others'.
+    pub(super) fn set_publishers(&mut self, publishers: BTreeMap<Name, (NodeId, RosNode)>) {
+        self.has_changed |= std::mem::replace(&mut self.publishers, publishers.clone()) != publishers;
+    }
+
     /// Endpoints stand for a consumer of this node from here on.
     pub(super) fn consumer_there(&mut self, key: ConsumerKey, node: RosNode, ends: &[(EndpointKind, Guid)]) {
         let of = |kind| ends.iter().filter(move |(of, _)| *of == kind).map(|(_, guid)| *guid).collect();
@@ -129,7 +137,8 @@ impl LocalGraph {
             }
         }
         for (key, guid) in &self.writers {
-            match self.nodes.get(key) {
+            let publisher = || self.publishers.get(&key.0).filter(|_| key.1.is_none());
+            match self.nodes.get(key).or_else(publisher) {
                 Some(node) => far.entry(node).or_default().1.push(*guid),
                 None => own.1.push(*guid),
             }
@@ -225,6 +234,10 @@ mod tests {
         assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 1, 1)]);
         graph.consumer_gone(&of_two);
         assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 0, 1)]);
+        // What others publish on a share is one writer, which is that of one of them; its reader is of this proxy.
+        graph.set_publishers([(name, (NodeId([2; 32]), talker().unwrap()))].into());
+        assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 1), of("/talker", 0, 2)]);
+        graph.set_publishers(BTreeMap::new());
         graph.reader_gone(&name);
         [None, source(2), source(3)].iter().for_each(|s| graph.writer_gone(&(name, *s)));
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 0, 0)]);

@@ -167,8 +167,8 @@ impl<N: RosNetwork> Core<N> {
                 graph::forget_refusal(&mut self.refused, &name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
                     routes.handle_sink_joined(&name, sink);
-                    self.consumers.sink_joined(now.instant, peer, name, sink);
                 }
+                self.consumers.sink_joined(now.instant, peer, name, sink, role);
             }
             Event::SinkLeft { name, sink, peer } => {
                 debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");

@@ -169,6 +169,7 @@ impl<N: RosNetwork> Core<N> {
         self.retire_due.insert(name, now().instant + EPOCH_GRACE);
         if let Some(routes) = &mut self.routes {
             routes.handle_publishers(&name, others);
+            self.consumers.show_soon(now().instant);
         }
     }
 }

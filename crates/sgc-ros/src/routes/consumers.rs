@@ -1,9 +1,12 @@
-//! Consumers: which local subscribers and service clients use what others own, and the endpoints that stand for those of others.
+//! Consumers: which local subscribers, publishers and service clients use what others own, and the endpoints that stand for those of
+//! others.
 
 use std::collections::BTreeMap;
 
 use rand_core::RngCore;
-use sgc_wire::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, History, Kind, Name, NodeId, Qos};
+use sgc_wire::{
+    CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, History, Kind, Name, NodeId, Qos, Role,
+};
 
 use super::services::service_spec;
 use super::{Direction, Routes, UseRoute};
@@ -33,7 +36,7 @@ impl<R: RngCore> Routes<R> {
         std::mem::take(&mut self.consumers_changed)
     }
 
-    /// Returns the local subscribers and service clients that belong to a node and use what is granted to this one.
+    /// Returns the local subscribers, publishers and service clients that belong to a node and use what is granted to this one.
     pub fn consumers(&self) -> Consumers {
         let mut used = BTreeMap::<String, Vec<ConsumingEnd>>::new();
         for (name, route) in &self.uses {
@@ -69,6 +72,10 @@ impl<R: RngCore> Routes<R> {
                 of_owner.push(Consumer {
                     interface: *interface,
                     id: self.secret.publisher_tag(&endpoint.guid.0),
+                    role: match endpoint.kind {
+                        EndpointKind::Reader => Role::Subscribe,
+                        EndpointKind::Writer => Role::Publish,
+                    },
                     node: node.clone(),
                     type_hash: endpoint.type_hash.clone(),
                     qos: Qos { partitions: Vec::new(), ..endpoint.qos.clone() },
@@ -91,15 +98,18 @@ impl<R: RngCore> Routes<R> {
                 request.dds_topic(&route.local_name),
                 request.dds_type(type_name),
             )),
-            (_, Direction::Bring) => {
-                Some((EndpointKind::Reader, dds_topic(&route.local_name), dds_type(type_name)))
+            (_, direction) => {
+                let kind = match direction {
+                    Direction::Bring => EndpointKind::Reader,
+                    Direction::Publish => EndpointKind::Writer,
+                };
+                Some((kind, dds_topic(&route.local_name), dds_type(type_name)))
             }
-            (_, Direction::Publish) => None,
         }
     }
 
-    /// Returns the endpoints by which the local network sees a consumer of a share that is elsewhere: a reader, or both ends of a
-    /// service client. None if there is no such share.
+    /// Returns the endpoints by which the local network sees a consumer of a share that is elsewhere: a reader, a writer, or both
+    /// ends of a service client. None if there is no such share, or no writer of what others publish.
     pub fn consumer_ends(&self, consumer: &Consumer) -> Vec<(EndpointKind, EndpointSpec)> {
         let Some(share) = self.shares.get(&consumer.interface) else { return Vec::new() };
         // It goes into a text of `key=value;` elements.
@@ -109,6 +119,12 @@ impl<R: RngCore> Routes<R> {
             let type_name = ros_type(&share.type_name);
             let spec = service_spec(&share.local_name, &type_name, type_hash.map(String::as_str));
             return vec![(EndpointKind::Writer, spec.request), (EndpointKind::Reader, spec.reply)];
+        }
+        if consumer.role == Role::Publish {
+            // Its messages come from that writer, with the QoS of that.
+            let spec =
+                |writer: &EndpointSpec| EndpointSpec { type_hash: type_hash.cloned(), ..writer.clone() };
+            return share.writer.iter().map(|writer| (EndpointKind::Writer, spec(writer))).collect();
         }
         let spec = EndpointSpec {
             topic: dds_topic(&share.local_name),

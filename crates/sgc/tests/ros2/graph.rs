@@ -1,6 +1,7 @@
 //! Far programs in the local ROS graph, those that publish and those that consume, as a program of each distribution reads it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::process::Stdio;
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -102,6 +103,59 @@ fn far_subscribers_are_shown_with_node_type_qos_and_id_while_they_live() {
         talker.end();
         assert_eq!(talker.summary()["matched"], 1, "{talks}, {hears}");
     }
+}
+
+#[test]
+fn far_publishers_on_a_topic_that_others_publish_on_are_shown_as_their_nodes() {
+    let robot =
+        share("topic", "/load", "desk") + "type = \"std_msgs/msg/UInt8MultiArray\"\npublish = [\"desk\"]\n";
+    let desk = uses("topic", "/load", "robot") + "publish = true\n";
+    let lab = Lab::real(PLAN, [robot, desk]);
+    let publisher = |distribution| {
+        let talk = ["pub", "--topic", "/load", "--wait-go", "--timeout", PLAN.peer_life];
+        lab.load(Site::Desk, distribution, &talk)
+    };
+    let shown = |distribution, count: &str| {
+        let args =
+            ["--topic", "/load", "--node", "load", "--timeout", "30", "--exactly", "--publishers", count];
+        let found = lab.rclpy(Site::Robot, distribution, "graph.py", &args).summary();
+        let all = found["publishers"].as_array().unwrap();
+        let of = |end: &Value| ["node", "namespace", "type", "reliability"].map(|key| end[key].clone());
+        all.iter().map(of).collect::<Vec<_>>()
+    };
+    for [hears, talks] in PAIRS {
+        let mut first = publisher(talks);
+        let native = without_gid(&ends(&lab, Site::Desk, talks, "1", "0")["publishers"][0]);
+        let native = ["node", "namespace", "type", "reliability"].map(|key| native[key].clone());
+        for reads in ["jazzy", "kilted"] {
+            assert_eq!(shown(reads, "1"), std::slice::from_ref(&native), "{talks} to {hears}, {reads}");
+        }
+        let mut second = publisher(hears);
+        assert_eq!(shown(hears, "2"), [native.clone(), native], "{talks} to {hears}");
+        for publisher in [&mut first, &mut second] {
+            publisher.end();
+            publisher.summary();
+        }
+    }
+}
+
+#[test]
+fn programs_at_a_gateway_are_one_far_node() {
+    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let talk = ["topic", "pub", "/load", "std_msgs/msg/UInt8MultiArray", "{data: [1]}", "--rate", "10"];
+    let mut command = lab.sgc(Some(Site::Robot), &[&talk[..], &["--socket", "robot.sock"]].concat());
+    let mut programs = [0; 2].map(|_| command.stdin(Stdio::null()).stdout(Stdio::null()).spawn().unwrap());
+    let args = ["--topic", "/load", "--node", "sgc_gateway_robot", "--publishers", "2", "--timeout", "30"];
+    let found = lab.rclpy(Site::Desk, "kilted", "graph.py", &args).summary();
+    for program in &mut programs {
+        program.kill().unwrap();
+        program.wait().unwrap();
+    }
+    let publishers = found["publishers"].as_array().unwrap();
+    let nodes: Vec<_> = publishers.iter().map(|end| end["node"].as_str().unwrap()).collect();
+    assert_eq!(nodes, ["sgc_gateway_robot"; 2], "{found}");
+    let is_it = |node: &&Value| **node == "/sgc_gateway_robot";
+    assert_eq!(found["nodes"].as_array().unwrap().iter().filter(is_it).count(), 1, "{found}");
 }
 
 #[test]
