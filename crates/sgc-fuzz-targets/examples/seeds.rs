@@ -10,10 +10,11 @@ use rand_core::SeedableRng;
 use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
 use sgc_trust::{EnrollRequest, Fleet, KeyRequest, MessageKey, ShareToken, Suite, TopicSecret};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Class, Control,
-    DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead, MessageKind, Metadata, Name,
-    PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason, RejectReason, Request, RosNode, SecretBytes,
-    Signed, SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
+    Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead,
+    MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason,
+    RejectReason, Request, Role, RosNode, SecretBytes, SecretGeneration, Signed, SinkId, SourceId,
+    SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
 };
 
 /// The time of the targets.
@@ -118,14 +119,17 @@ fn bodies() -> Vec<Vec<u8>> {
     };
     let offer = SourceOffer { source: SourceId([3; 16]), key: Bytes::from_static(&[5; 32]) };
     let reply_key = Bytes::from_static(&[5; 32]);
-    let joins = [Request::Subscribe { describe: true }, Request::Publish { offer }].map(|request| JoinBody {
-        name: NAME,
-        sink: SINK,
-        request,
-        issued_at: NOW,
-        chain: chain.clone(),
-        reply_key: reply_key.clone(),
-    });
+    // A node is asked for its consumers with an empty question.
+    let ask = Request::Ask { what: Bytes::new() };
+    let joins =
+        [Request::Subscribe { describe: true }, Request::Publish { offer }, ask].map(|request| JoinBody {
+            name: NAME,
+            sink: SINK,
+            request,
+            issued_at: NOW,
+            chain: chain.clone(),
+            reply_key: reply_key.clone(),
+        });
     let answers = [
         Answer::Grant { enc: Bytes::from_static(&[6; 32]), sealed: Bytes::from_static(&[7; 80]) },
         Answer::Refuse { reason: RefuseReason::NotPermitted },
@@ -157,6 +161,16 @@ fn bodies() -> Vec<Vec<u8>> {
             encoding: PayloadEncoding::Zstd,
             description: Bytes::from_static(b"\0\0\x01\0packed"),
         }]),
+        GrantContent::Consumers(vec![
+            consumer("rviz", Role::Subscribe, Some("RIHS01_ab")),
+            consumer("teleop", Role::Publish, None),
+        ]),
+        GrantContent::Consumers(Vec::new()),
+        GrantContent::Credentials(Credentials {
+            chain: chain.clone(),
+            secrets: vec![SecretGeneration { generation: 1, secret: SecretBytes::new([4; 32]) }],
+        }),
+        GrantContent::Operation(OperationAnswer::Challenge(Challenge([1; 16]))),
     ];
     let head = MessageHead::new(MessageKind::Write, 7);
     let mut all = vec![(0, advert.to_vec())];
@@ -167,6 +181,18 @@ fn bodies() -> Vec<Vec<u8>> {
     all.extend([(4, metadata.to_vec()), (5, head.to_vec()), (5, json.to_vec())]);
     all.push((6, TypeQuestion { names: vec![NAME; 2] }.to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
+}
+
+/// A subscriber or a publisher of a node at a desk.
+fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
+    Consumer {
+        interface: NAME,
+        id: *b"consumer",
+        role,
+        node: RosNode::new("/desk", node, None).expect("a node"),
+        type_hash: type_hash.map(str::to_owned),
+        qos: Qos::default(),
+    }
 }
 
 /// Of another key than the target of sinks grants: what is sealed under that one is genuine there in suites without

@@ -1,11 +1,13 @@
 //! Every fuzz target over its committed inputs, and over alterations of them from a fixed seed.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::{env, fs};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{RngCore, SeedableRng};
 use sgc_fuzz_targets::TARGETS;
+use sgc_wire::{Decode, DecodeError, GrantContent};
 
 /// Altered inputs for each target; `SGC_FUZZ_RUNS` sets another number.
 const RUNS: usize = 300;
@@ -54,6 +56,18 @@ fn altered(inputs: &[(String, Vec<u8>)], rng: &mut ChaCha20Rng) -> Vec<u8> {
         input.truncate(INPUT_BYTES_MAX);
     }
     input
+}
+
+#[test]
+fn corpus_has_a_sample_of_each_content_of_a_grant() {
+    // `bodies` reads a grant behind a 3; the next byte is the tag of its content.
+    let is_grant =
+        |input: &Vec<u8>| input.first() == Some(&3) && GrantContent::from_slice(&input[1..]).is_ok();
+    let inputs = corpus("bodies").into_iter().map(|(_, input)| input);
+    let tags: BTreeSet<u8> = inputs.filter(is_grant).map(|input| input[1]).collect();
+    let none_beyond = GrantContent::from_slice(&[tags.len() as u8]);
+    assert!(tags.iter().copied().eq(0..tags.len() as u8), "{tags:?}");
+    assert_eq!(none_beyond, Err(DecodeError::value("grant content", tags.len() as u64)));
 }
 
 #[test]

@@ -5,11 +5,11 @@ use bytes::Bytes;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
-    AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
-    Control, Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name, NodeId, Operation,
-    OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader, Place, Qos, Recover,
-    RefuseReason, RejectReason, Request, RosNode, RosterPage, RosterRow, RowCertificate, SecretBytes, Signed,
-    SinkId, SourceAnnounce, SourceId, TopicGrant, UnixMillis,
+    AdvertBody, Answer, AnswerBody, Blind, CONSUMERS_MAX, Catalogue, CatalogueEntry, CatalogueSource,
+    Challenge, Class, Consumer, Control, Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name,
+    NodeId, Operation, OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader, Place, Qos,
+    Recover, RefuseReason, RejectReason, Request, Role, RosNode, RosterPage, RosterRow, RowCertificate,
+    SecretBytes, Signed, SinkId, SourceAnnounce, SourceId, TYPE_HASH_BYTES_MAX, TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -172,6 +172,51 @@ fn operations_survive_mutation() {
     let refused = OperationAnswer::Refused { why: OperationRefusal::Fleet, detail: "no".into() };
     let contents = [OperationAnswer::Roster(page), refused].map(GrantContent::Operation);
     survives::<GrantContent>(&contents.map(|c| c.to_vec()), 9);
+}
+
+/// The encoding of consumers, and what stands in front of them: their tag and their number.
+fn consumers(count: u32) -> Vec<u8> {
+    let node = |n: u32| RosNode::new("/desk", &format!("viewer_{n}"), None).unwrap();
+    let consumer = |n: u32| Consumer {
+        interface: Name([1; 32]),
+        id: [2; 8],
+        role: if n == 1 { Role::Publish } else { Role::Subscribe },
+        node: node(n),
+        type_hash: n.is_multiple_of(2).then(|| "RIHS01_ab".to_owned()),
+        qos: Qos { partitions: vec!["p".into()], ..Qos::default() },
+    };
+    GrantContent::Consumers((0..count).map(consumer).collect()).to_vec()
+}
+
+#[test]
+fn consumers_survive_mutation_and_arbitrary_bytes_within_their_bounds() {
+    survives::<GrantContent>(&[consumers(0), consumers(1), consumers(3)], 10);
+    // The tag and a small number in front have arbitrary bytes read as consumers, not refused at once.
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    for _ in 0..ROUNDS {
+        let mut input = vec![0; rng.next_u32() as usize % 2_048];
+        rng.fill_bytes(&mut input);
+        let head = [&[5, 0, 0][..], &(rng.next_u32() as u16 % 1_024).to_be_bytes()].concat();
+        let of_both = [mutated(&mut rng, &consumers(4)), [head, input.clone()].concat(), input];
+        for input in of_both {
+            let Ok(GrantContent::Consumers(all)) = GrantContent::from_slice(&input) else { continue };
+            assert!(all.len() <= CONSUMERS_MAX);
+            for consumer in all {
+                let Consumer { node, type_hash, .. } = consumer;
+                assert!(node.namespace().len().max(node.name().len()) <= RosNode::NAME_BYTES_MAX);
+                assert!(type_hash.is_none_or(|hash| hash.len() <= TYPE_HASH_BYTES_MAX));
+            }
+        }
+    }
+}
+
+/// What is kept while an answer is read grows with its bytes, not with the number that it claims.
+#[test]
+fn claimed_consumers_that_do_not_follow_are_refused() {
+    for claimed in [1, CONSUMERS_MAX as u32, CONSUMERS_MAX as u32 + 1, u32::MAX] {
+        let input = [&[5][..], &claimed.to_be_bytes(), &consumers(1)[5..60]].concat();
+        assert!(GrantContent::from_slice(&input).is_err(), "{claimed}");
+    }
 }
 
 #[test]
