@@ -161,7 +161,7 @@ fn share(
     };
     if share.interface != Interface::Topic {
         let reason =
-            format!("{topic} is no topic, and tokens are for topics: name a `[[partner]]` in its `to`");
+            format!("{topic} is no topic, and tokens are for topics: nodes of another fleet cannot use it");
         return Err(cannot(reason));
     }
     let mut share = share.clone();

@@ -42,15 +42,18 @@ def main() -> int:
     def endpoints(read):
         return [endpoint(info) for info in read(options.topic)]
 
-    def clients(read, interface):
-        found = []
+    def of_each_node(read):
         for name, namespace in node.get_node_names_and_namespaces():
             try:
-                if interface in dict(read(name, namespace)):
-                    found.append(f"{namespace.rstrip('/')}/{name}")
+                yield f"{namespace.rstrip('/')}/{name}", dict(read(name, namespace))
             except RuntimeError:  # NodeNameNonExistentError: gone meanwhile
                 pass
-        return sorted(found)
+
+    def clients(read, interface):
+        return sorted(name for name, interfaces in of_each_node(read) if interface in interfaces)
+
+    def all_of(read):
+        return sorted({interface for _, interfaces in of_each_node(read) for interface in interfaces})
 
     def action_clients(name, namespace):
         return get_action_client_names_and_types_by_node(node, name, namespace)
@@ -74,6 +77,8 @@ def main() -> int:
     nodes = sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in node.get_node_names_and_namespaces())
     said = {"publishers": publishers, "subscribers": subscribers, "nodes": nodes}
     said |= {"service_clients": service_clients, "action_clients": in_action}
+    said |= {"published": all_of(node.get_publisher_names_and_types_by_node)}
+    said |= {"served": all_of(node.get_service_names_and_types_by_node)}
     print(json.dumps({"event": "summary"} | said), flush=True)
     return 0
 

@@ -16,6 +16,7 @@ mod hosts;
 mod keyed;
 #[path = "../support/lab.rs"]
 mod lab;
+mod partner;
 mod secured;
 #[path = "../support/mod.rs"]
 mod support;
