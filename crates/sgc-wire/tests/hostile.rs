@@ -176,7 +176,7 @@ fn operations_survive_mutation() {
 
 /// The encoding of consumers, and what stands in front of them: their tag and their number.
 fn consumers(count: u32) -> Vec<u8> {
-    let node = |n: u32| RosNode::new("/desk", &format!("viewer_{n}"), None).unwrap();
+    let node = |n: u32| RosNode::new("/desk", &format!("viewer_{n}"), None).expect("a valid name");
     let consumer = |n: u32| Consumer {
         interface: Name([1; 32]),
         id: [2; 8],
