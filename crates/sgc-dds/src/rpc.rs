@@ -2,6 +2,7 @@
 //! belong ([`crate::sample`]). What they say elsewhere, and which of both a client or server expects, is for
 //! [`crate::service`] to know.
 
+use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
@@ -42,17 +43,22 @@ impl Message {
 }
 
 /// Receives messages, on a thread of its reader alone.
-pub(crate) type MessageHandler = Box<dyn FnMut(Message) + Send>;
+pub(crate) trait HandleMessages: Send + 'static {
+    /// Receives a message; may wait.
+    fn handle(&mut self, message: Message);
+
+    /// So many messages gave way to newer ones.
+    fn overrun(&mut self, messages: u64);
+}
 
 /// A reader of requests or replies; dropping it ends its thread, waits for a handler that is at work, and deletes the
 /// entities. What SGC wrote, this process or another, does not reach the handler.
-#[derive(Debug)]
-pub(crate) struct RpcReader {
-    intake: Intake<Messages>,
+pub(crate) struct RpcReader<H: HandleMessages> {
+    intake: Intake<Messages<H>>,
     ignores_tagged: bool,
 }
 
-impl RpcReader {
+impl<H: HandleMessages> RpcReader<H> {
     /// `more` elements are added to USER_DATA. Messages come once `start` is called.
     pub(crate) fn new(
         participant: &Arc<Participant>,
@@ -64,7 +70,7 @@ impl RpcReader {
     }
 
     /// Hands messages over from now on.
-    pub(crate) fn start(&mut self, handler: MessageHandler) -> Result<(), String> {
+    pub(crate) fn start(&mut self, handler: H) -> Result<(), String> {
         let (ignores_tagged, writers) = (self.ignores_tagged, KnownWriters::default());
         self.intake.start("sgc-dds-rpc", Messages { ignores_tagged, writers, handler })
     }
@@ -77,6 +83,12 @@ impl RpcReader {
     /// The reader's handle, for calls into Cyclone while `self` lives.
     pub(crate) fn handle(&self) -> dds_entity_t {
         self.intake.handle()
+    }
+}
+
+impl<H: HandleMessages> fmt::Debug for RpcReader<H> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RpcReader").field("guid", &self.guid()).finish_non_exhaustive()
     }
 }
 
@@ -104,13 +116,13 @@ impl Taken for Content {
 }
 
 /// Hands messages to the handler.
-struct Messages {
+struct Messages<H> {
     ignores_tagged: bool,
     writers: KnownWriters,
-    handler: MessageHandler,
+    handler: H,
 }
 
-impl Receiver for Messages {
+impl<H: HandleMessages> Receiver for Messages<H> {
     type Sample = Content;
 
     fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Content>) {
@@ -118,12 +130,12 @@ impl Receiver for Messages {
         // Another proxy's client or server: what it has to say comes through SGC.
         if !(writer.tagged && self.ignores_tagged) {
             let Content { origin, payload } = arrival.sample;
-            (self.handler)(Message { writer: writer.guid, origin, payload });
+            self.handler.handle(Message { writer: writer.guid, origin, payload });
         }
     }
 
     fn overrun(&mut self, samples: u64) {
-        tracing::warn!(samples, "messages of a service came faster than they were passed on and are lost");
+        self.handler.overrun(samples);
     }
 }
 

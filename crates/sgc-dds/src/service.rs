@@ -11,6 +11,7 @@
 //! Cyclone's conditions.
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, Ordering::Relaxed};
 use std::time::{Duration, Instant};
@@ -21,13 +22,13 @@ use cyclors::{
     dds_get_matched_publication_data, dds_get_matched_publications, dds_get_matched_subscription_data,
     dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask, dds_take_status,
 };
-use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, ServiceSpec};
+use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, ServiceSpec, UnhandledCall};
 
 use crate::entity::check;
 use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
 use crate::network::Participant;
 use crate::payload::{Frame, HEADER_BYTES, PREFIX_BYTES, is_little_endian};
-use crate::rpc::{Message, RpcReader, RpcWriter};
+use crate::rpc::{HandleMessages, Message, RpcReader, RpcWriter};
 use crate::wait::{READERS_MATCHED, WRITERS_MATCHED, wait_for_status};
 use crate::{qos, user_data};
 
@@ -43,7 +44,7 @@ const ID_BYTES: usize = 8;
 /// A client; dropping it ends the thread that reads its replies.
 #[derive(Debug)]
 pub struct CycloneClient {
-    ends: Ends,
+    ends: Ends<Replies>,
     id: u64,
     mixed: AtomicBool,
     /// Number of the last request in the mapping of Cyclone.
@@ -53,16 +54,71 @@ pub struct CycloneClient {
 /// A server; dropping it ends the thread that reads requests.
 #[derive(Debug)]
 pub struct CycloneServer {
-    ends: Ends,
+    ends: Ends<Requests>,
+}
+
+/// Hands replies to a client's handler.
+struct Replies {
+    /// The client's reader, and its writer.
+    reading: [u8; 16],
+    writing: [u8; 16],
+    /// The client's id in the mapping of Cyclone, and the number of its last request there.
+    id: u64,
+    last_in_body: Arc<AtomicI64>,
+    handler: RequestHandler,
+}
+
+impl HandleMessages for Replies {
+    fn handle(&mut self, message: Message) {
+        let Some((client, number, payload)) = reply_of(message) else {
+            return self.handler.unhandled(UnhandledCall::Unreadable, 1);
+        };
+        // Replies to all clients are on one topic.
+        let is_ours = if client == self.writing {
+            // Who names the writer may have been matched just after a request was written in the other mapping,
+            // and have answered what nobody asked.
+            number > self.last_in_body.load(Relaxed)
+        } else {
+            client == self.reading || client == id_bytes(self.id)
+        };
+        if is_ours {
+            self.handler.handle(RequestId { client: id_bytes(self.id), number, asker: None }, payload);
+        }
+    }
+
+    fn overrun(&mut self, messages: u64) {
+        self.handler.unhandled(UnhandledCall::Overrun, messages);
+    }
+}
+
+/// Hands requests to a server's handler.
+struct Requests {
+    handler: RequestHandler,
+}
+
+impl HandleMessages for Requests {
+    fn handle(&mut self, message: Message) {
+        let asker = Some(message.writer);
+        match request_of(message) {
+            Some((client, number, payload)) => {
+                self.handler.handle(RequestId { client, number, asker }, payload)
+            }
+            None => self.handler.unhandled(UnhandledCall::Unreadable, 1),
+        }
+    }
+
+    fn overrun(&mut self, messages: u64) {
+        self.handler.unhandled(UnhandledCall::Overrun, messages);
+    }
 }
 
 impl CycloneClient {
     pub(crate) fn new(
         participant: &Arc<Participant>,
         spec: &ServiceSpec,
-        mut handler: RequestHandler,
+        handler: RequestHandler,
     ) -> Result<Self, String> {
-        let user_data = Ends::user_data("clientid", participant);
+        let user_data = pair_mark("clientid", participant);
         let writer = RpcWriter::new(participant, &spec.request, &user_data)?;
         let mut id: dds_instance_handle_t = 0;
         // SAFETY: the handle is checked by Cyclone, and `id` is a valid place for the result.
@@ -70,25 +126,7 @@ impl CycloneClient {
         let mut reader = RpcReader::new(participant, &spec.reply, &user_data)?;
         let (reading, writing) = (reader.guid().0, writer.entity().guid()?.0);
         let last_in_body = Arc::new(AtomicI64::new(0));
-        let in_body_until = Arc::clone(&last_in_body);
-        let on_message = Box::new(move |message: Message| {
-            let Some((client, number, payload)) = reply_of(message) else {
-                tracing::debug!("a reply that says of no request is dropped");
-                return;
-            };
-            // Replies to all clients are on one topic.
-            let is_ours = if client == writing {
-                // Who names the writer may have been matched just after a request was written in the other mapping,
-                // and have answered what nobody asked.
-                number > in_body_until.load(Relaxed)
-            } else {
-                client == reading || client == id_bytes(id)
-            };
-            if is_ours {
-                handler(RequestId { client: id_bytes(id), number, asker: None }, payload);
-            }
-        });
-        reader.start(on_message)?;
+        reader.start(Replies { reading, writing, id, last_in_body: Arc::clone(&last_in_body), handler })?;
         let (ends, mixed) = (Ends::new(participant, reader, writer)?, AtomicBool::new(false));
         Ok(Self { ends, id, mixed, last_in_body })
     }
@@ -98,7 +136,7 @@ impl CycloneClient {
     /// Cyclone's servers leave out.
     fn mapping(&self) -> Mapping {
         let readers = self.ends.readers();
-        let inline = readers.iter().filter(|r| Mapping::of([r[0], r[1]]) == Mapping::InlineQos).count();
+        let inline = readers.iter().filter(|r| Mapping::of(r.vendor()) == Mapping::InlineQos).count();
         let is_mixed = inline > 0 && inline < readers.len();
         if self.mixed.swap(is_mixed, Relaxed) != is_mixed && is_mixed {
             tracing::warn!(
@@ -126,8 +164,9 @@ impl RosClient for CycloneClient {
         Ok(RequestId { client: id_bytes(self.id), number, asker: None })
     }
 
-    fn matched_servers(&self) -> u32 {
-        self.ends.readers().intersection(&self.ends.writers()).count() as u32
+    fn servers(&self) -> BTreeSet<Guid> {
+        let writers = prefixes(self.ends.writers());
+        self.ends.readers().into_iter().filter(|reader| writers.contains(&reader.prefix())).collect()
     }
 
     fn guids(&self) -> [Guid; 2] {
@@ -139,20 +178,13 @@ impl CycloneServer {
     pub(crate) fn new(
         participant: &Arc<Participant>,
         spec: &ServiceSpec,
-        mut handler: RequestHandler,
+        handler: RequestHandler,
     ) -> Result<Self, String> {
-        let user_data = Ends::user_data("serviceid", participant);
+        let user_data = pair_mark("serviceid", participant);
         // The writer first: who sees a server's reader may ask at once.
         let writer = RpcWriter::new(participant, &spec.reply, &user_data)?;
         let mut reader = RpcReader::new(participant, &spec.request, &user_data)?;
-        let on_message = Box::new(move |message: Message| {
-            let asker = Some(message.writer);
-            match request_of(message) {
-                Some((client, number, payload)) => handler(RequestId { client, number, asker }, payload),
-                None => tracing::debug!("a request without its header is dropped"),
-            }
-        });
-        reader.start(on_message)?;
+        reader.start(Requests { handler })?;
         Ok(Self { ends: Ends::new(participant, reader, writer)? })
     }
 }
@@ -165,7 +197,7 @@ impl RosServer for CycloneServer {
             None => (Some(SampleIdentity { guid: Guid(request.client), number }), Frame::new(&payload)?),
         };
         self.ends.wait(|| {
-            let readers = self.ends.readers();
+            let readers = prefixes(self.ends.readers());
             request.asker.map_or(!readers.is_empty(), |asker| readers.contains(&asker.prefix()))
         })?;
         self.ends.writer.write(related, |_| Ok(frame)).map(drop)
@@ -177,32 +209,28 @@ impl RosServer for CycloneServer {
 }
 
 /// Both endpoints of a client or a server.
-#[derive(Debug)]
-struct Ends {
-    reader: RpcReader,
+struct Ends<H: HandleMessages> {
+    reader: RpcReader<H>,
     writer: RpcWriter,
     /// Of both, in this order.
     guids: [Guid; 2],
     participant: Arc<Participant>,
 }
 
-impl Ends {
-    fn new(participant: &Arc<Participant>, reader: RpcReader, writer: RpcWriter) -> Result<Self, String> {
+impl<H: HandleMessages> fmt::Debug for Ends<H> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Ends").field("guids", &self.guids).finish_non_exhaustive()
+    }
+}
+
+impl<H: HandleMessages> Ends<H> {
+    fn new(participant: &Arc<Participant>, reader: RpcReader<H>, writer: RpcWriter) -> Result<Self, String> {
         // SAFETY: takes numbers only; the handles are checked by Cyclone.
         check(unsafe { dds_set_status_mask(writer.entity().handle(), READERS_MATCHED) })?;
         // SAFETY: as above.
         check(unsafe { dds_set_status_mask(reader.handle(), WRITERS_MATCHED) })?;
         let guids = [reader.guid(), writer.entity().guid()?];
         Ok(Self { reader, writer, guids, participant: Arc::clone(participant) })
-    }
-
-    /// By this rmw_cyclonedds knows which two endpoints are one client or one server, and waits for both.
-    fn user_data(key: &str, participant: &Participant) -> String {
-        static NUMBER: AtomicU32 = AtomicU32::new(0);
-        let prefix = participant.guid().prefix();
-        let number = NUMBER.fetch_add(1, Relaxed).to_be_bytes();
-        let hex: Vec<_> = prefix.iter().chain(&number).map(|b| format!("{b:02x}")).collect();
-        format!("{key}={};", hex.join("."))
     }
 
     /// Waits until something is so that changes with what is matched.
@@ -232,23 +260,18 @@ impl Ends {
         }
     }
 
-    /// Participants that read what is written here.
-    fn readers(&self) -> BTreeSet<[u8; 12]> {
+    /// Those that read what is written here.
+    fn readers(&self) -> BTreeSet<Guid> {
         let writer = self.writer.entity().handle();
         self.matched(writer, dds_get_matched_subscriptions, dds_get_matched_subscription_data)
     }
 
-    /// Participants that write what is read here.
-    fn writers(&self) -> BTreeSet<[u8; 12]> {
+    /// Those that write what is read here.
+    fn writers(&self) -> BTreeSet<Guid> {
         self.matched(self.reader.handle(), dds_get_matched_publications, dds_get_matched_publication_data)
     }
 
-    fn matched(
-        &self,
-        handle: dds_entity_t,
-        list: ListMatches,
-        describe: DescribeMatch,
-    ) -> BTreeSet<[u8; 12]> {
+    fn matched(&self, handle: dds_entity_t, list: ListMatches, describe: DescribeMatch) -> BTreeSet<Guid> {
         let mut matches: [dds_instance_handle_t; MATCHES_MAX] = [0; MATCHES_MAX];
         // SAFETY: the handle is checked by Cyclone, and there is room for as many as is said.
         let found = unsafe { list(handle, matches.as_mut_ptr(), MATCHES_MAX) };
@@ -265,10 +288,25 @@ impl Ends {
             };
             // SAFETY: not null, not used any more, freed once.
             unsafe { dds_builtintopic_free_endpoint(data) };
-            (!(tagged && self.participant.ignores_tagged())).then(|| guid.prefix())
+            (!(tagged && self.participant.ignores_tagged())).then_some(guid)
         });
         endpoints.collect()
     }
+}
+
+/// The part of an endpoint's USER_DATA by which rmw_cyclonedds knows which two endpoints are one client or one server, and waits for
+/// both.
+fn pair_mark(key: &str, participant: &Participant) -> String {
+    static NUMBER: AtomicU32 = AtomicU32::new(0);
+    let prefix = participant.guid().prefix();
+    let number = NUMBER.fetch_add(1, Relaxed).to_be_bytes();
+    let hex: Vec<_> = prefix.iter().chain(&number).map(|b| format!("{b:02x}")).collect();
+    format!("{key}={};", hex.join("."))
+}
+
+/// The participants of endpoints.
+fn prefixes(endpoints: BTreeSet<Guid>) -> BTreeSet<[u8; 12]> {
+    endpoints.iter().map(Guid::prefix).collect()
 }
 
 type ListMatches = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;

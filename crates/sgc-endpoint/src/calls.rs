@@ -3,11 +3,14 @@
 //! Messages carry the call's number at the source that asks. Whatever breaks between the two, a call is published
 //! again until it is answered, and is carried out once, since the answerer knows it again: what is under way is not
 //! begun twice, what is done is answered from memory, and of what it remembers no more it says so. Nothing here ends
-//! a call by time: it lives as long as its client.
+//! a call by time: it lives as long as its client. A call that ends without an answer is a [`LostCall`], which the driver
+//! takes, counts and explains.
 //!
-//! Sending, sealing and the local network are the driver's. `L` is how that one tells local calls apart.
+//! Sending, sealing and the local network are the driver's. `L` is how that one tells local calls apart, `S` how it tells
+//! local servers apart.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -59,10 +62,106 @@ pub struct CallStats {
     pub open: u64,
     /// Those that were answered.
     pub answered: u64,
-    /// Calls that were not taken: too many at once.
-    pub refused: u64,
-    /// Those that will not be answered: their client, their server or what was remembered of them is gone.
-    pub lost: u64,
+}
+
+/// The reason for which a call is not answered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum CallLoss {
+    /// Too many calls were open where it was made ([`CallRefused`]): it was not taken.
+    Refused,
+    /// Too many calls of its node were under way at the owner: it was not taken.
+    OwnerFull,
+    /// The servers that were asked are gone.
+    ServerGone,
+    /// The owner's node started anew and remembers nothing: the call may have been carried out.
+    OwnerRestarted,
+    /// The service ended while the call waited: its servers stayed away, its owner left, or a rule changed.
+    Withdrawn,
+    /// Its client is gone.
+    ClientGone,
+    /// The answer came, and was asked for when the owner kept it no more.
+    Forgotten,
+    /// The request or the answer is larger than any message.
+    TooLarge,
+    /// The answer came, and the client was not there to hear it.
+    Unheard,
+    /// Messages of the local network came faster than they were taken: requests, or answers.
+    Overrun,
+    /// A message of the local network does not say to which call it belongs.
+    Unreadable,
+    /// The owner did not say why.
+    Unsaid,
+}
+
+impl CallLoss {
+    /// All of them.
+    pub const ALL: [Self; 12] = [
+        Self::Refused,
+        Self::OwnerFull,
+        Self::ServerGone,
+        Self::OwnerRestarted,
+        Self::Withdrawn,
+        Self::ClientGone,
+        Self::Forgotten,
+        Self::TooLarge,
+        Self::Unheard,
+        Self::Overrun,
+        Self::Unreadable,
+        Self::Unsaid,
+    ];
+
+    /// Returns the counter's name.
+    pub const fn key(self) -> &'static str {
+        match self {
+            Self::Refused => "call_refused",
+            Self::OwnerFull => "call_owner_full",
+            Self::ServerGone => "call_server_gone",
+            Self::OwnerRestarted => "call_owner_restarted",
+            Self::Withdrawn => "call_withdrawn",
+            Self::ClientGone => "call_client_gone",
+            Self::Forgotten => "call_forgotten",
+            Self::TooLarge => "call_too_large",
+            Self::Unheard => "call_unheard",
+            Self::Overrun => "overrun",
+            Self::Unreadable => "call_unreadable",
+            Self::Unsaid => "call_unsaid",
+        }
+    }
+
+    /// Returns the payload of a `gone` with this reason.
+    fn payload(self) -> Bytes {
+        Bytes::from_static(match self {
+            Self::ServerGone => &[1],
+            Self::Forgotten => &[2],
+            Self::OwnerFull => &[3],
+            Self::TooLarge => &[4],
+            Self::ClientGone => &[5],
+            Self::Withdrawn => &[6],
+            _ => &[],
+        })
+    }
+
+    /// Returns the reason that a `gone` names; bytes behind it are of later versions.
+    fn from_payload(payload: &[u8]) -> Self {
+        match payload.first() {
+            Some(1) => Self::ServerGone,
+            Some(2) => Self::Forgotten,
+            Some(3) => Self::OwnerFull,
+            Some(4) => Self::TooLarge,
+            Some(5) => Self::ClientGone,
+            Some(6) => Self::Withdrawn,
+            _ => Self::Unsaid,
+        }
+    }
+}
+
+/// A call that is not answered, and whose it was: a local call at the node that called, a source at the owner.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LostCall<W> {
+    /// The reason.
+    pub loss: CallLoss,
+    /// The caller.
+    pub of: W,
 }
 
 /// Why a local call is not taken.
@@ -123,6 +222,8 @@ pub struct Caller<L> {
     /// Not later than the first question that is due.
     ask_at: Option<Instant>,
     stats: CallStats,
+    /// Those that the driver has not taken yet.
+    lost: Vec<LostCall<L>>,
 }
 
 impl<L: Copy> Caller<L> {
@@ -136,6 +237,7 @@ impl<L: Copy> Caller<L> {
             granted: false,
             ask_at: None,
             stats: CallStats::default(),
+            lost: Vec::new(),
         }
     }
 
@@ -160,7 +262,7 @@ impl<L: Copy> Caller<L> {
             None
         };
         if let Some(why) = refused {
-            self.stats.refused += 1;
+            self.lost.push(LostCall { loss: CallLoss::Refused, of: local });
             return Err(why);
         }
         let number = self.next;
@@ -180,7 +282,7 @@ impl<L: Copy> Caller<L> {
         if anew {
             let published = self.open.iter().filter(|(_, open)| open.published).map(|(number, _)| *number);
             for number in published.collect::<Vec<_>>() {
-                self.lose(number);
+                self.lose(number, CallLoss::OwnerRestarted);
             }
         }
         self.granted = true;
@@ -198,8 +300,8 @@ impl<L: Copy> Caller<L> {
         self.granted = false;
     }
 
-    /// Takes what the owner says of a call.
-    pub fn handle(&mut self, kind: MessageKind, number: u64) -> Outcome<L> {
+    /// Takes what the owner says of a call, with the payload of the message.
+    pub fn handle(&mut self, kind: MessageKind, number: u64, payload: &[u8]) -> Outcome<L> {
         match kind {
             MessageKind::Reply => match self.remove(number) {
                 Some(open) => {
@@ -213,18 +315,43 @@ impl<L: Copy> Caller<L> {
                 None => Outcome::Nothing,
             },
             MessageKind::Gone => {
-                self.lose(number);
+                self.lose(number, CallLoss::from_payload(payload));
                 Outcome::Nothing
             }
             _ => Outcome::Nothing,
         }
     }
 
+    /// An answer of [`Outcome::Answers`] could not be given to its client.
+    pub fn unheard(&mut self, local: L) {
+        self.stats.answered -= 1;
+        self.lost.push(LostCall { loss: CallLoss::Unheard, of: local });
+    }
+
     /// A local client is gone: its calls are over. Their numbers, for the owner to forget them too.
     pub fn client_gone(&mut self, is_of: impl Fn(&L) -> bool) -> Vec<u64> {
         let gone: Vec<_> = self.open.iter().filter(|(_, o)| is_of(&o.local)).map(|(n, _)| *n).collect();
-        gone.iter().for_each(|number| self.lose(*number));
+        gone.iter().for_each(|number| self.lose(*number, CallLoss::ClientGone));
         gone
+    }
+
+    /// The service ended: nothing that is open will be answered.
+    pub fn withdraw(&mut self) {
+        for number in self.open.keys().copied().collect::<Vec<_>>() {
+            self.lose(number, CallLoss::Withdrawn);
+        }
+    }
+
+    /// Gives up a call that is open.
+    pub fn lose(&mut self, number: u64, loss: CallLoss) {
+        if let Some(open) = self.remove(number) {
+            self.lost.push(LostCall { loss, of: open.local });
+        }
+    }
+
+    /// Takes the calls that were lost since the last time.
+    pub fn take_lost(&mut self) -> Vec<LostCall<L>> {
+        std::mem::take(&mut self.lost)
     }
 
     /// The calls that have been quiet for so long that it is to be asked what became of them.
@@ -252,10 +379,6 @@ impl<L: Copy> Caller<L> {
         CallStats { open: self.open.len() as u64, ..self.stats }
     }
 
-    fn lose(&mut self, number: u64) {
-        self.stats.lost += u64::from(self.remove(number).is_some());
-    }
-
     fn remove(&mut self, number: u64) -> Option<Open<L>> {
         let open = self.open.remove(&number)?;
         self.bytes -= open.payload.len();
@@ -274,8 +397,8 @@ enum Known<L> {
     /// The local server was asked under this id.
     Asked(L),
     Answered(Bytes),
-    /// Nothing more is known of it than that it was carried out, or may have been.
-    Over,
+    /// Nothing more is known of it than that it was carried out, or may have been, and why its answer is not here.
+    Over(CallLoss),
 }
 
 impl<L> Known<L> {
@@ -304,30 +427,45 @@ struct Remembered<L> {
     heard: u64,
 }
 
+/// A call that local servers were asked.
+#[derive(Debug)]
+struct Asked<S> {
+    source: SourceId,
+    number: u64,
+    /// Those of them that are still there; one set for all calls that have the same.
+    servers: Arc<BTreeSet<S>>,
+}
+
 /// The calls that others make of one local service.
 #[derive(Debug)]
-pub struct Answerer<L> {
+pub struct Answerer<L, S> {
     limits: CallLimits,
     sources: BTreeMap<SourceId, Remembered<L>>,
-    local: BTreeMap<L, (SourceId, u64)>,
+    local: BTreeMap<L, Asked<S>>,
+    /// The servers that were asked last.
+    servers: Arc<BTreeSet<S>>,
     /// Answers, oldest first, some of which are here no more.
     answers: VecDeque<(SourceId, u64)>,
     answer_bytes: usize,
     heard: u64,
     stats: CallStats,
+    /// Those that the driver has not taken yet.
+    lost: Vec<LostCall<SourceId>>,
 }
 
-impl<L: Copy + Ord> Answerer<L> {
+impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     /// No calls yet.
     pub fn new(limits: CallLimits) -> Self {
         Self {
             limits,
             sources: BTreeMap::new(),
             local: BTreeMap::new(),
+            servers: Arc::default(),
             answers: VecDeque::new(),
             answer_bytes: 0,
             heard: 0,
             stats: CallStats::default(),
+            lost: Vec::new(),
         }
     }
 
@@ -344,11 +482,14 @@ impl<L: Copy + Ord> Answerer<L> {
         }
     }
 
-    /// The local server was asked under this id. An answer that came before is given to [`Self::answered`] after this.
-    pub fn asked(&mut self, source: SourceId, number: u64, local: L) {
+    /// These local servers were asked under this id. An answer that came before is given to [`Self::answered`] after this.
+    pub fn asked(&mut self, source: SourceId, number: u64, local: L, servers: BTreeSet<S>) {
         if let Some(known) = self.known(&source, number).filter(|known| matches!(known, Known::Asking)) {
             *known = Known::Asked(local);
-            self.local.insert(local, (source, number));
+            if *self.servers != servers {
+                self.servers = Arc::new(servers);
+            }
+            self.local.insert(local, Asked { source, number, servers: self.servers.clone() });
         }
     }
 
@@ -363,7 +504,7 @@ impl<L: Copy + Ord> Answerer<L> {
 
     /// The local server answered: whom to tell, and of which call.
     pub fn answered(&mut self, local: &L, payload: &Bytes) -> Option<(SourceId, u64)> {
-        let (source, number) = self.local.remove(local)?;
+        let Asked { source, number, .. } = self.local.remove(local)?;
         self.stats.answered += 1;
         if let Some(known) = self.known(&source, number) {
             *known = Known::Answered(payload.clone());
@@ -379,14 +520,65 @@ impl<L: Copy + Ord> Answerer<L> {
         Some((source, number))
     }
 
+    /// A local server is gone: a call that was asked of no other will not be answered. Returns whom to tell, and of which
+    /// calls, with the payload.
+    pub fn server_gone(&mut self, server: &S) -> Vec<(SourceId, u64, Bytes)> {
+        let mut last: Option<[Arc<BTreeSet<S>>; 2]> = None;
+        for asked in self.local.values_mut().filter(|asked| asked.servers.contains(server)) {
+            let left = match &last {
+                Some([before, left]) if Arc::ptr_eq(before, &asked.servers) => left.clone(),
+                _ => Arc::new(asked.servers.iter().filter(|other| *other != server).cloned().collect()),
+            };
+            last = Some([std::mem::replace(&mut asked.servers, left.clone()), left]);
+        }
+        self.lose_unanswerable()
+    }
+
+    /// Gives up calls of which no server is there that was asked. Returns what [`Self::server_gone`] does.
+    pub fn lose_unanswerable(&mut self) -> Vec<(SourceId, u64, Bytes)> {
+        self.lose_asked(CallLoss::ServerGone, |asked| asked.servers.is_empty())
+    }
+
     /// All local servers are gone: nothing that was asked of them will be answered.
-    pub fn servers_gone(&mut self) {
-        for (source, number) in std::mem::take(&mut self.local).into_values() {
-            self.stats.lost += 1;
-            if let Some(known) = self.known(&source, number) {
-                *known = Known::Over;
+    pub fn servers_gone(&mut self) -> Vec<(SourceId, u64, Bytes)> {
+        self.lose_asked(CallLoss::ServerGone, |_| true)
+    }
+
+    /// The service ended: nothing that was asked will be answered.
+    pub fn withdraw(&mut self) {
+        self.lose_asked(CallLoss::Withdrawn, |_| true);
+    }
+
+    /// The answer of a call is larger than any message. Returns the payload of the `gone` to tell.
+    pub fn too_large(&mut self, source: SourceId, number: u64) -> Bytes {
+        self.drop_answer(&source, number);
+        if let Some(known) = self.known(&source, number) {
+            *known = Known::Over(CallLoss::TooLarge);
+            self.stats.answered -= 1;
+            self.lost.push(LostCall { loss: CallLoss::TooLarge, of: source });
+        }
+        CallLoss::TooLarge.payload()
+    }
+
+    /// Takes the calls that were lost since the last time.
+    pub fn take_lost(&mut self) -> Vec<LostCall<SourceId>> {
+        std::mem::take(&mut self.lost)
+    }
+
+    fn lose_asked(
+        &mut self,
+        loss: CallLoss,
+        is_lost: impl Fn(&Asked<S>) -> bool,
+    ) -> Vec<(SourceId, u64, Bytes)> {
+        let lost: Vec<_> = self.local.iter().filter(|(_, asked)| is_lost(asked)).map(|(id, _)| *id).collect();
+        let lost: Vec<_> = lost.iter().filter_map(|id| self.local.remove(id)).collect();
+        for asked in &lost {
+            self.lost.push(LostCall { loss, of: asked.source });
+            if let Some(known) = self.known(&asked.source, asked.number) {
+                *known = Known::Over(loss);
             }
         }
+        lost.into_iter().map(|asked| (asked.source, asked.number, loss.payload())).collect()
     }
 
     /// What became of them.
@@ -409,14 +601,14 @@ impl<L: Copy + Ord> Answerer<L> {
         match remembered.calls.get(&number) {
             Some(Known::Asking | Known::Asked(_)) => return Answering::Nothing,
             Some(Known::Answered(payload)) => return Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over) => return Answering::Tell(MessageKind::Gone, Bytes::new()),
-            None if number < remembered.from => return Answering::Tell(MessageKind::Gone, Bytes::new()),
+            Some(Known::Over(why)) => return gone(*why),
+            None if number < remembered.from => return gone(CallLoss::Forgotten),
             None => {}
         }
         if remembered.calls.len() >= max {
             let Some(oldest) = remembered.calls.iter().find(|(_, k)| !k.is_open()).map(|(n, _)| *n) else {
-                self.stats.refused += 1;
-                return Answering::Tell(MessageKind::Gone, Bytes::new());
+                self.lost.push(LostCall { loss: CallLoss::OwnerFull, of: source });
+                return gone(CallLoss::OwnerFull);
             };
             self.drop_answer(&source, oldest);
             if let Some(remembered) = self.sources.get_mut(&source) {
@@ -436,10 +628,8 @@ impl<L: Copy + Ord> Answerer<L> {
         match remembered.and_then(|r| r.calls.get(&number)) {
             Some(Known::Asking | Known::Asked(_)) => Answering::Nothing,
             Some(Known::Answered(payload)) => Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over) => Answering::Tell(MessageKind::Gone, Bytes::new()),
-            None if remembered.is_some_and(|r| number < r.from) => {
-                Answering::Tell(MessageKind::Gone, Bytes::new())
-            }
+            Some(Known::Over(why)) => gone(*why),
+            None if remembered.is_some_and(|r| number < r.from) => gone(CallLoss::Forgotten),
             None => Answering::Tell(MessageKind::Unknown, Bytes::new()),
         }
     }
@@ -448,10 +638,13 @@ impl<L: Copy + Ord> Answerer<L> {
     fn forget(&mut self, source: SourceId, number: u64) {
         self.drop_answer(&source, number);
         let Some(known) = self.known(&source, number) else { return };
-        if let Known::Asked(local) = std::mem::replace(known, Known::Over) {
-            self.local.remove(&local);
-            self.stats.lost += 1;
+        if !known.is_open() {
+            return;
         }
+        if let Known::Asked(local) = std::mem::replace(known, Known::Over(CallLoss::ClientGone)) {
+            self.local.remove(&local);
+        }
+        self.lost.push(LostCall { loss: CallLoss::ClientGone, of: source });
     }
 
     fn known(&mut self, source: &SourceId, number: u64) -> Option<&mut Known<L>> {
@@ -463,7 +656,7 @@ impl<L: Copy + Ord> Answerer<L> {
             && let Known::Answered(payload) = known
         {
             let bytes = payload.len();
-            *known = Known::Over;
+            *known = Known::Over(CallLoss::Forgotten);
             self.answer_bytes -= bytes;
         }
         // What is not there any more must not gather.
@@ -483,13 +676,18 @@ impl<L: Copy + Ord> Answerer<L> {
         if self.sources.contains_key(source) || self.sources.len() < self.limits.sources_max {
             return;
         }
-        let busy: BTreeSet<_> = self.local.values().map(|(source, _)| *source).collect();
+        let busy: BTreeSet<_> = self.local.values().map(|asked| asked.source).collect();
         let idle = self.sources.iter().filter(|(id, _)| !busy.contains(*id));
         let Some(gone) = idle.min_by_key(|(_, r)| r.heard).map(|(id, _)| *id) else { return };
         let numbers: Vec<_> = self.sources[&gone].calls.keys().copied().collect();
         numbers.into_iter().for_each(|number| self.drop_answer(&gone, number));
         self.sources.remove(&gone);
     }
+}
+
+/// The answer to who asks for a call that will not be answered.
+fn gone(why: CallLoss) -> Answering {
+    Answering::Tell(MessageKind::Gone, why.payload())
 }
 
 #[cfg(test)]
@@ -515,6 +713,19 @@ mod tests {
         Answering::Tell(kind, payload(text))
     }
 
+    fn lost<W>(loss: CallLoss, of: W) -> LostCall<W> {
+        LostCall { loss, of }
+    }
+
+    fn answerer() -> Answerer<u32, u8> {
+        Answerer::new(CallLimits::default())
+    }
+
+    /// The only server.
+    fn one() -> BTreeSet<u8> {
+        BTreeSet::from([0])
+    }
+
     #[test]
     fn a_call_waits_for_a_way_and_goes_again_on_another() {
         let (mut caller, now) = caller();
@@ -522,16 +733,17 @@ mod tests {
         assert_eq!(caller.deadline(), None, "nobody could be asked");
         assert_eq!(caller.granted(now, true), [(1, payload("a"))]);
         assert_eq!(caller.call(now, [1; 16], 11, payload("b")), Ok(Some(2)));
-        assert_eq!(caller.handle(MessageKind::Reply, 2), Outcome::Answers(11));
-        assert_eq!(caller.handle(MessageKind::Reply, 2), Outcome::Nothing);
+        assert_eq!(caller.handle(MessageKind::Reply, 2, b""), Outcome::Answers(11));
+        assert_eq!(caller.handle(MessageKind::Reply, 2, b""), Outcome::Nothing);
         caller.lost();
         assert_eq!(caller.granted(now, false), [(1, payload("a"))]);
         // Another run of the owner remembers nothing: what may have been carried out is not asked again.
         caller.lost();
         assert_eq!(caller.call(now, [1; 16], 12, payload("c")), Ok(None));
         assert_eq!(caller.granted(now, true), [(3, payload("c"))]);
-        let stats = CallStats { calls: 3, open: 1, answered: 1, refused: 0, lost: 1 };
-        assert_eq!(caller.stats(), stats);
+        assert_eq!(caller.stats(), CallStats { calls: 3, open: 1, answered: 1 });
+        assert_eq!(caller.take_lost(), [lost(CallLoss::OwnerRestarted, 10)]);
+        assert_eq!(caller.take_lost(), []);
     }
 
     #[test]
@@ -546,7 +758,10 @@ mod tests {
         assert_eq!(caller.client_gone(|local| *local == 0), [1]);
         let large = Bytes::from(vec![0; CallLimits::default().open_bytes_max]);
         assert!(matches!(caller.call(now, [3; 16], 5, large), Err(CallRefused::Bytes { .. })));
-        assert_eq!(caller.stats(), CallStats { calls: 3, open: 2, answered: 0, refused: 3, lost: 1 });
+        assert_eq!(caller.stats(), CallStats { calls: 3, open: 2, answered: 0 });
+        let [refused, gone] = [CallLoss::Refused, CallLoss::ClientGone];
+        let all = [(refused, 2), (refused, 4), (gone, 0), (refused, 5)].map(|(loss, of)| lost(loss, of));
+        assert_eq!(caller.take_lost(), all);
     }
 
     #[test]
@@ -564,22 +779,22 @@ mod tests {
             at = due;
         }
         assert_eq!(waits, [5, 10, 20, 40, 80, 160, 300, 300, 300, 300]);
-        assert_eq!(caller.handle(MessageKind::Unknown, 1), Outcome::Again(payload("a")));
-        assert_eq!(caller.handle(MessageKind::Reply, 1), Outcome::Answers(10));
+        assert_eq!(caller.handle(MessageKind::Unknown, 1, b""), Outcome::Again(payload("a")));
+        assert_eq!(caller.handle(MessageKind::Reply, 1, b""), Outcome::Answers(10));
         assert_eq!(caller.deadline(), None);
-        assert_eq!(caller.handle(MessageKind::Unknown, 1), Outcome::Nothing);
+        assert_eq!(caller.handle(MessageKind::Unknown, 1, b""), Outcome::Nothing);
     }
 
     #[test]
     fn what_is_asked_twice_is_carried_out_once() {
-        let mut answerer = Answerer::<u32>::new(CallLimits::default());
+        let mut answerer = answerer();
         let request = MessageKind::Request;
         assert_eq!(answerer.handle(A, request, 1), Answering::Ask);
         assert_eq!(answerer.handle(A, request, 1), Answering::Nothing);
-        answerer.asked(A, 1, 70);
+        answerer.asked(A, 1, 70, one());
         // The same number of another source is another call.
         assert_eq!(answerer.handle(B, request, 1), Answering::Ask);
-        answerer.asked(B, 1, 71);
+        answerer.asked(B, 1, 71, one());
         assert_eq!(answerer.handle(A, MessageKind::Ask, 1), Answering::Nothing);
         assert_eq!(answerer.answered(&70, &payload("yes")), Some((A, 1)));
         assert_eq!(answerer.answered(&70, &payload("yes")), None);
@@ -589,28 +804,132 @@ mod tests {
         assert_eq!(answerer.handle(A, MessageKind::Ask, 2), tell(MessageKind::Unknown, ""));
         answerer.handle(A, MessageKind::Forget, 1);
         for kind in [request, MessageKind::Ask] {
-            assert_eq!(answerer.handle(A, kind, 1), tell(MessageKind::Gone, ""));
+            assert_eq!(answerer.handle(A, kind, 1), gone(CallLoss::Forgotten));
         }
-        assert_eq!(answerer.stats(), CallStats { calls: 2, open: 1, answered: 1, refused: 0, lost: 0 });
+        assert_eq!(answerer.stats(), CallStats { calls: 2, open: 1, answered: 1 });
+        assert_eq!(answerer.take_lost(), []);
     }
 
     #[test]
     fn what_never_reached_a_server_may_be_asked_again_and_what_died_with_it_may_not() {
-        let mut answerer = Answerer::<u32>::new(CallLimits::default());
+        let mut answerer = answerer();
         assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
         answerer.not_asked(A, 1);
         assert_eq!(answerer.handle(A, MessageKind::Ask, 1), tell(MessageKind::Unknown, ""));
         assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
-        answerer.asked(A, 1, 5);
-        answerer.servers_gone();
-        assert_eq!(answerer.handle(A, MessageKind::Ask, 1), tell(MessageKind::Gone, ""));
+        answerer.asked(A, 1, 5, one());
+        assert_eq!(answerer.servers_gone(), [(A, 1, CallLoss::ServerGone.payload())]);
+        assert_eq!(answerer.handle(A, MessageKind::Ask, 1), gone(CallLoss::ServerGone));
         assert_eq!(answerer.answered(&5, &payload("late")), None);
         assert_eq!(answerer.open(), 0);
         // A client that is gone while the server is at work.
         assert_eq!(answerer.handle(A, MessageKind::Request, 2), Answering::Ask);
-        answerer.asked(A, 2, 6);
+        answerer.asked(A, 2, 6, one());
         answerer.handle(A, MessageKind::Forget, 2);
         assert_eq!((answerer.open(), answerer.answered(&6, &payload("x"))), (0, None));
+        // And one that is gone before the server is asked.
+        assert_eq!(answerer.handle(A, MessageKind::Request, 3), Answering::Ask);
+        answerer.handle(A, MessageKind::Forget, 3);
+        answerer.asked(A, 3, 7, one());
+        let losses = [CallLoss::ServerGone, CallLoss::ClientGone, CallLoss::ClientGone];
+        assert_eq!(answerer.take_lost(), losses.map(|loss| lost(loss, A)));
+        assert_eq!((answerer.open(), answerer.stats().calls), (0, 3));
+    }
+
+    #[test]
+    fn call_is_lost_with_the_last_server_that_was_asked() {
+        let mut answerer = answerer();
+        let ask = |answerer: &mut Answerer<u32, u8>, number: u64, servers: &[u8]| {
+            assert_eq!(answerer.handle(A, MessageKind::Request, number), Answering::Ask);
+            answerer.asked(A, number, number as u32, servers.iter().copied().collect());
+        };
+        ask(&mut answerer, 1, &[0]);
+        ask(&mut answerer, 2, &[0]);
+        // Another server is started before the end of the first is noticed.
+        ask(&mut answerer, 3, &[0, 1]);
+        assert_eq!(answerer.server_gone(&2), []);
+        let gone = |number| (A, number, CallLoss::ServerGone.payload());
+        assert_eq!(answerer.server_gone(&0), [gone(1), gone(2)]);
+        assert_eq!(answerer.answered(&3, &payload("3")), Some((A, 3)));
+        ask(&mut answerer, 4, &[1, 2]);
+        assert_eq!(answerer.server_gone(&1), []);
+        assert_eq!(answerer.server_gone(&2), [gone(4)]);
+        // Its server went before it could be said who it was.
+        ask(&mut answerer, 5, &[]);
+        assert_eq!(answerer.lose_unanswerable(), [gone(5)]);
+        assert_eq!(answerer.take_lost(), [lost(CallLoss::ServerGone, A); 4]);
+    }
+
+    #[test]
+    fn every_reason_reaches_the_node_that_called() {
+        let (mut caller, now) = caller();
+        caller.granted(now, true);
+        let mut call = |payload: Bytes| {
+            let number = caller.call(now, [1; 16], 7, Bytes::from_static(b"a")).unwrap().unwrap();
+            assert_eq!(caller.handle(MessageKind::Gone, number, &payload), Outcome::Nothing);
+            assert_eq!(caller.handle(MessageKind::Gone, number, &payload), Outcome::Nothing, "once");
+            caller.take_lost()
+        };
+        let said = [
+            CallLoss::ServerGone,
+            CallLoss::Forgotten,
+            CallLoss::OwnerFull,
+            CallLoss::TooLarge,
+            CallLoss::ClientGone,
+            CallLoss::Withdrawn,
+        ];
+        for loss in said {
+            assert_eq!(call(loss.payload()), [lost(loss, 7)]);
+        }
+        // Of an earlier version, and of a later one.
+        for bytes in [&b""[..], &[99], &[0, 1]] {
+            assert_eq!(call(Bytes::from_static(bytes)), [lost(CallLoss::Unsaid, 7)]);
+        }
+        assert_eq!(call(Bytes::from_static(&[1, 99])), [lost(CallLoss::ServerGone, 7)]);
+    }
+
+    #[test]
+    fn calls_of_a_service_that_ends_are_lost_at_both_ends() {
+        let (mut caller, now) = caller();
+        caller.call(now, [1; 16], 10, payload("a")).unwrap();
+        caller.granted(now, true);
+        caller.call(now, [1; 16], 11, payload("b")).unwrap();
+        caller.withdraw();
+        assert_eq!(caller.take_lost(), [10, 11].map(|of| lost(CallLoss::Withdrawn, of)));
+        assert_eq!((caller.stats().open, caller.deadline()), (0, None));
+        let mut answerer = answerer();
+        assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
+        answerer.asked(A, 1, 5, one());
+        answerer.withdraw();
+        assert_eq!(answerer.take_lost(), [lost(CallLoss::Withdrawn, A)]);
+    }
+
+    #[test]
+    fn answer_that_arrives_nowhere_is_no_answer() {
+        let (mut caller, now) = caller();
+        caller.granted(now, true);
+        caller.call(now, [1; 16], 10, payload("a")).unwrap();
+        assert_eq!(caller.handle(MessageKind::Reply, 1, b"b"), Outcome::Answers(10));
+        caller.unheard(10);
+        caller.call(now, [1; 16], 11, payload("a")).unwrap();
+        caller.lose(2, CallLoss::TooLarge);
+        let losses = [lost(CallLoss::Unheard, 10), lost(CallLoss::TooLarge, 11)];
+        assert_eq!(caller.take_lost(), losses);
+        assert_eq!(caller.stats(), CallStats { calls: 2, open: 0, answered: 0 });
+        let mut answerer = answerer();
+        assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
+        answerer.asked(A, 1, 5, one());
+        answerer.answered(&5, &payload("large"));
+        assert_eq!(answerer.too_large(A, 1), CallLoss::TooLarge.payload());
+        assert_eq!(answerer.handle(A, MessageKind::Ask, 1), gone(CallLoss::TooLarge));
+        assert_eq!(answerer.take_lost(), [lost(CallLoss::TooLarge, A)]);
+        assert_eq!((answerer.stats().answered, answerer.answer_bytes), (0, 0));
+    }
+
+    #[test]
+    fn every_loss_has_a_counter_of_its_own() {
+        let keys: BTreeSet<_> = CallLoss::ALL.into_iter().map(CallLoss::key).collect();
+        assert_eq!(keys.len(), CallLoss::ALL.len());
     }
 
     #[test]
@@ -621,28 +940,28 @@ mod tests {
             answer_bytes_max: 10,
             ..CallLimits::default()
         };
-        let mut answerer = Answerer::<u32>::new(limits);
-        let call = |answerer: &mut Answerer<u32>, source, number: u64, text| {
+        let mut answerer = Answerer::<u32, u8>::new(limits);
+        let call = |answerer: &mut Answerer<u32, u8>, source, number: u64, text| {
             assert_eq!(answerer.handle(source, MessageKind::Request, number), Answering::Ask);
-            answerer.asked(source, number, number as u32);
+            answerer.asked(source, number, number as u32, one());
             answerer.answered(&(number as u32), &payload(text)).unwrap();
         };
         call(&mut answerer, A, 1, "123456");
         call(&mut answerer, A, 2, "123456");
         // Two answers are too large together.
-        assert_eq!(answerer.handle(A, MessageKind::Ask, 1), tell(MessageKind::Gone, ""));
+        assert_eq!(answerer.handle(A, MessageKind::Ask, 1), gone(CallLoss::Forgotten));
         assert_eq!(answerer.handle(A, MessageKind::Ask, 2), tell(MessageKind::Reply, "123456"));
         call(&mut answerer, A, 3, "1");
         call(&mut answerer, A, 4, "1");
-        assert_eq!(answerer.handle(A, MessageKind::Request, 1), tell(MessageKind::Gone, ""));
+        assert_eq!(answerer.handle(A, MessageKind::Request, 1), gone(CallLoss::Forgotten));
         assert_eq!(answerer.handle(A, MessageKind::Request, 3), tell(MessageKind::Reply, "1"));
         // All that is remembered is under way.
         for number in 5..8 {
             assert_eq!(answerer.handle(A, MessageKind::Request, number), Answering::Ask);
-            answerer.asked(A, number, number as u32);
+            answerer.asked(A, number, number as u32, one());
         }
-        assert_eq!(answerer.handle(A, MessageKind::Request, 8), tell(MessageKind::Gone, ""));
-        assert_eq!(answerer.stats().refused, 1);
+        assert_eq!(answerer.handle(A, MessageKind::Request, 8), gone(CallLoss::OwnerFull));
+        assert_eq!(answerer.take_lost(), [lost(CallLoss::OwnerFull, A)]);
         // Sources give way to newer ones, unless they wait for something.
         call(&mut answerer, B, 100, "b");
         call(&mut answerer, SourceId([3; 16]), 101, "c");

@@ -28,8 +28,8 @@ mod types;
 
 pub use advert_pace::{ADVERT_INTERVAL, ADVERTS_BURST};
 pub use calls::{
-    ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallRefused, CallStats,
-    Caller, Outcome,
+    ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallLoss, CallRefused,
+    CallStats, Caller, LostCall, Outcome,
 };
 pub use compression::{COMPRESS_BYTES_MIN, CompressionError, Compressor, Decompressor};
 pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};

@@ -255,7 +255,9 @@ impl Serving {
                 let spec = spec(&service, &type_name, &halves);
                 let (send, requests) = mpsc::channel(REQUESTS_MAX);
                 // It waits for room on the server's own thread.
-                let handler = Box::new(move |id, payload| drop(send.blocking_send(Request { id, payload })));
+                let handler = Box::new(move |id: RequestId, payload: Bytes| {
+                    drop(send.blocking_send(Request { id, payload }));
+                });
                 let server: Arc<dyn RosServer> = Arc::from(shared.ros.server(&spec, handler)?);
                 let [reader, writer] = server.guids();
                 shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.request));

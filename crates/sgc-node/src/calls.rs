@@ -4,21 +4,22 @@
 //! network. Whatever may block does so on the thread of one service, and nobody calls the local network under a lock:
 //! it may answer on the thread that asks.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_endpoint::{
-    ANSWER_KEPT_BYTES_MAX, Answerer, Answering, CallLimits, CallStats, Caller, Message, Outcome,
+    ANSWER_KEPT_BYTES_MAX, Answerer, Answering, CallLimits, CallLoss, CallStats, Caller, Message, Outcome,
 };
-use sgc_ros::{Guid, RequestId, RosClient, RosError, RosServer};
+use sgc_ros::{Guid, HandleCalls, RequestId, RosClient, RosError, RosServer, UnhandledCall};
 use sgc_wire::{MessageHead, MessageKind, SinkId, SourceId};
 use tokio::sync::Notify;
 use tracing::{debug, warn};
 
+use crate::call_ledger::{CallLedger, CallerId};
 use crate::sinks::failure_key;
-use crate::sources::LocalShare;
+use crate::sources::{IsTooLarge, LocalShare};
 use crate::stats::Drops;
 
 /// How long a message about a call waits for the local endpoint that is being made.
@@ -36,6 +37,32 @@ pub(crate) enum Calls {
 }
 
 impl Calls {
+    /// The calls that were lost.
+    pub(crate) fn ledger(&self) -> &CallLedger {
+        match self {
+            Self::Served(served) => &served.ledger,
+            Self::Called(called) => &called.ledger,
+        }
+    }
+
+    /// The service ended: what is open will not be answered.
+    pub(crate) fn withdraw(&self) {
+        match self {
+            Self::Served(served) => {
+                served.lock().answerer.withdraw();
+                served.count_lost();
+            }
+            Self::Called(called) => {
+                let mut state = called.lock();
+                state.closed = true;
+                state.caller.withdraw();
+                drop(state);
+                called.count_lost();
+            }
+        }
+        self.ledger().add_past(self.stats());
+    }
+
     /// What became of its calls.
     pub(crate) fn stats(&self) -> CallStats {
         match self {
@@ -65,12 +92,14 @@ impl Calls {
 type Old = Option<Box<dyn std::any::Any + Send>>;
 
 struct ServedState {
-    answerer: Answerer<RequestId>,
+    answerer: Answerer<RequestId, Guid>,
     client: Option<Arc<dyn RosClient>>,
     /// True if the client is to go once nothing is open.
     ending: bool,
     /// True while the local network is being asked: an answer may come before its id is known.
     asking: bool,
+    /// Servers that went meanwhile.
+    gone: BTreeSet<Guid>,
     early: Vec<(RequestId, Bytes)>,
     sinks: BTreeMap<SourceId, SinkId>,
     closed: bool,
@@ -80,6 +109,7 @@ struct ServedState {
 pub(crate) struct Served {
     share: Arc<LocalShare>,
     failures: Arc<Drops>,
+    ledger: Arc<CallLedger>,
     state: Mutex<ServedState>,
     /// Told when there is a client, or it is closed.
     ready: Condvar,
@@ -87,17 +117,18 @@ pub(crate) struct Served {
 
 impl Served {
     /// Nobody calls it yet. What is said goes out as the share's.
-    pub(crate) fn new(share: Arc<LocalShare>, failures: Arc<Drops>) -> Self {
+    pub(crate) fn new(share: Arc<LocalShare>, failures: Arc<Drops>, ledger: Arc<CallLedger>) -> Self {
         let state = ServedState {
             answerer: Answerer::new(CallLimits::default()),
             client: None,
             ending: false,
             asking: false,
+            gone: BTreeSet::new(),
             early: Vec::new(),
             sinks: BTreeMap::new(),
             closed: false,
         };
-        Self { share, failures, state: Mutex::new(state), ready: Condvar::new() }
+        Self { share, failures, ledger, state: Mutex::new(state), ready: Condvar::new() }
     }
 
     /// Who may call now.
@@ -129,45 +160,80 @@ impl Served {
     }
 
     /// All local servers are gone.
-    pub(crate) fn servers_gone(&self) {
-        self.lock().answerer.servers_gone();
+    pub(crate) fn servers_gone(self: &Arc<Self>) {
+        let lost = self.lock().answerer.servers_gone();
+        self.tell_lost(lost);
+    }
+
+    /// An endpoint of the local network is gone, which may be a server's.
+    pub(crate) fn endpoint_gone(self: &Arc<Self>, guid: &Guid) {
+        let lost = {
+            let mut state = self.lock();
+            if state.asking {
+                state.gone.insert(*guid);
+            }
+            state.answerer.server_gone(guid)
+        };
+        self.tell_lost(lost);
+    }
+
+    /// Tells who called that these calls will not be answered; on a thread that may block.
+    fn tell_lost(self: &Arc<Self>, lost: Vec<(SourceId, u64, Bytes)>) {
+        self.count_lost();
+        if lost.is_empty() {
+            return;
+        }
+        let this = self.clone();
+        self.share.run_blocking(move || {
+            lost.into_iter().for_each(|(source, number, why)| {
+                this.tell(source, MessageKind::Gone, number, why);
+            });
+        });
+    }
+
+    fn count_lost(&self) {
+        let lost = self.lock().answerer.take_lost();
+        lost.into_iter().for_each(|lost| self.ledger.count(lost.loss, Some(CallerId::Source(lost.of)), 1));
     }
 
     /// Takes what somebody elsewhere says of a call; on the thread of the service.
-    pub(crate) fn take(&self, message: Message) {
+    pub(crate) fn take(self: &Arc<Self>, message: Message) {
         let (source, number) = (message.source, message.head.call());
         let what = self.lock().answerer.handle(source, message.head.kind, number);
+        self.count_lost();
         match what {
             Answering::Nothing => {}
-            Answering::Tell(kind, payload) => self.tell(source, kind, number, payload),
+            Answering::Tell(kind, payload) => {
+                self.tell(source, kind, number, payload);
+            }
             Answering::Ask => self.ask(source, number, message.payload),
         }
     }
 
     /// Asks the local server.
-    fn ask(&self, source: SourceId, number: u64, payload: Bytes) {
+    fn ask(self: &Arc<Self>, source: SourceId, number: u64, payload: Bytes) {
         let Some(client) = self.client() else { return self.lock().answerer.not_asked(source, number) };
         self.lock().asking = true;
-        let asked = client.request(payload);
+        let asked = client.request(payload).map(|id| (id, client.servers()));
         let early = {
             let mut state = self.lock();
             state.asking = false;
-            let early = std::mem::take(&mut state.early);
+            let gone = std::mem::take(&mut state.gone);
             match &asked {
-                Ok(id) => {
-                    state.answerer.asked(source, number, *id);
-                    early
+                Ok((id, servers)) => {
+                    let servers = servers.difference(&gone).copied().collect();
+                    state.answerer.asked(source, number, *id, servers);
                 }
-                Err(_) => {
-                    state.answerer.not_asked(source, number);
-                    early
-                }
+                Err(_) => state.answerer.not_asked(source, number),
             }
+            std::mem::take(&mut state.early)
         };
         if let Err(why) = asked {
             self.failed(&why);
         }
         early.into_iter().for_each(|(id, payload)| self.answer(id, payload));
+        let lost = self.lock().answerer.lose_unanswerable();
+        self.tell_lost(lost);
     }
 
     /// The client, once it is there.
@@ -195,7 +261,12 @@ impl Served {
             (answered, state.take_ended())
         };
         if let Some((source, number)) = answered {
-            self.tell(source, MessageKind::Reply, number, payload);
+            self.ledger.answered();
+            if self.tell(source, MessageKind::Reply, number, payload) == IsTooLarge::Yes {
+                let why = self.lock().answerer.too_large(source, number);
+                self.count_lost();
+                self.tell(source, MessageKind::Gone, number, why);
+            }
         } else {
             self.failures.count("reply_to_nothing");
         }
@@ -205,10 +276,10 @@ impl Served {
         }
     }
 
-    fn tell(&self, source: SourceId, kind: MessageKind, number: u64, payload: Bytes) {
+    fn tell(&self, source: SourceId, kind: MessageKind, number: u64, payload: Bytes) -> IsTooLarge {
         // Who is gone asks again when it is back.
-        let Some(sink) = self.lock().sinks.get(&source).copied() else { return };
-        self.share.publish_call(&MessageHead::of_call(kind, number), payload, Some(sink));
+        let Some(sink) = self.lock().sinks.get(&source).copied() else { return IsTooLarge::No };
+        self.share.publish_call(&MessageHead::of_call(kind, number), payload, Some(sink))
     }
 
     fn failed(&self, why: &RosError) {
@@ -230,6 +301,42 @@ impl ServedState {
     }
 }
 
+/// Takes the replies of local servers.
+pub(crate) struct Answers(pub(crate) Arc<Served>);
+
+impl HandleCalls for Answers {
+    fn handle(&mut self, id: RequestId, payload: Bytes) {
+        self.0.answer(id, payload);
+    }
+
+    fn unhandled(&mut self, why: UnhandledCall, messages: u64) {
+        count_unhandled(&self.0.share, &self.0.ledger, why, messages);
+    }
+}
+
+/// Takes the requests of local clients.
+pub(crate) struct Requests(pub(crate) Arc<Called>);
+
+impl HandleCalls for Requests {
+    fn handle(&mut self, id: RequestId, payload: Bytes) {
+        self.0.call(id, payload);
+    }
+
+    fn unhandled(&mut self, why: UnhandledCall, messages: u64) {
+        count_unhandled(&self.0.share, &self.0.ledger, why, messages);
+    }
+}
+
+fn count_unhandled(share: &LocalShare, ledger: &CallLedger, why: UnhandledCall, messages: u64) {
+    match why {
+        UnhandledCall::Overrun => {
+            share.count_overrun(messages);
+            ledger.count(CallLoss::Overrun, None, messages);
+        }
+        UnhandledCall::Unreadable => ledger.count(CallLoss::Unreadable, None, messages),
+    }
+}
+
 struct CalledState {
     caller: Caller<RequestId>,
     server: Option<Arc<dyn RosServer>>,
@@ -241,6 +348,7 @@ struct CalledState {
 pub(crate) struct Called {
     share: Arc<LocalShare>,
     failures: Arc<Drops>,
+    ledger: Arc<CallLedger>,
     state: Mutex<CalledState>,
     /// Told when there is a server, or it is closed.
     ready: Condvar,
@@ -250,10 +358,15 @@ pub(crate) struct Called {
 
 impl Called {
     /// No call yet. What is asked goes out as the share's.
-    pub(crate) fn new(share: Arc<LocalShare>, failures: Arc<Drops>, wake: Arc<Notify>) -> Self {
+    pub(crate) fn new(
+        share: Arc<LocalShare>,
+        failures: Arc<Drops>,
+        ledger: Arc<CallLedger>,
+        wake: Arc<Notify>,
+    ) -> Self {
         let caller = Caller::new(CallLimits::default());
         let state = CalledState { caller, server: None, sink: None, closed: false };
-        Self { share, failures, state: Mutex::new(state), ready: Condvar::new(), wake }
+        Self { share, failures, ledger, state: Mutex::new(state), ready: Condvar::new(), wake }
     }
 
     /// What local clients call; the one before may block when it is dropped.
@@ -269,19 +382,19 @@ impl Called {
             let mut state = self.lock();
             let before = state.caller.deadline();
             let number = state.caller.call(Instant::now(), id.client, id, payload.clone());
-            (number, state.caller.deadline() != before)
+            if state.closed {
+                state.caller.withdraw();
+            }
+            (number.map(|number| number.filter(|_| !state.closed)), state.caller.deadline() != before)
         };
+        self.count_lost();
         if wakes {
             self.wake.notify_one();
         }
         match number {
             Ok(Some(number)) => self.publish(MessageKind::Request, number, payload),
             Ok(None) => {}
-            Err(why) => {
-                if self.failures.count("call_refused") {
-                    warn!(%why, "a call is not taken; counted from here on");
-                }
-            }
+            Err(why) => debug!(%why, "a call is not taken"),
         }
     }
 
@@ -294,6 +407,7 @@ impl Called {
             }
             state.caller.granted(Instant::now(), anew)
         };
+        self.count_lost();
         self.publish_elsewhere(MessageKind::Request, open);
     }
 
@@ -307,6 +421,7 @@ impl Called {
     /// A local endpoint is gone: its calls are over if it was a client.
     pub(crate) fn endpoint_gone(self: &Arc<Self>, guid: &Guid) {
         let over = self.lock().caller.client_gone(|id| id.asker == Some(*guid));
+        self.count_lost();
         self.publish_elsewhere(MessageKind::Forget, over.into_iter().map(|n| (n, Bytes::new())).collect());
     }
 
@@ -332,13 +447,19 @@ impl Called {
             },
             _ => None,
         };
-        let outcome = self.lock().caller.handle(kind, number);
+        let outcome = self.lock().caller.handle(kind, number, &message.payload);
+        self.count_lost();
         match (outcome, server) {
             (Outcome::Answers(id), Some(server)) => {
                 let bytes = message.payload.len();
-                if let Err(why) = server.reply(&id, message.payload) {
-                    debug!(%why, "an answer could not be given to a local client");
-                    self.failures.count(failure_key(&why));
+                match server.reply(&id, message.payload) {
+                    Ok(()) => self.ledger.answered(),
+                    Err(why) => {
+                        debug!(%why, "an answer could not be given to a local client");
+                        self.failures.count(failure_key(&why));
+                        self.lock().caller.unheard(id);
+                        self.count_lost();
+                    }
                 }
                 if bytes > ANSWER_KEPT_BYTES_MAX {
                     self.publish(MessageKind::Forget, number, Bytes::new());
@@ -363,7 +484,18 @@ impl Called {
     }
 
     fn publish(&self, kind: MessageKind, number: u64, payload: Bytes) {
-        self.share.publish_call(&MessageHead::of_call(kind, number), payload, None);
+        let head = MessageHead::of_call(kind, number);
+        if self.share.publish_call(&head, payload, None) == IsTooLarge::Yes {
+            self.lock().caller.lose(number, CallLoss::TooLarge);
+            self.count_lost();
+        }
+    }
+
+    fn count_lost(&self) {
+        let lost = self.lock().caller.take_lost();
+        for lost in lost {
+            self.ledger.count(lost.loss, lost.of.asker.map(CallerId::Client), 1);
+        }
     }
 
     /// The same for several, on a thread that may block.

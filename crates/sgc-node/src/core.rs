@@ -37,6 +37,7 @@ use tracing::{debug, warn};
 use crate::alerts::{Alerts, clock_alert};
 use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::authority::{Authority, DeskAnswers};
+use crate::call_ledger::CallLedger;
 use crate::calls::Calls;
 use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::consumers::{ConsumerKey, FarConsumers};
@@ -261,6 +262,8 @@ pub(crate) struct Core<N: RosNetwork> {
     sinks: HashMap<Name, Arc<LocalSink>>,
     /// Names of services, shared or joined.
     calls: BTreeMap<Name, Calls>,
+    /// Their lost calls, which outlast them.
+    call_ledgers: BTreeMap<Name, Arc<CallLedger>>,
     /// Their ends on the local network, as they are wanted.
     service_ends: HashMap<Name, ServiceSpec>,
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
@@ -414,6 +417,7 @@ impl<N: RosNetwork> Core<N> {
             silence_due: None,
             requests,
             control_drops: Drops::default(),
+            call_ledgers: BTreeMap::new(),
             ros_failures: Arc::default(),
             events: parts.events,
             started: Instant::now(),

@@ -42,12 +42,42 @@ pub struct Graph {
     pub drops: BTreeMap<String, u64>,
     /// Peers refused a link, by kind.
     pub refused: BTreeMap<String, u64>,
+    /// Services of which calls got no answer.
+    pub calls: Vec<ServiceCalls>,
     /// Programs refused at the gateway, by kind.
     pub gateway_refused: BTreeMap<String, u64>,
     /// What the user was told once.
     pub problems: Vec<String>,
     /// Alerts for an operator.
     pub alerts: Vec<Alert>,
+}
+
+/// The calls of a service that got no answer, since the node started.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ServiceCalls {
+    /// As it is called on the local network.
+    pub topic: String,
+    /// Whether its servers are here, and not its clients.
+    pub is_served: bool,
+    /// By reason.
+    pub lost: Vec<LostCalls>,
+}
+
+/// The calls that got no answer for one reason.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LostCalls {
+    /// The counter of the reason.
+    pub reason: String,
+    /// All of them.
+    pub count: u64,
+    /// Those since a call was answered last.
+    pub since_answer: u64,
+    /// Those of ROS 2 nodes here, or of nodes elsewhere, that are still there, by their names.
+    pub by: BTreeMap<String, u64>,
+    /// Seconds since the last one.
+    pub last_s: u64,
 }
 
 /// What an interface is.

@@ -15,6 +15,7 @@ mod authority;
 #[cfg(feature = "benchmarks")]
 #[doc(hidden)]
 pub mod benchmarks;
+mod call_ledger;
 mod calls;
 pub mod config;
 mod control_queue;

@@ -45,8 +45,17 @@ impl HandleSamples for Publisher {
     }
 
     fn overrun(&mut self, samples: u64) {
-        self.0.data.count_here(&self.0.name, DataDrop::Overrun, samples);
+        self.0.count_overrun(samples);
     }
+}
+
+/// Whether a message is larger than any that is carried.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum IsTooLarge {
+    /// It is not sent, however often it is tried.
+    Yes,
+    /// It was sent, or may be later.
+    No,
 }
 
 /// Samples that may wait for their writer to be discovered, or for what their type looks like.
@@ -516,10 +525,10 @@ impl LocalShare {
 
     /// Publishes a message about a call: what is asked and what is answered have one source each. Nothing becomes of it
     /// while nobody would get it. May block.
-    pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) {
-        let Some(slot) = self.map.load().shared.clone() else { return };
+    pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) -> IsTooLarge {
+        let Some(slot) = self.map.load().shared.clone() else { return IsTooLarge::No };
         if self.closed.load(Relaxed) || !self.data.is_wanted(&self.name) {
-            return;
+            return IsTooLarge::No;
         }
         let mut source = lock(&slot.source);
         let result = match to {
@@ -527,7 +536,17 @@ impl LocalShare {
             None => source.publish(head, payload, false, self.emit()),
         };
         drop(source);
+        let is_too_large = match result {
+            Err(PublishError::TooLarge { .. }) => IsTooLarge::Yes,
+            _ => IsTooLarge::No,
+        };
         self.note_published(&slot, result);
+        is_too_large
+    }
+
+    /// Counts messages of the local network that came faster than they were taken.
+    pub(crate) fn count_overrun(&self, messages: u64) {
+        self.data.count_here(&self.name, DataDrop::Overrun, messages);
     }
 
     fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) {

@@ -214,6 +214,47 @@ fn a_server_that_dies_is_gone_for_remote_clients_too_and_may_come_back() {
 }
 
 #[test]
+fn call_asked_of_a_server_that_was_replaced_is_counted_at_both_ends() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let (_cloud, robot, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));
+    let first = Server::new(&lab.net("robot"), "/add");
+    let client = Client::new(&lab.net("desk"), "/add");
+    client.calls("lost");
+    first.takes();
+    // It is there before the end of the first is noticed, so the service is never without a server.
+    let second = Server::new(&lab.net("robot"), "/add");
+    drop(first);
+    for node in [&robot, &desk] {
+        wait("it is counted", || node.status()["drops"]["call_server_gone"] == 1);
+        assert!(node.route_state().contains("0 in progress, 0 answered, 0 refused, 1 lost"));
+    }
+    let call = client.calls("new");
+    second.answers(&second.takes(), 1);
+    client.is_answered(call, "new", 1);
+    client.hears_nothing();
+}
+
+#[test]
+fn call_that_waits_when_its_service_ends_is_counted_and_stays_so() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let (_cloud, _robot, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));
+    let server = Server::new(&lab.net("robot"), "/add");
+    let client = Client::new(&lab.net("desk"), "/add");
+    wait("a server is there", || client.end.matched_servers() > 0);
+    drop(server);
+    wait("no server is there", || servers(&lab.net("robot"), "/add") == 0);
+    // The service is still offered.
+    client.end.request(body("lost")).unwrap();
+    wait("it is counted", || desk.status()["drops"]["call_withdrawn"] == 1);
+    let server = Server::new(&lab.net("robot"), "/add");
+    let call = client.calls("new");
+    server.answers(&server.takes(), 1);
+    client.is_answered(call, "new", 1);
+    let state = desk.route_state();
+    assert!(state.contains("2 calls, 0 in progress, 1 answered, 0 refused, 1 lost"), "{state}");
+}
+
+#[test]
 fn a_call_under_way_is_answered_once_though_the_router_restarts() {
     let lab = Lab::new(&["robot", "desk"]);
     let (cloud, _robot, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));

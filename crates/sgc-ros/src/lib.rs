@@ -17,8 +17,9 @@ pub use interface::{Interface, Part};
 pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_name, ros_topic, ros_type};
 pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
-    HandleSamples, KeyHash, RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter,
-    Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
+    HandleCalls, HandleSamples, KeyHash, RequestHandler, RequestId, RosClient, RosError, RosNetwork,
+    RosServer, RosWriter, Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
+    UnhandledCall,
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosOverride, QosPolicy, RELIABLE_READER_DEPTH_MIN,

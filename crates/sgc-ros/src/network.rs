@@ -5,6 +5,7 @@
 //! header (RTPS 2.5, 10.2) and the body, untouched.
 
 use std::any::Any;
+use std::collections::BTreeSet;
 use std::fmt;
 use std::time::Duration;
 
@@ -243,9 +244,35 @@ pub struct ServiceSpec {
     pub reply: EndpointSpec,
 }
 
-/// Receives requests at a server, replies at a client: encapsulation header and body, without the request's id, which
-/// vendors put in different places. On a thread of its own: it may block.
-pub type RequestHandler = Box<dyn FnMut(RequestId, Bytes) + Send>;
+/// The reason for which a request or a reply of the local network is not handed over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UnhandledCall {
+    /// Newer ones took its place, since they came faster than they were handled.
+    Overrun,
+    /// It does not say to which call it belongs.
+    Unreadable,
+}
+
+/// Receives requests at a server, replies at a client. A closure that takes both arguments of [`Self::handle`] is one.
+pub trait HandleCalls: Send {
+    /// Handles a message: encapsulation header and body, without the request's id, which vendors put in different places.
+    /// On a thread of its own: it may block.
+    fn handle(&mut self, id: RequestId, payload: Bytes);
+
+    /// So many messages are not handed over.
+    fn unhandled(&mut self, why: UnhandledCall, messages: u64) {
+        let _ = (why, messages);
+    }
+}
+
+impl<F: FnMut(RequestId, Bytes) + Send> HandleCalls for F {
+    fn handle(&mut self, id: RequestId, payload: Bytes) {
+        self(id, payload);
+    }
+}
+
+/// Handles the requests of a server, or the replies to a client.
+pub type RequestHandler = Box<dyn HandleCalls>;
 
 /// A client of a local service; lives until dropped. Calls may block, like those of [`RosWriter`].
 pub trait RosClient: Send + Sync + 'static {
@@ -253,8 +280,14 @@ pub trait RosClient: Send + Sync + 'static {
     /// a little for a server, and is [`RosError::NoPeer`] if there is none.
     fn request(&self, payload: Bytes) -> Result<RequestId, RosError>;
 
+    /// Returns the request readers of the servers that there are at present. A request reaches no other than those that are there
+    /// before it is sent.
+    fn servers(&self) -> BTreeSet<Guid>;
+
     /// How many servers there are at present.
-    fn matched_servers(&self) -> u32;
+    fn matched_servers(&self) -> u32 {
+        self.servers().len() as u32
+    }
 
     /// GUIDs of its reader and its writer.
     fn guids(&self) -> [Guid; 2];

@@ -4,7 +4,7 @@
 //! the thread of whoever writes. Matching honours topic, type, keylessness, reliability and durability; what it does
 //! not do: depth of volatile history, loss, partitions, or anything that takes time.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -292,7 +292,7 @@ impl RosNetwork for FakeRos {
                 if let Some((id, payload)) = split(&sample.payload, None)
                     && id.client == client
                 {
-                    handler(id, payload);
+                    handler.handle(id, payload);
                 }
             }),
         )?;
@@ -305,7 +305,7 @@ impl RosNetwork for FakeRos {
             &spec.request,
             Box::new(move |sample: Sample| {
                 if let Some((id, payload)) = split(&sample.payload, sample.writer) {
-                    handler(id, payload);
+                    handler.handle(id, payload);
                 }
             }),
         )?;
@@ -348,8 +348,8 @@ impl RosClient for FakeClient {
         Ok(id)
     }
 
-    fn matched_servers(&self) -> u32 {
-        self.requests.matched_readers()
+    fn servers(&self) -> BTreeSet<Guid> {
+        self.requests.readers()
     }
 
     fn guids(&self) -> [Guid; 2] {
@@ -410,6 +410,17 @@ impl FakeWriter {
         while let Some(payload) = payloads.next() {
             self.give(SampleHead::new(SampleKind::Write, 1), payload, payloads.peek().is_some());
         }
+    }
+
+    fn readers(&self) -> BTreeSet<Guid> {
+        let state = self.domain.lock();
+        let Some(writer) = state.endpoints.get(&self.guid) else { return BTreeSet::new() };
+        let matched = state
+            .endpoints
+            .values()
+            .filter(|r| writer.reaches(r.tagged))
+            .filter(|r| r.reader.is_some() && matches(&writer.discovered, &r.discovered));
+        matched.map(|r| r.discovered.guid).collect()
     }
 
     /// Writes a request or a reply once there is somebody to read it.
@@ -479,14 +490,7 @@ impl RosWriter for FakeWriter {
     }
 
     fn matched_readers(&self) -> u32 {
-        let state = self.domain.lock();
-        let Some(writer) = state.endpoints.get(&self.guid) else { return 0 };
-        let matched = state
-            .endpoints
-            .values()
-            .filter(|r| writer.reaches(r.tagged))
-            .filter(|r| r.reader.is_some() && matches(&writer.discovered, &r.discovered));
-        matched.count() as u32
+        self.readers().len() as u32
     }
 
     fn wait_matched(&self, readers: u32, max: Duration) -> u32 {

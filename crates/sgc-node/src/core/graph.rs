@@ -57,6 +57,7 @@ impl<N: RosNetwork> Core<N> {
             drops: self.all_drops(),
             refused: self.all_refused(),
             alerts: self.alerts(),
+            calls: self.lost_calls(),
             ..Graph::default()
         };
         let links = self.links.iter().map(|(id, entry)| {

@@ -1,22 +1,26 @@
 //! Services: what local clients call elsewhere, and local servers for others.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_endpoint::{CallStats, Event};
-use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, Shaping};
+use sgc_endpoint::{CallLoss, CallStats, Event};
+use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, ServiceTopic, Shaping};
 use sgc_wire::{Name, Now, SinkId, TopicGrant};
 use tracing::error;
 
 use super::{Core, CoreEvent, EPOCH_GRACE, ServiceEnd, drop_elsewhere};
-use crate::calls::{Called, Calls, Served};
+use crate::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
+use crate::calls::{Answers, Called, Calls, Requests, Served};
+use crate::graph::{LostCalls, ServiceCalls};
 use crate::sinks::{Behind, LocalSink, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
     /// A share is a service: what comes is calls, not what others publish.
     pub(super) fn begin_served(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
-        let served = Arc::new(Served::new(share.clone(), self.ros_failures.clone()));
+        let (share, ledger) = (share.clone(), self.call_ledger(name, true));
+        let served = Arc::new(Served::new(share, self.ros_failures.clone(), ledger));
         let takes = served.clone();
         self.begin_calls(name, Calls::Served(served), move |message| takes.take(message));
     }
@@ -24,10 +28,24 @@ impl<N: RosNetwork> Core<N> {
     /// A name that this node publishes under is a service: what comes is answers.
     pub(super) fn begin_called(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
-        let called = Called::new(share.clone(), self.ros_failures.clone(), self.epoch_over.clone());
+        let (share, ledger) = (share.clone(), self.call_ledger(name, false));
+        let called = Called::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
         let called = Arc::new(called);
         let takes = called.clone();
         self.begin_calls(name, Calls::Called(called), move |message| takes.take(message));
+    }
+
+    /// The lost calls of a service, of this route and of those before it.
+    fn call_ledger(&mut self, name: Name, is_served: bool) -> Arc<CallLedger> {
+        if self.call_ledgers.len() >= LEDGERS_MAX && !self.call_ledgers.contains_key(&name) {
+            let ended = self.call_ledgers.keys().find(|name| !self.calls.contains_key(*name)).copied();
+            if let Some(name) = ended {
+                self.call_ledgers.remove(&name);
+            }
+        }
+        let failures = self.ros_failures.clone();
+        let new = || Arc::new(CallLedger::new(is_served, failures));
+        self.call_ledgers.entry(name).or_insert_with(new).clone()
     }
 
     fn begin_calls(
@@ -55,7 +73,15 @@ impl<N: RosNetwork> Core<N> {
         self.calls.insert(name, calls);
     }
 
+    /// A service is shared or used no more.
     pub(super) fn end_calls(&mut self, name: &Name) {
+        if let Some(calls) = self.calls.get(name) {
+            calls.withdraw();
+        }
+        self.close_calls(name);
+    }
+
+    fn close_calls(&mut self, name: &Name) {
         self.service_ends.remove(name);
         self.graph.service_gone(name);
         if let Some(old) = self.calls.remove(name).and_then(|calls| calls.close()) {
@@ -65,7 +91,7 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn close_all_calls(&mut self) {
         for name in self.calls.keys().copied().collect::<Vec<_>>() {
-            self.end_calls(&name);
+            self.close_calls(&name);
         }
     }
 
@@ -99,12 +125,13 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A local client that is gone waits for nothing.
+    /// A local client that is gone waits for nothing, and a local server that is gone answers nothing.
     pub(super) fn calls_discovery(&self, event: &DiscoveryEvent) {
         let DiscoveryEvent::Vanished { guid } = event else { return };
         for calls in self.calls.values() {
-            if let Calls::Called(called) = calls {
-                called.endpoint_gone(guid);
+            match calls {
+                Calls::Called(called) => called.endpoint_gone(guid),
+                Calls::Served(served) => served.endpoint_gone(guid),
             }
         }
     }
@@ -138,8 +165,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         }
         self.make_service_end(name, spec, move |network, spec| {
-            let answers = served.clone();
-            let handler = Box::new(move |id, payload| answers.answer(id, payload));
+            let handler = Box::new(Answers(served));
             network.create_client(spec, handler).map(|client| ServiceEnd::Client(Arc::new(client)))
         });
     }
@@ -157,8 +183,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn open_server(&mut self, name: Name, spec: ServiceSpec) {
         let Some(Calls::Called(called)) = self.calls.get(&name).cloned() else { return };
         self.make_service_end(name, spec, move |network, spec| {
-            let calls = called.clone();
-            let handler = Box::new(move |id, payload| calls.call(id, payload));
+            let handler = Box::new(Requests(called));
             network.create_server(spec, handler).map(|server| ServiceEnd::Server(Arc::new(server)))
         });
     }
@@ -181,6 +206,11 @@ impl<N: RosNetwork> Core<N> {
     ) {
         let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         self.service_ends.insert(name, spec.clone());
+        if let (Some(calls), Some((_, service, _))) =
+            (self.calls.get(&name), ServiceTopic::of(&spec.request.topic, &spec.request.type_name))
+        {
+            calls.ledger().set_topic(service);
+        }
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
@@ -219,11 +249,57 @@ impl<N: RosNetwork> Core<N> {
     /// Adds to a route's state what became of its calls.
     pub(super) fn describe_calls(&self, route: &mut RouteStatus) {
         if let Some(calls) = route.name.and_then(|name| self.calls.get(&name)) {
-            let CallStats { calls, open, answered, refused, lost } = calls.stats();
+            let CallStats { calls: now, open, answered: answered_now } = calls.stats();
+            let (_, past, losses) = calls.ledger().read();
+            let (calls, answered) = (past.calls + now, past.answered + answered_now);
+            let refused = losses.get(&CallLoss::Refused).map_or(0, |losses| losses.count);
+            let lost = losses.values().map(|losses| losses.count).sum::<u64>() - refused;
             let counts = format!(
                 ", {calls} calls, {open} in progress, {answered} answered, {refused} refused, {lost} lost"
             );
             route.state.push_str(&counts);
+        }
+    }
+
+    /// The services of which calls were lost.
+    pub(super) fn lost_calls(&self) -> Vec<ServiceCalls> {
+        let of_service = |(name, ledger): (&Name, &Arc<CallLedger>)| {
+            let (topic, _, losses) = ledger.read();
+            let lost = losses.into_iter().map(|(loss, losses)| LostCalls {
+                reason: loss.key().to_owned(),
+                count: losses.count,
+                since_answer: losses.since_answer,
+                by: self.named_callers(name, losses.by),
+                last_s: losses.last.elapsed().as_secs(),
+            });
+            let lost: Vec<_> = lost.collect();
+            (!lost.is_empty()).then_some(ServiceCalls { topic, is_served: ledger.is_served, lost })
+        };
+        self.call_ledgers.iter().filter_map(of_service).collect()
+    }
+
+    fn named_callers(&self, name: &Name, by: BTreeMap<CallerId, u64>) -> BTreeMap<String, u64> {
+        let mut named = BTreeMap::new();
+        for (of, calls) in by {
+            if let Some(caller) = self.caller_name(name, of) {
+                *named.entry(caller).or_default() += calls;
+            }
+        }
+        named
+    }
+
+    /// The name of who called, if it is still there.
+    fn caller_name(&self, name: &Name, of: CallerId) -> Option<String> {
+        match of {
+            CallerId::Client(guid) => {
+                let node = self.routes.as_ref()?.node_of(&guid)?;
+                Some(format!("{}/{}", node.namespace().trim_end_matches('/'), node.name()))
+            }
+            CallerId::Source(source) => {
+                let sink = *self.endpoint.publishers(name).get(&source)?;
+                let granted = self.endpoint.granted(name);
+                granted.into_iter().find(|(id, _)| *id == sink).map(|(_, peer)| self.called(&peer))
+            }
         }
     }
 }

@@ -5,7 +5,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_node::alerts::Alert;
-use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Offer, Share, ShareRoute, Use, UseRoute};
+use sgc_node::graph::{
+    Endpoint, Graph, Interface, LostCalls, NameLine, Offer, ServiceCalls, Share, ShareRoute, Use, UseRoute,
+};
 use sgc_ros::{Naming, Rename, is_for_wildcards, is_pattern, matches};
 
 use super::near::{hint, near};
@@ -14,6 +16,9 @@ use super::{Step, Verdict};
 
 /// Steps, of which one that is wrong is the last.
 type Walk = Vec<Step>;
+
+/// Lost calls are a fault for so long, in seconds, unless calls are answered before.
+const LOST_CALLS_FRESH_S: u64 = 600;
 
 /// The beginning of each walk: whether the node runs, and what an operator has to see to. `true` if that is why nothing
 /// flows.
@@ -55,7 +60,40 @@ pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
         }
     }
     steps.extend(merged(walks));
+    lost_calls(graph, topic, &mut steps);
     steps
+}
+
+/// Says which calls of a service, or of the parts of an action or of parameters, got no answer. That is a fault if nothing else is, until
+/// calls are answered again; ahead of another fault it is what that one led to.
+fn lost_calls(graph: &Graph, topic: &str, steps: &mut Walk) {
+    let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
+    let parts = kinds.into_iter().flat_map(|kind| kind.parts()).map(|part| part.name(topic));
+    let names: BTreeSet<String> = parts.chain([topic.to_owned()]).collect();
+    let of_topic = graph.calls.iter().filter(|calls| names.contains(&calls.topic));
+    let lost = of_topic.flat_map(|calls| calls.lost.iter().map(move |lost| lost_step(calls, lost)));
+    let (faults, past): (Vec<_>, Vec<_>) = lost.partition(|step| step.verdict == Verdict::Wrong);
+    let is_wrong = steps.iter().any(|step| step.verdict == Verdict::Wrong);
+    let before = if is_wrong { steps.len() - 1 } else { steps.len() };
+    let faults_are = if is_wrong { Verdict::Unknown } else { Verdict::Wrong };
+    let faults = faults.into_iter().map(|step| Step { verdict: faults_are, ..step });
+    steps.splice(before..before, past.into_iter().chain(faults));
+}
+
+fn lost_step(calls: &ServiceCalls, lost: &LostCalls) -> Step {
+    let (means, fix) = refusals::of_calls(&lost.reason).unwrap_or(("for another reason", ""));
+    let side = if calls.is_served { "calls of others to the server here" } else { "calls of clients here" };
+    let by: Vec<_> = lost.by.iter().map(|(caller, count)| format!("{count} of {caller}")).collect();
+    let by = if by.is_empty() { String::new() } else { format!(", among them {}", by.join(", ")) };
+    let found = format!(
+        "{}: {} {side} got no answer{by}, the last {} s ago: {} ({means})",
+        calls.topic, lost.count, lost.last_s, lost.reason
+    );
+    // A client may end whenever it likes.
+    let is_fault =
+        lost.since_answer > 0 && lost.last_s <= LOST_CALLS_FRESH_S && lost.reason != "call_client_gone";
+    let step = if is_fault { Step::wrong(found, fix) } else { Step::unknown(found) };
+    if fix.is_empty() { Step { fix: None, ..step } } else { step.with_fix(fix) }
 }
 
 /// The walk of one rule.

@@ -239,8 +239,63 @@ const CONTROL: &[Refusal] = &[
         "",
     ),
     counted("frames", "a transform could not be given the prefix of its owner", SAME_VERSION),
-    counted("call_refused", "a call was refused: too many were under way, or its server is not there", ""),
-    counted("reply_to_nothing", "a reply came to a call that nobody waits for any more", ""),
+    counted(
+        "call_refused",
+        "calls were not taken: 1024 of one client, or 8192 or 128 MiB of all, were without an answer",
+        "have the client wait for answers; if none come, look at the server",
+    ),
+    counted(
+        "call_owner_full",
+        "calls were not taken: 4096 calls of one node were under way at the owner",
+        "look at the server: it answers too slowly, or not at all",
+    ),
+    counted(
+        "call_server_gone",
+        "the server that was asked is gone: its process ended or was killed, or its network broke",
+        "start the server again and call again; what it was asked may have been carried out in part",
+    ),
+    counted(
+        "call_owner_restarted",
+        "the owner's sgc started anew and no longer knows whether the calls were carried out",
+        "call again if that does no harm",
+    ),
+    counted(
+        "call_withdrawn",
+        "the service ended while calls waited: its server stayed away for more than 2 s, its node stopped, or a rule changed",
+        "start the server again and call again; `sgc why` on the owner says what it has",
+    ),
+    counted("call_client_gone", "clients ended, or were dropped, before their answer came", ""),
+    counted(
+        "call_forgotten",
+        "the answer came while the way was broken, and the owner kept it no longer when the way was back",
+        "call again if that does no harm",
+    ),
+    counted(
+        "call_too_large",
+        "a request or an answer is larger than 64 MiB",
+        "send it in parts, or as a topic",
+    ),
+    counted(
+        "call_unheard",
+        "the answer came, and DDS did not find the client that had asked",
+        "is the client still there, and does DDS match it with this node?",
+    ),
+    counted(
+        "call_unreadable",
+        "a request or reply on the local network does not say to which call it belongs",
+        "look for a program of another DDS vendor on that service",
+    ),
+    counted(
+        "call_unsaid",
+        "the owner gave calls up; its sgc is older and does not say why",
+        "`sgc why` on the owner",
+    ),
+    counted(
+        "no_local_peer",
+        "no server, or no client, was there on the local network when something was to be handed to it",
+        "calls are handed over again after 5 s while the service is shared",
+    ),
+    counted("reply_to_nothing", "a reply came to a call that nobody waits for any more, or a second one", ""),
     counted("write_payload", "a message could not be given to the local network", DDS_LOG),
     counted(
         "write_timeout",
@@ -533,6 +588,15 @@ fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
 /// Returns what a dropped packet or message of a name means.
 pub(super) fn of_packets(key: &str) -> Option<&'static Refusal> {
     find(PACKETS, key)
+}
+
+/// Returns the meaning and the remedy of a reason for which calls are lost.
+pub(super) fn of_calls(key: &str) -> Option<(&'static str, &'static str)> {
+    if key == "overrun" {
+        let means = "requests or replies came faster than they were taken, more than may wait";
+        return Some((means, "have the programs on the local network make fewer calls at a time"));
+    }
+    find(CONTROL, key).map(|refusal| (refusal.means, refusal.fix))
 }
 
 /// Returns what a row of `sgc status`, Drops, means.

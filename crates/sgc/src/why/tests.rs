@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, UnheardMember, Use,
-    UseRoute,
+    Endpoint, Graph, Interface, Link, LostCalls, NameLine, Offer, Qos, Search, ServiceCalls, Share,
+    ShareRoute, UnheardMember, Use, UseRoute,
 };
 
 use sgc_wire::{RefuseReason, RejectReason};
@@ -651,4 +651,35 @@ fn names_of_members_that_nobody_has_are_pointed_out() {
     assert!(fix(&graph).contains("if \"desk\" is meant, correct it in the file of here"));
     graph.shares[0].unheard.pop();
     assert_eq!(wrong(&graph, "/a"), "nobody asked for it");
+}
+
+#[test]
+fn lost_calls_are_a_fault_until_calls_are_answered() {
+    let lost = |reason: &str, since_answer, last_s| {
+        let mut graph = owner();
+        let by = [("/caller".to_owned(), 2)].into();
+        let lost = LostCalls { reason: reason.into(), count: 3, since_answer, by, last_s };
+        graph.calls = vec![ServiceCalls { topic: "/a".into(), is_served: false, lost: vec![lost] }];
+        graph
+    };
+    let wrong = |graph: &Graph| {
+        let steps = diagnose::interface(graph, "/a");
+        steps.into_iter().filter(|step| step.verdict == Verdict::Wrong).collect::<Vec<_>>()
+    };
+    let fault = wrong(&lost("call_server_gone", 3, 5));
+    let said = "/a: 3 calls of clients here got no answer, among them 2 of /caller, the last 5 s ago: call_server_gone";
+    assert!(fault.len() == 1 && fault[0].found.starts_with(said), "{fault:?}");
+    assert!(fault[0].fix.as_ref().unwrap().contains("start the server again"));
+    for graph in
+        [lost("call_server_gone", 0, 5), lost("call_server_gone", 3, 601), lost("call_client_gone", 3, 5)]
+    {
+        assert_eq!(wrong(&graph), []);
+        let steps = diagnose::interface(&graph, "/a");
+        assert!(steps.iter().any(|step| step.found.contains("3 calls of clients here got no answer")));
+    }
+    // Another fault comes last, and alone.
+    let mut graph = lost("call_withdrawn", 3, 5);
+    graph.links.clear();
+    let fault = wrong(&graph);
+    assert!(fault.len() == 1 && fault[0].found.contains("no link is up"), "{fault:?}");
 }

@@ -1,6 +1,7 @@
 //! Services, actions and parameters of real ROS 2: calls made in the moment in which a server is seen, slow servers, servers that are
 //! started again. And the first messages of publishers, which meet the same fault of the transport.
 
+use rustix::process::Signal;
 use serde_json::Value;
 
 use super::lab::{Lab, Site, robot_to_desk};
@@ -153,6 +154,51 @@ fn calls_of_a_server_that_was_started_again_are_answered() {
     let _servers = DISTRIBUTIONS.map(start);
     eventually("both are back", || without() == 0);
     call_all(CLIENTS);
+}
+
+/// A server that is killed is missed when its lease ends, after 20 s; until then its service is offered, natively as well.
+#[test]
+fn calls_of_a_server_that_was_killed_are_counted_and_explained_until_calls_are_answered() {
+    let lab = Lab::real(PLAN, robot_to_desk("service", ["/jazzy", "/kilted"]));
+    let start = |d| serve(&lab, Site::Robot, d, &["--node", "server", "--service", &format!("/{d}")]);
+    let call_one = |[serves, d]: [&str; 2], node: &str, patience: &str| {
+        let args = ["call", "--service", &format!("/{serves}"), "--node", node, "--timeout", patience];
+        lab.rclpy(Site::Desk, d, "calls.py", &args)
+    };
+    let servers = DISTRIBUTIONS.map(start);
+    for pair in PAIRS {
+        assert_answered(&call_one(pair, "first", TRIES_S).summary(), 1, &format!("{pair:?}"));
+    }
+    servers.iter().for_each(|server| server.signal(Signal::KILL));
+    let waiting = PAIRS.map(|pair| call_one(pair, "left_alone", PLAN.peer_life));
+    eventually("both calls are counted at the desk", || {
+        lab.status(Site::Desk)["drops"]["call_server_gone"] == 2
+    });
+    for pair in PAIRS {
+        let why = lab.why(Site::Desk, &format!("/{}", pair[0]));
+        for part in [
+            "1 calls of clients here got no answer",
+            "1 of /left_alone",
+            "call_server_gone",
+            "start the server again",
+        ] {
+            assert!(why.contains(part), "{pair:?}: no {part} in {why}");
+        }
+        assert!(why.contains('✗'), "{why}");
+        let why = lab.why(Site::Robot, &format!("/{}", pair[0]));
+        assert!(why.contains("1 calls of others to the server here got no answer"), "{why}");
+    }
+    drop(waiting);
+    let _servers = DISTRIBUTIONS.map(start);
+    for pair in PAIRS {
+        assert_answered(&call_one(pair, "again", TRIES_S).summary(), 1, &format!("{pair:?}"));
+        eventually("nothing is wrong", || {
+            [Site::Robot, Site::Desk].into_iter().all(|site| {
+                let why = lab.why(site, &format!("/{}", pair[0]));
+                why.contains("call_server_gone") && !why.contains('✗')
+            })
+        });
+    }
 }
 
 /// eclipse-zenoh/zenoh-plugin-ros2dds #382: a client that goes while there is no server stops everything.
