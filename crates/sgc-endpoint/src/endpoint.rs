@@ -290,6 +290,12 @@ pub enum Dropped {
 }
 
 impl Dropped {
+    /// Returns `true` if an operator should hear of it. Answers cross with requests that are made anew, so a frame that concerns nothing
+    /// here is ordinary while nodes start.
+    pub fn is_suspicious(&self) -> bool {
+        !matches!(self, Self::Unexpected { .. })
+    }
+
     /// A short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {

@@ -94,7 +94,8 @@ impl<N: RosNetwork> Core<N> {
         match output {
             EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
             EndpointOutput::Dropped(dropped) => {
-                if self.control_drops.count(dropped.key()) {
+                let is_first = self.control_drops.count(dropped.key());
+                if is_first && dropped.is_suspicious() {
                     warn!(reason = %dropped, "refused; counted from here on");
                 } else {
                     debug!(reason = %dropped, "refused");
