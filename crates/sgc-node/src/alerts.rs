@@ -14,6 +14,8 @@ use sgc_wire::{NodeId, UnixMillis};
 
 /// Peers that are remembered because two processes use their identity; of more the one seen longest ago goes.
 const PEERS_MAX: usize = 1024;
+/// Bound on what is shown of the mistakes of a configuration, characters.
+const MISTAKES_CHARS_MAX: usize = 1000;
 /// Time for which an identity's use at another place is shown. A process that waits tries again sooner than that.
 const SHOWN_FOR: Duration = Duration::from_secs(660);
 
@@ -87,6 +89,13 @@ pub enum Alert {
         /// The enclave that they name, `/` if they have none of their own.
         enclave: String,
     },
+    /// The configuration was changed, and what it says now has mistakes: the node runs with what it said before.
+    ConfigurationRefused {
+        /// The mistakes, as `sgc check` says them.
+        mistakes: String,
+        /// Seconds since the node read it.
+        ago_s: u64,
+    },
     /// An alert that this version does not know.
     #[serde(other)]
     Other,
@@ -121,6 +130,10 @@ impl Alert {
             Self::ProtectedPrograms { .. } => {
                 "if DDS Security (SROS2) protects them, set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves, \
                  with a certificate of their CA and the key of that; if not, look for a firewall that stops UDP between them and sgc"
+            }
+            Self::ConfigurationRefused { .. } => {
+                "mend the file; `sgc check -c FILE` says everything that is wrong with it. Then `sgc reload`, if the node does not \
+                 watch it"
             }
             Self::Other => "use an `sgc` of the node's version",
         }
@@ -170,6 +183,10 @@ impl fmt::Display for Alert {
                 f,
                 "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) does so"
             ),
+            Self::ConfigurationRefused { mistakes, ago_s } => write!(
+                f,
+                "the changed configuration was refused {ago_s} s ago, and the one before holds: {mistakes}"
+            ),
             Self::Other => f.write_str("the node says something that this version of sgc does not know"),
         }
     }
@@ -211,9 +228,11 @@ impl Sighting {
     }
 }
 
-/// Identities that were seen at two places lately.
+/// Identities that were seen at two places lately, and a configuration that was refused.
 #[derive(Debug, Default)]
 pub(crate) struct Alerts {
+    /// The mistakes of the configuration that was read last, and when that was.
+    refused: Option<(String, Instant)>,
     /// The process that has the links of this node.
     displaced: Option<Sighting>,
     /// The process that is kept out for this node.
@@ -222,6 +241,11 @@ pub(crate) struct Alerts {
 }
 
 impl Alerts {
+    /// Notes the mistakes of the configuration that was read; `None` if it has none.
+    pub(crate) fn configuration_read(&mut self, mistakes: Option<&str>, now: Instant) {
+        self.refused = mistakes.map(|text| (text.chars().take(MISTAKES_CHARS_MAX).collect(), now));
+    }
+
     /// Notes that another process has the links of this node; `true` if that is news.
     pub(crate) fn displaced(&mut self, place: &str, now: Instant) -> bool {
         self.kept_out = None;
@@ -253,6 +277,10 @@ impl Alerts {
         let own = |seen: &Option<Sighting>| seen.clone().filter(|seen| seen.is_shown(now));
         let mut alerts = Vec::new();
         let node = node.to_owned();
+        alerts.extend(self.refused.as_ref().map(|(mistakes, at)| Alert::ConfigurationRefused {
+            mistakes: mistakes.clone(),
+            ago_s: now.saturating_duration_since(*at).as_secs(),
+        }));
         if let Some(seen) = own(&self.displaced) {
             let ago_s = seen.ago_s(now);
             alerts.push(Alert::Displaced { node, place: seen.place, ago_s });
@@ -315,6 +343,17 @@ mod tests {
         let mut oldest = [0; 32];
         oldest[..8].copy_from_slice(&PEERS_MAX.to_be_bytes());
         assert_eq!(alerts.peers.keys().next(), Some(&NodeId(oldest)), "those seen last stay");
+    }
+
+    #[test]
+    fn refused_configuration_is_shown_until_one_is_read_that_holds() {
+        let (mut alerts, now) = (Alerts::default(), Instant::now());
+        alerts.configuration_read(Some(&"x".repeat(2 * MISTAKES_CHARS_MAX)), now);
+        let shown = alerts.shown("robot", NodeId::short, now + 2 * SHOWN_FOR);
+        let [Alert::ConfigurationRefused { mistakes, ago_s }] = &shown[..] else { panic!("{shown:?}") };
+        assert_eq!((mistakes.len(), *ago_s), (MISTAKES_CHARS_MAX, 2 * SHOWN_FOR.as_secs()));
+        alerts.configuration_read(None, now);
+        assert_eq!(alerts.shown("robot", NodeId::short, now), []);
     }
 
     #[test]

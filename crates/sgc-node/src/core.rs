@@ -94,6 +94,11 @@ pub(crate) enum CoreEvent {
         /// Its place here, or nothing if the node is stopping.
         reply: oneshot::Sender<Option<LinkPlace>>,
     },
+    /// The configuration was read again.
+    ConfigurationRead {
+        /// The mistakes for which it was refused.
+        mistakes: Option<String>,
+    },
     /// A link ended.
     LinkDown {
         /// Which.
@@ -572,6 +577,9 @@ impl<N: RosNetwork> Core<N> {
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());
                 self.answer_renewals();
+            }
+            CoreEvent::ConfigurationRead { mistakes } => {
+                self.alerts.configuration_read(mistakes.as_deref(), Instant::now());
             }
             CoreEvent::Crl { der, reply } => {
                 let taken = self.router.add_crl(now(), &der);

@@ -106,6 +106,9 @@ impl Reloader {
     pub(crate) async fn reload(&self, by: &str) -> Result<ReloadReport, String> {
         let result = self.try_reload().await;
         let record = AuditRecord::new(AuditEvent::Reload).by(by);
+        // A node that stops shows nothing any more.
+        let read = CoreEvent::ConfigurationRead { mistakes: result.as_ref().err().cloned() };
+        let _ = self.events.send(read).await;
         match &result {
             Ok(report) => {
                 let changes = [&report.changed[..], &report.needs_restart[..]].concat();

@@ -183,10 +183,10 @@ pub(crate) enum CliError {
         dir: PathBuf,
     },
     /// No status socket was named and several are in the usual place.
-    #[error("which node? Name one with --socket: {}", sockets.join(", "))]
+    #[error("which node? Name one with --node: {}", nodes.join(", "))]
     SeveralNodes {
-        /// Their sockets.
-        sockets: Vec<String>,
+        /// Their names, as those of their sockets.
+        nodes: Vec<String>,
     },
     /// What came from a status socket is no status.
     #[error("what answers at {} is not a node's status: {reason}", path.display())]

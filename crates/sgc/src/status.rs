@@ -203,7 +203,10 @@ fn only_socket() -> Result<PathBuf, CliError> {
             Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })
         }
         1 => Ok(found.swap_remove(0)),
-        _ => Err(CliError::SeveralNodes { sockets: found.iter().map(|p| p.display().to_string()).collect() }),
+        _ => {
+            let name = |socket: &PathBuf| Some(socket.file_stem()?.to_string_lossy().into_owned());
+            Err(CliError::SeveralNodes { nodes: found.iter().filter_map(name).collect() })
+        }
     }
 }
 

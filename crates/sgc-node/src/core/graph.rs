@@ -15,6 +15,7 @@ use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm, Role};
 use tokio::sync::oneshot;
 
 use super::Core;
+use crate::audit::Audit;
 use crate::graph::{
     Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
     UnheardMember, Use, UseRoute,
@@ -271,7 +272,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// A peer's name, or the beginning of its id.
     pub(super) fn called(&self, peer: &NodeId) -> String {
-        self.audit.name_of(peer).unwrap_or_else(|| peer.short())
+        called(&self.audit, peer)
     }
 
     /// Lets somebody look at what goes by. A topic that comes from the far side is looked at there, since what this node
@@ -370,6 +371,11 @@ impl<N: RosNetwork> Core<N> {
 }
 
 /// Whether it is for calling.
+/// Returns a peer's name, or the beginning of its id.
+pub(super) fn called(audit: &Audit, peer: &NodeId) -> String {
+    audit.name_of(peer).unwrap_or_else(|| peer.short())
+}
+
 fn is_called(entry: &CatalogueEntry) -> bool {
     entry.metadata.kind == Kind::Service && entry.publish
 }

@@ -1,10 +1,11 @@
 //! What router and endpoint want done, and what happened that somebody has to know.
 
+use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Event, Output as EndpointOutput};
-use sgc_ros::{RosNetwork, UNREACHABLE_HOLD};
+use sgc_ros::{RosNetwork, Routes, UNREACHABLE_HOLD};
 use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
 use sgc_transport::{CloseReason, Link};
-use sgc_wire::{Now, RefuseReason, Role};
+use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
 use super::{Core, EPOCH_GRACE, graph, now};
@@ -163,7 +164,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer, role } => {
-                info!(peer = %peer.short(), "granted a subscriber");
+                info!("granted {} to {}", shown(routes, &name), graph::called(&self.audit, &peer));
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
                 graph::forget_refusal(&mut self.refused, &name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
@@ -177,7 +178,11 @@ impl<N: RosNetwork> Core<N> {
                 self.consumers.sink_left(peer, name, sink, now.instant + UNREACHABLE_HOLD);
             }
             Event::SinkCut { name, sink, peer, reason } => {
-                info!(peer = %peer.short(), %reason, "took a grant back; a new epoch begins");
+                info!(
+                    "{} no longer gets {}: {reason}; the others get a new key",
+                    graph::called(&self.audit, &peer),
+                    shown(routes, &name)
+                );
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
                 routes.handle_sink_left(now.instant, &name, &sink);
                 self.consumers.sink_left(peer, name, sink, now.instant);
@@ -190,7 +195,7 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             Event::Refused { name, by } => {
-                warn!(reason = %by, "a topic is refused to this node; asking again later");
+                warn!("{} is refused to this node: {by}; asking again later", shown(routes, &name));
                 debug!(name = %name.short(), reason = %by, "refused");
                 routes.handle_refused(&name, by);
             }
@@ -204,11 +209,18 @@ impl<N: RosNetwork> Core<N> {
                 self.types_listed(owner);
             }
             Event::OwnerLost { owner, reason } => {
-                info!(owner = %owner.short(), ?reason, "owner out of reach");
+                info!(
+                    "{} is out of reach: its topics and services wait for it",
+                    graph::called(&self.audit, &owner)
+                );
+                debug!(owner = %owner.short(), ?reason, "owner out of reach");
                 routes.handle_owner_lost(owner, reason);
             }
             Event::OwnerRefused { owner, by } => {
-                warn!(owner = %owner.short(), reason = %by, "owner refuses its catalogue");
+                warn!(
+                    "{} tells this node nothing of what it shares: {by}",
+                    graph::called(&self.audit, &owner)
+                );
                 routes.handle_owner_refused(owner, by);
             }
             Event::RenewAsked { .. }
@@ -254,4 +266,9 @@ impl<N: RosNetwork> Core<N> {
             _ => {}
         }
     }
+}
+
+/// Returns the topic or service of this node behind a name, for the log.
+fn shown(routes: &Routes<ChaCha20Rng>, name: &Name) -> String {
+    routes.topic_of(name).map_or_else(|| name.short(), str::to_owned)
 }

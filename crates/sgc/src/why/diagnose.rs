@@ -353,10 +353,19 @@ fn uncovered(graph: &Graph, topic: &str) -> Step {
     let ruled =
         graph.shares.iter().map(|s| s.topic.as_str()).chain(graph.uses.iter().map(|u| u.topic.as_str()));
     let meant = hint(&near(topic, here.chain(offered).chain(ruled)));
-    Step::wrong(
-        format!(
+    let pattern = graph.shares.iter().map(|share| share.topic.as_str()).find(|rule| matches(rule, topic));
+    let found = match pattern {
+        Some(pattern) => {
+            format!(
+                "nobody on the local network has {topic}, which the [[share]] of {pattern} would cover{meant}"
+            )
+        }
+        None => format!(
             "nobody on the local network has {topic}, no rule names it, and no followed node lists it{meant}"
         ),
+    };
+    Step::wrong(
+        found,
         "start what publishes it; if it runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
          ROS_AUTOMATIC_DISCOVERY_RANGE; `sgc topic list` shows what there is",
     )
@@ -603,18 +612,26 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
     }
     if !used.is_token && !used.has_catalogue {
         let state = used.owner_state.as_deref().unwrap_or("has not said yet what it shares");
+        let is_linked = graph.links.iter().any(|link| link.name.as_ref() == Some(owner));
         let why = match used.follow.as_deref() {
             Some("refused") => {
                 "it is in reach and refuses this node: are both of one fleet, and is neither revoked?"
             }
             Some("asked") => "it is in reach and was asked; it has not answered",
+            _ if is_linked => "it is linked to this node, and announces nothing that it shares",
             _ => {
                 "nobody in reach knows it: is its node running, and linked to the same routers? Is its name spelt right?"
             }
         };
         let refused = state.strip_prefix("refuses its catalogue: ").and_then(refusals::fix_at_asker);
-        let look =
-            || format!("run `sgc status` on {owner}; its name in `from` has to be that of its identity");
+        let look = || match is_linked && used.follow.as_deref() != Some("asked") {
+            true => format!(
+                "if {owner} is a router, which shares nothing of its own: name in `from` the node beside the publishers"
+            ),
+            false => {
+                format!("run `sgc status` on {owner}; its name in `from` has to be that of its identity")
+            }
+        };
         let fix = refused.map_or_else(look, str::to_owned);
         steps.push(Step::wrong(format!("{owner} {state}: {why}"), fix));
         return;
@@ -926,11 +943,11 @@ fn linked(graph: &Graph, steps: &mut Walk) -> bool {
         ),
         Some(search) => {
             let why = search.last_failure.as_deref().map(|why| format!(": {why}")).unwrap_or_default();
-            Step::wrong(
-                format!("no link is up; {} is {}{why}", search.router, search.state),
+            let fix = search.last_failure.as_deref().and_then(refusals::fix_of_link).unwrap_or(
                 "is the router running and in reach? Where UDP is blocked, a URL with tls:// or wss:// passes \
                  (docs/transports.md)",
-            )
+            );
+            Step::wrong(format!("no link is up; {} is {}{why}", search.router, search.state), fix)
         }
     };
     steps.push(step);

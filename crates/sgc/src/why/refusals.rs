@@ -5,6 +5,8 @@
 use std::collections::BTreeMap;
 
 use sgc_node::graph::Graph;
+use sgc_transport::PeerRefusal;
+use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
 use super::{Step, diagnose};
@@ -583,6 +585,27 @@ pub(super) fn fix_at_asker(why: &str) -> Option<&'static str> {
 
 fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
     JOINS.iter().find(|(answer, ..)| answer.is_said_as(why)).map(|(_, owner, asker)| (*owner, *asker))
+}
+
+/// Returns what this node's user can do about a link that is refused, at either end, for the reason that `why` ends with.
+pub(super) fn fix_of_link(why: &str) -> Option<&'static str> {
+    let other_fleet = "`sgc check -c FILE` says of which fleet this node's identity is. If it is the wrong one, bring the right file here; if \
+         the router is of another fleet on purpose, name this fleet's CA in `accept` there, and its CA in `trust` of [node] here";
+    let fixes = [
+        (CertError::UnknownIssuer.to_string(), other_fleet),
+        (PeerRefusal::OtherCa.to_string(), other_fleet),
+        (
+            PeerRefusal::NotAdmitted.to_string(),
+            "give the router's keeper the file that `sgc fleet ca` prints",
+        ),
+        (
+            PeerRefusal::Expired.to_string(),
+            "`sgc check -c FILE` says how long this node's identity holds. If it is over, `sgc fleet renew` the node and bring the file \
+             here; if not, set the clock that is wrong",
+        ),
+        (PeerRefusal::Revoked.to_string(), ENROLL_AGAIN),
+    ];
+    fixes.into_iter().find(|(said, _)| why.ends_with(said.as_str())).map(|(_, fix)| fix)
 }
 
 /// Returns what a dropped packet or message of a name means.

@@ -8,6 +8,8 @@ use sgc_node::graph::{
     ShareRoute, UnheardMember, Use, UseRoute,
 };
 
+use sgc_transport::PeerRefusal;
+use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
 use super::{Verdict, diagnose};
@@ -321,6 +323,43 @@ fn fix(graph: &Graph) -> String {
     let steps = diagnose::interface(graph, "/a");
     let step = steps.into_iter().find(|step| step.verdict == Verdict::Wrong);
     step.and_then(|step| step.fix).unwrap_or_default()
+}
+
+#[test]
+fn refused_link_has_the_remedy_of_its_reason() {
+    let failed = |why: &str| {
+        let mut graph = user();
+        graph.links.clear();
+        graph.routers[0].last_failure = Some(format!("quic://r: 10.0.0.1:7447: {why}"));
+        fix(&graph)
+    };
+    let foreign = format!("refused: {}", CertError::UnknownIssuer);
+    assert!(failed(&foreign).contains("of which fleet this node's identity is"), "{}", failed(&foreign));
+    let over = format!("the peer refused this node: {}", PeerRefusal::Expired);
+    assert!(failed(&over).contains("`sgc fleet renew`"), "{}", failed(&over));
+    assert!(failed("no answer").contains("is the router running"), "{}", failed("no answer"));
+}
+
+#[test]
+fn router_in_from_is_told_from_a_node_out_of_reach() {
+    let mut graph = user();
+    graph.uses[0].has_catalogue = false;
+    graph.links[0].name = Some("arm".into());
+    assert!(wrong(&graph, "/a").contains("it is linked to this node, and announces nothing"));
+    assert!(fix(&graph).contains("name in `from` the node beside the publishers"));
+}
+
+#[test]
+fn pattern_that_would_cover_a_missing_topic_is_named() {
+    let mut graph = owner();
+    graph.endpoints.clear();
+    graph.shares[0].topic = "/**".into();
+    graph.shares[0].routes.clear();
+    let said = wrong(&graph, "/a");
+    assert!(
+        said.contains("nobody on the local network has /a, which the [[share]] of /** would cover"),
+        "{said}"
+    );
 }
 
 #[test]
