@@ -244,6 +244,15 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
     Ok(xml)
 }
 
+/// Returns `true` if the network is to reach other hosts.
+pub(crate) fn reaches_out(config: &DdsConfig) -> bool {
+    match config.discovery {
+        DiscoveryRange::Off => false,
+        DiscoveryRange::LocalHost => !is_loopback_only(config),
+        DiscoveryRange::Subnet | DiscoveryRange::SystemDefault => true,
+    }
+}
+
 /// True within the loopback interface.
 fn is_loopback_only(config: &DdsConfig) -> bool {
     config.discovery == DiscoveryRange::LocalHost && config.static_peers.iter().all(|p| is_loopback(p))

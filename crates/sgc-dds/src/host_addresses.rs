@@ -5,7 +5,7 @@
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Once, PoisonError, RwLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use std::{io, thread};
 
 use rustix::fd::OwnedFd;
@@ -25,16 +25,27 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_millis(
 const GROUPS: u32 = 0x1 | 0x10;
 const MESSAGE_BYTES_MAX: usize = 8192;
 
-static ADDRESSES: RwLock<Addresses> = RwLock::new(Addresses { here: Vec::new(), known: Vec::new() });
+static ADDRESSES: RwLock<Addresses> = RwLock::new(Addresses::NONE);
 /// An address that this host had is gone.
 static ANY_GONE: AtomicBool = AtomicBool::new(false);
 
 struct Addresses {
     here: Vec<Ipv4Addr>,
     known: Vec<Ipv4Addr>,
+    changes: Changes,
+}
+
+/// How often this host's addresses changed since they are followed, and when they did last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Changes {
+    pub(crate) number: u64,
+    pub(crate) last: Option<Instant>,
 }
 
 impl Addresses {
+    const NONE: Self =
+        Self { here: Vec::new(), known: Vec::new(), changes: Changes { number: 0, last: None } };
+
     fn update(&mut self, here: Vec<Ipv4Addr>) {
         for address in &here {
             if !self.known.contains(address) {
@@ -56,14 +67,14 @@ pub(crate) fn follow() {
     static FOLLOWED: Once = Once::new();
     FOLLOWED.call_once(|| {
         let kernel = subscribe();
-        refresh();
+        refresh(false);
         let started = kernel.and_then(|kernel| {
             thread::Builder::new().name("sgc-dds-host".into()).spawn(move || {
                 // Between the first look and the thread's beginning something may have changed, which the kernel kept.
                 while wait_for_change(&kernel).is_ok() {
                     for pause in PAUSES {
                         thread::sleep(pause);
-                        refresh();
+                        refresh(true);
                     }
                 }
             })
@@ -89,16 +100,29 @@ pub(crate) fn is_here(address: Ipv4Addr) -> bool {
     address.is_loopback() || read(|addresses| addresses.here.contains(&address))
 }
 
+/// Returns `true` if this host has an address besides loopback.
+pub(crate) fn has_any() -> bool {
+    read(|addresses| !addresses.here.is_empty())
+}
+
+/// Returns how often and when the addresses changed.
+pub(crate) fn changes() -> Changes {
+    read(|addresses| addresses.changes)
+}
+
 fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
     look(&ADDRESSES.read().unwrap_or_else(PoisonError::into_inner))
 }
 
-fn refresh() {
+/// Reads the addresses; what is other than before is a change, except for the first time.
+fn refresh(is_change: bool) {
     let here = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), HERE_MAX);
     let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
     if addresses.here != here {
-        if !addresses.known.is_empty() {
+        if is_change {
             tracing::info!(now = ?here, before = ?addresses.here, "this host's addresses changed");
+            let number = addresses.changes.number + 1;
+            addresses.changes = Changes { number, last: Some(Instant::now()) };
         }
         addresses.update(here);
         ANY_GONE.store(addresses.any_gone(), Ordering::Relaxed);
@@ -134,7 +158,7 @@ mod tests {
 
     #[test]
     fn addresses_that_are_gone_stay_known() {
-        let mut addresses = Addresses { here: Vec::new(), known: Vec::new() };
+        let mut addresses = Addresses::NONE;
         addresses.update(vec![OLD]);
         assert!(!addresses.any_gone());
         addresses.update(vec![NEW]);
@@ -146,7 +170,7 @@ mod tests {
 
     #[test]
     fn known_addresses_are_bounded() {
-        let mut addresses = Addresses { here: Vec::new(), known: Vec::new() };
+        let mut addresses = Addresses::NONE;
         for n in 0..1000 {
             addresses.update(vec![Ipv4Addr::from_bits(0x0a00_0000 + n)]);
         }

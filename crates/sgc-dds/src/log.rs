@@ -7,10 +7,13 @@
 
 use std::cell::RefCell;
 use std::ffi::{CStr, c_void};
+use std::net::SocketAddrV4;
 use std::sync::{Mutex, Once, PoisonError};
 use std::time::{Duration, Instant};
 
 use cyclors::{DDS_LC_ERROR, DDS_LC_FATAL, DDS_LC_WARNING, dds_log_data_t, dds_set_log_sink};
+
+use crate::host_addresses;
 
 /// Bound on what one failure may say, bytes.
 const REASON_BYTES_MAX: usize = 1024;
@@ -30,10 +33,22 @@ pub struct Unsent {
 }
 
 static UNSENT: Mutex<Option<Unsent>> = Mutex::new(None);
+/// The time of the last that was for a program of another host.
+static CUT_OFF: Mutex<Option<Instant>> = Mutex::new(None);
 
 /// Returns the packets of the local networks of this process that could not be sent, if there were any.
 pub fn unsent() -> Option<Unsent> {
     UNSENT.lock().unwrap_or_else(PoisonError::into_inner).clone()
+}
+
+/// Returns `true` if since then a packet for a program of another host could not be sent.
+pub(crate) fn is_cut_off_since(begin: Instant) -> bool {
+    CUT_OFF.lock().unwrap_or_else(PoisonError::into_inner).is_some_and(|last| last >= begin)
+}
+
+/// Returns `true` for the address of a program of another host.
+fn is_elsewhere(to: &str) -> bool {
+    to.parse::<SocketAddrV4>().is_ok_and(|to| !to.ip().is_multicast() && !host_addresses::is_known(*to.ip()))
 }
 
 /// Lines of one kind.
@@ -96,6 +111,9 @@ fn complain(message: &str, now: Instant) {
         let mut unsent = UNSENT.lock().unwrap_or_else(PoisonError::into_inner);
         let packets = unsent.as_ref().map_or(0, |unsent| unsent.packets) + 1;
         *unsent = Some(Unsent { packets, to: to.to_owned(), last: now });
+        if is_elsewhere(to) {
+            *CUT_OFF.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
+        }
     }
     let refused = refused_program(message);
     let [sending, security, other] = &mut *REPEATS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -204,10 +222,22 @@ mod tests {
     }
 
     #[test]
+    fn only_packets_for_other_hosts_say_that_those_are_cut_off() {
+        assert!(is_elsewhere("192.0.2.1:7411"));
+        for here in ["239.255.0.1:7400", "127.0.0.1:7411", "[ff02::1]:7400", "nowhere"] {
+            assert!(!is_elsewhere(here), "{here}");
+        }
+        let now = Instant::now();
+        complain("ddsi_udp_conn_write to udp/192.0.2.1:7411 failed with retcode -1", now);
+        assert!(is_cut_off_since(now));
+        assert!(!is_cut_off_since(now + QUIET));
+    }
+
+    #[test]
     fn packets_that_are_not_sent_are_counted() {
         let now = Instant::now();
         let before = unsent().map_or(0, |unsent| unsent.packets);
-        complain("ddsi_udp_conn_write to udp/192.0.2.1:7411 failed with retcode -1", now);
-        assert_eq!(unsent(), Some(Unsent { packets: before + 1, to: "192.0.2.1:7411".into(), last: now }));
+        complain("ddsi_udp_conn_write to udp/239.255.0.1:7400 failed with retcode -1", now);
+        assert!(unsent().is_some_and(|unsent| unsent.packets > before));
     }
 }

@@ -4,8 +4,10 @@
 //! them alive as long as they need them. Moves no sample itself.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
-use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::Duration;
 
 use cyclors::{
     DDS_RETCODE_PRECONDITION_NOT_MET, dds_create_domain, dds_create_participant, dds_create_publisher,
@@ -13,19 +15,20 @@ use cyclors::{
 };
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{
-    DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, RequestHandler, RosError,
-    RosNetwork, SampleHandler, ServiceSpec, ShownEndpoint,
+    DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, Reach, RequestHandler,
+    RosError, RosNetwork, SampleHandler, ServiceSpec, ShownEndpoint,
 };
 
 use crate::announced;
 use crate::config::{
     DdsConfig, DiscoveryRange, HOST_ADDRESSES_MAX, Instance, PEERS_MAX, chooses_interfaces, cyclone_config,
-    far_hosts, local_addresses,
+    far_hosts, local_addresses, reaches_out,
 };
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
 use crate::first_messages;
 use crate::graph::{Announcer, SharedHandler, lock};
+use crate::host_addresses::{self, Changes};
 use crate::intake::Pace;
 use crate::log;
 use crate::qos::NativeQos;
@@ -45,6 +48,9 @@ const ALIAS_FIRST: u32 = 0x5347_0000;
 /// Any port will do to ask for a route; this is the first that a participant of domain 0 listens at (RTPS 2.5, 9.6.2.3).
 const DISCOVERY_PORT: u16 = 7410;
 
+/// How long this host's addresses have to stand before it matters which they are: DHCP and a change of the interface take several steps.
+const SETTLED: Duration = Duration::from_secs(3);
+
 /// Bound on what is read of a file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
@@ -60,6 +66,13 @@ pub struct CycloneNetwork {
     /// If the ROS graph is told of, both ways.
     announcer: Option<Arc<Announcer>>,
     participant: Arc<Participant>,
+    config: DdsConfig,
+    /// The changes of this host's addresses before it was opened.
+    opened_after: Changes,
+    /// The number of changes that make no difference to it.
+    changes_seen: AtomicU64,
+    /// Told when everything made on it is dropped.
+    all_dropped: Mutex<Option<Receiver<()>>>,
 }
 
 /// The participant and the domain it is in. Fields drop in this order.
@@ -67,7 +80,7 @@ pub struct CycloneNetwork {
 pub(crate) struct Participant {
     entity: Entity,
     /// Ends before the domain. None if it loses programs of this host when the host's addresses change.
-    _same_host: Option<SameHost>,
+    same_host: Option<SameHost>,
     domain: Entity,
     guid: Guid,
     domain_id: u32,
@@ -79,6 +92,8 @@ pub(crate) struct Participant {
     late_writers: AtomicUsize,
     /// The handler that discovery tells, while it is under way.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
+    /// Ends last.
+    _alive: Sender<()>,
 }
 
 impl CycloneNetwork {
@@ -89,6 +104,9 @@ impl CycloneNetwork {
     /// logged: an interface that is not there, no free participant index, a peer that is not a host name.
     pub fn open(config: &DdsConfig) -> Result<Self, RosError> {
         log::install();
+        host_addresses::follow();
+        let opened_after = host_addresses::changes();
+        let (alive, all_dropped) = channel();
         let refused = |reason| RosError::Domain { domain: config.domain, reason };
         let domain = create_domain(config)?;
         let qos = NativeQos::new().map_err(refused)?;
@@ -126,7 +144,7 @@ impl CycloneNetwork {
         }
         let participant = Participant {
             entity,
-            _same_host: same_host.ok(),
+            same_host: same_host.ok(),
             domain: domain.entity,
             guid,
             domain_id: config.domain,
@@ -137,6 +155,7 @@ impl CycloneNetwork {
             writers: AtomicUsize::new(0),
             late_writers: AtomicUsize::new(0),
             watcher: Mutex::default(),
+            _alive: alive,
         };
         // Before there are endpoints to announce.
         let completed = participant.complete_announcements().or_else(|reason| {
@@ -155,7 +174,25 @@ impl CycloneNetwork {
         let participant = Arc::new(participant);
         let explained = |reason| refused(participant.explain(&graph_writer().topic, reason));
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(explained)?;
-        Ok(Self { discovery: Mutex::new(None), announcer: announcer.map(Arc::new), participant })
+        Ok(Self {
+            discovery: Mutex::new(None),
+            announcer: announcer.map(Arc::new),
+            participant,
+            config: config.clone(),
+            opened_after,
+            changes_seen: AtomicU64::new(opened_after.number),
+            all_dropped: Mutex::new(Some(all_dropped)),
+        })
+    }
+
+    /// Returns the addresses from which a network opened now would speak to other hosts. Nobody hears of it.
+    fn outward_now(&self) -> Result<Vec<Ipv4Addr>, RosError> {
+        let refused = |reason| RosError::Domain { domain: self.config.domain, reason };
+        let domain = create_domain(&self.config)?;
+        let qos = NativeQos::new().map_err(refused)?;
+        SameHost::install(&domain.entity, domain.id, &qos)
+            .map(|same_host| same_host.outward().to_vec())
+            .map_err(refused)
     }
 
     /// GUID of the participant; readers and writers made here share its first 12 bytes.
@@ -236,6 +273,51 @@ impl RosNetwork for CycloneNetwork {
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
         self.announcer.as_ref().map_or(Ok(()), |announcer| announcer.announce(nodes))
+    }
+
+    fn reach(&self) -> Reach {
+        let changes = host_addresses::changes();
+        let Some(same_host) = self.participant.same_host.as_ref().filter(|_| reaches_out(&self.config))
+        else {
+            return Reach::Whole;
+        };
+        let (Some(last), true) = (changes.last, changes.number != self.changes_seen.load(Ordering::Relaxed))
+        else {
+            return Reach::Whole;
+        };
+        if last.elapsed() < SETTLED || !host_addresses::has_any() {
+            return Reach::Doubtful;
+        }
+        let outward = same_host.outward();
+        let is_whole = !outward.is_empty() && outward.iter().all(|address| host_addresses::is_here(*address));
+        // One that took what was there after a change, or found nothing, goes where there is more.
+        if outward.is_empty() || self.opened_after.number > 0 {
+            return Reach::CutOff;
+        }
+        match is_whole {
+            true => Reach::Whole,
+            false if log::is_cut_off_since(last) => Reach::CutOff,
+            false => Reach::Doubtful,
+        }
+    }
+
+    fn gains_by_reopening(&self) -> Result<bool, RosError> {
+        let changes = host_addresses::changes();
+        let outward = self.outward_now()?;
+        let here = self.participant.same_host.as_ref().map_or(&[][..], SameHost::outward);
+        let gains = !outward.is_empty() && outward != here;
+        if !gains {
+            self.changes_seen.store(changes.number, Ordering::Relaxed);
+        }
+        Ok(gains)
+    }
+
+    fn close(self: Arc<Self>, max: Duration) -> bool {
+        drop(lock(&self.discovery).take());
+        let all_dropped = lock(&self.all_dropped).take();
+        drop(self);
+        // Nobody sends.
+        all_dropped.is_none_or(|dropped| dropped.recv_timeout(max) == Err(RecvTimeoutError::Disconnected))
     }
 }
 

@@ -136,6 +136,8 @@ struct Multicast {
 #[derive(Debug)]
 pub(crate) struct SameHost {
     connections: Vec<usize>,
+    /// The addresses besides loopback that it sends from.
+    outward: Vec<Ipv4Addr>,
 }
 
 impl Drop for SameHost {
@@ -162,6 +164,11 @@ impl SameHost {
         let installed = Entity::new(handle).and_then(|participant| install(inside(&participant)?));
         check(silence(false)).and(installed)
     }
+
+    /// Returns the addresses besides loopback from which the domain speaks to other hosts.
+    pub(crate) fn outward(&self) -> &[Ipv4Addr] {
+        &self.outward
+    }
 }
 
 /// Returns the inside of a participant's domain.
@@ -180,13 +187,14 @@ fn inside(participant: &Entity) -> Result<*const ddsi_domaingv, String> {
 
 fn install(domain: *const ddsi_domaingv) -> Result<SameHost, String> {
     let here = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), ADDRESSES_MAX);
-    let mut same_host = SameHost { connections: Vec::new() };
+    let mut same_host = SameHost { connections: Vec::new(), outward: Vec::new() };
     for address in std::iter::once(Ipv4Addr::LOCALHOST).chain(here) {
         let Some(connection) = connection_for(domain, address) else { continue };
         if !same_host.connections.contains(&(connection as usize)) {
             // SAFETY: a connection of the domain, which lives as long; its beginning says whether it is as expected.
-            take_over(domain, unsafe { &*connection })?;
+            let bound = take_over(domain, unsafe { &*connection })?;
             same_host.connections.push(connection as usize);
+            same_host.outward.extend((!bound.is_loopback()).then_some(bound));
         }
     }
     if same_host.connections.is_empty() {
@@ -195,8 +203,8 @@ fn install(domain: *const ddsi_domaingv) -> Result<SameHost, String> {
     Ok(same_host)
 }
 
-/// Makes a connection send by [`write`].
-fn take_over(domain: *const ddsi_domaingv, connection: &Connection) -> Result<(), String> {
+/// Makes a connection send by [`write`], and returns the address that it is bound to.
+fn take_over(domain: *const ddsi_domaingv, connection: &Connection) -> Result<Ipv4Addr, String> {
     let handle = connection.handle.filter(|_| {
         ptr::eq(connection.domain, domain) && connection.kind == CONNECTION && !connection.is_multicast
     });
@@ -225,7 +233,7 @@ fn take_over(domain: *const ddsi_domaingv, connection: &Connection) -> Result<()
     let mut all = BESIDE.write().unwrap_or_else(PoisonError::into_inner);
     all.push((ptr::from_ref(connection) as usize, Arc::new(beside)));
     connection.write.store(ours, Ordering::Release);
-    Ok(())
+    Ok(address)
 }
 
 impl Beside {

@@ -17,7 +17,7 @@ pub use interface::{Interface, Part};
 pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_name, ros_topic, ros_type};
 pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
-    HandleCalls, HandleSamples, KeyHash, RequestHandler, RequestId, RosClient, RosError, RosNetwork,
+    HandleCalls, HandleSamples, KeyHash, Reach, RequestHandler, RequestId, RosClient, RosError, RosNetwork,
     RosServer, RosWriter, Sample, SampleHandler, SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
     UnhandledCall,
 };

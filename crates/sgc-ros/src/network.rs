@@ -7,6 +7,7 @@
 use std::any::Any;
 use std::collections::BTreeSet;
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -379,6 +380,17 @@ pub enum RosError {
     },
 }
 
+/// How far a network reaches, compared with when it was opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reach {
+    /// As far.
+    Whole,
+    /// Perhaps not as far: this host's addresses are others. No program of another host is known to be cut off, or they still change.
+    Doubtful,
+    /// Programs of other hosts are cut off, or may be, until the network is opened again.
+    CutOff,
+}
+
 /// A local ROS 2 network.
 ///
 /// Dropping the network ends discovery and waits for its threads; dropping a reader or writer deletes
@@ -421,6 +433,27 @@ pub trait RosNetwork: Send + Sync + 'static {
 
     /// Has the local graph show these nodes, and no others, as this participant's. May block.
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError>;
+
+    /// Returns how far it reaches at present.
+    fn reach(&self) -> Reach {
+        Reach::Whole
+    }
+
+    /// Returns `true` if a network opened now, as this one was, would reach programs that this one does not. After `false` the network is
+    /// [`Reach::Whole`] until something changes. May block.
+    ///
+    /// # Errors
+    /// The reason why none could be opened.
+    fn gains_by_reopening(&self) -> Result<bool, RosError> {
+        Ok(true)
+    }
+
+    /// Ends discovery and the network, and waits until all that was made on it is dropped: so long at most, `false` if something is
+    /// left. May block.
+    fn close(self: Arc<Self>, max: Duration) -> bool {
+        let _ = max;
+        true
+    }
 }
 
 /// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.

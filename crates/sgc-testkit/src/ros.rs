@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
-    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
+    DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, Reach,
     RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
     SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
 };
@@ -37,6 +37,8 @@ struct DomainState {
     watchers: Vec<Watcher>,
     /// Topics and payloads that cannot be written.
     refused: Vec<(String, Bytes)>,
+    /// The networks with these numbers and lower ones do not reach other hosts.
+    cut_off: u32,
 }
 
 struct Endpoint {
@@ -128,6 +130,12 @@ impl FakeDomain {
     /// Has the next write of a payload on a topic fail, as if a reader did not acknowledge what was written before.
     pub fn refuse_write(&self, topic: &str, payload: Bytes) {
         self.lock().refused.push((topic.to_owned(), payload));
+    }
+
+    /// Cuts the networks that have joined so far off from other hosts, as far as they can tell.
+    pub fn cut_off(&self) {
+        let mut state = self.lock();
+        state.cut_off = state.next;
     }
 
     /// What the writers on a topic offer.
@@ -338,6 +346,10 @@ impl RosNetwork for FakeRos {
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
         self.domain.announce(self.network, self.tagged, nodes.to_vec());
         Ok(())
+    }
+
+    fn reach(&self) -> Reach {
+        if self.network <= self.domain.lock().cut_off { Reach::CutOff } else { Reach::Whole }
     }
 }
 
