@@ -84,6 +84,11 @@ pub enum Alert {
         /// Seconds since the last one.
         ago_s: u64,
     },
+    /// The local ROS 2 network was closed since this host's addresses changed, and cannot be opened again.
+    LocalNetworkClosed {
+        /// The reason.
+        reason: String,
+    },
     /// Programs of the local ROS 2 network announce themselves and none of their topics.
     ProtectedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -104,7 +109,10 @@ pub enum Alert {
 impl Alert {
     /// Returns `true` if nothing flows over this node while it stands.
     pub fn stops_all(&self) -> bool {
-        matches!(self, Self::Displaced { .. } | Self::ClockBeforeCertificate { .. })
+        matches!(
+            self,
+            Self::Displaced { .. } | Self::ClockBeforeCertificate { .. } | Self::LocalNetworkClosed { .. }
+        )
     }
 
     /// Returns what to do about it.
@@ -125,7 +133,12 @@ impl Alert {
                  and ROS_STATIC_PEERS where multicast is to be avoided (docs/vendors.md)"
             }
             Self::LocalNetworkFails { .. } => {
-                "compare `ip addr` and `ip route` with that address; if this host's own address changed, restart the node"
+                "compare `ip addr` and `ip route` with that address; if this host's own address changed, the node opens its network again \
+                 within some 15 s of the change. If this stays, or clients of a gateway miss programs of other hosts, restart the node"
+            }
+            Self::LocalNetworkClosed { .. } => {
+                "see whether an interface or address that CYCLONEDDS_URI or ROS_STATIC_PEERS names is gone; the node tries again by itself, \
+                 up to a minute apart"
             }
             Self::ProtectedPrograms { .. } => {
                 "if DDS Security (SROS2) protects them, set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves, \
@@ -179,6 +192,9 @@ impl fmt::Display for Alert {
                 f,
                 "packets to the local ROS 2 network cannot be sent, the last to {to} {ago_s} s ago ({packets} so far)"
             ),
+            Self::LocalNetworkClosed { reason } => {
+                write!(f, "the local ROS 2 network is closed and cannot be opened again: {reason}")
+            }
             Self::ProtectedPrograms { enclave } => write!(
                 f,
                 "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) does so"

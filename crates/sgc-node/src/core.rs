@@ -11,6 +11,7 @@ mod operations;
 mod outputs;
 mod publish;
 mod quality;
+mod reopening;
 mod ros;
 mod services;
 mod trust;
@@ -43,6 +44,7 @@ use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::consumers::{ConsumerKey, FarConsumers};
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
+use crate::core::reopening::Reopening;
 use crate::core::types::{TypeOutcome, Types};
 use crate::credentials::Keeper;
 use crate::dataplane::DataPlane;
@@ -59,7 +61,7 @@ use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
 use crate::replays::Replays;
 use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
-use crate::sources::LocalShare;
+use crate::sources::{LocalShare, NewestSamples};
 use crate::stats::{Drops, NameStats};
 use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 use crate::tap::{Tap, TapError, TapQueue, TapWish};
@@ -127,6 +129,12 @@ pub(crate) enum CoreEvent {
     },
     /// The local graph changed.
     Discovery(DiscoveryEvent),
+    /// The local network was taken away to be opened again; answered once nothing here holds it.
+    CloseNetwork(oneshot::Sender<()>),
+    /// It is open again; what is discovered follows.
+    NetworkReopened,
+    /// It could not be opened again so far, for this reason.
+    NetworkStaysClosed(String),
     /// A local writer was made, or not.
     WriterReady {
         /// The joined name.
@@ -226,6 +234,16 @@ pub(crate) struct LinkPlace {
     pub(crate) inbox: InboxShare,
 }
 
+/// A reader of the local network, for a name.
+struct LocalReader {
+    /// As it is wanted.
+    spec: EndpointSpec,
+    /// Dropping it ends it. None while it is being made.
+    opened: Option<Box<dyn std::any::Any + Send>>,
+    /// The newest samples that it took.
+    newest: Option<Arc<NewestSamples>>,
+}
+
 /// This node's end of a service on the local network.
 pub(crate) enum ServiceEnd {
     /// It calls local servers.
@@ -263,7 +281,7 @@ pub(crate) struct Core<N: RosNetwork> {
     next_link: u32,
     entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
     shares: HashMap<Name, Arc<LocalShare>>,
-    readers: HashMap<Name, (EndpointSpec, Option<Box<dyn std::any::Any + Send>>)>,
+    readers: HashMap<Name, LocalReader>,
     sinks: HashMap<Name, Arc<LocalSink>>,
     /// Names of services, shared or joined.
     calls: BTreeMap<Name, Calls>,
@@ -274,6 +292,7 @@ pub(crate) struct Core<N: RosNetwork> {
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     /// Which nodes the local graph shows for them.
     graph: LocalGraph,
+    reopening: Reopening,
     /// The subscribers, publishers and service clients that owners are told, and those elsewhere that are shown here.
     consumers: FarConsumers,
     history_due: BTreeMap<(Name, SourceId), Instant>,
@@ -403,6 +422,7 @@ impl<N: RosNetwork> Core<N> {
             service_ends: HashMap::new(),
             writers: HashMap::new(),
             graph,
+            reopening: Reopening::default(),
             consumers: FarConsumers::default(),
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
@@ -538,21 +558,22 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Malformed { link } => {
                 self.control_drops.count_from("malformed_control", link);
             }
-            CoreEvent::Discovery(event) => {
-                self.calls_discovery(&event);
-                if let Some(routes) = &mut self.routes {
-                    routes.handle_discovery(Instant::now(), event);
-                }
+            CoreEvent::Discovery(event) => self.discovered(event),
+            CoreEvent::CloseNetwork(reply) => {
+                self.close_network();
+                let _ = reply.send(());
             }
+            CoreEvent::NetworkReopened => self.network_reopened(),
+            CoreEvent::NetworkStaysClosed(reason) => self.reopening.failed = Some(reason),
             CoreEvent::ReaderReady { name, spec, guid, reader } => match self.readers.get_mut(&name) {
-                Some((wanted, slot)) if *wanted == spec => {
-                    *slot = Some(reader);
+                Some(wanted) if wanted.spec == spec && !self.reopening.is_closed => {
+                    wanted.opened = Some(reader);
                     self.graph.reader_there(name, guid);
                 }
                 _ => drop_elsewhere(reader),
             },
             CoreEvent::WriterReady { name, source, spec, writer } => {
-                let wanted = self.writers.get(&(name, source)) == Some(&spec);
+                let wanted = !self.reopening.is_closed && self.writers.get(&(name, source)) == Some(&spec);
                 match (self.sinks.get(&name), writer) {
                     (Some(sink), Some(writer)) if wanted => {
                         self.graph.writer_there((name, source), writer.guid());
@@ -656,6 +677,7 @@ impl<N: RosNetwork> Core<N> {
         self.calls_due(now.instant);
         self.types_due(now.instant);
         self.consumers_due(now);
+        self.rediscovery_due(now.instant);
         self.rekey_due(now);
         let over: Vec<_> =
             self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
@@ -697,6 +719,7 @@ impl<N: RosNetwork> Core<N> {
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
+                let own = own.into_iter().chain([self.reopening.rediscovery.deadline()]);
                 let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
                 let all =
                     all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
@@ -738,8 +761,8 @@ impl<N: RosNetwork> Core<N> {
             share.close();
         }
         self.close_all_calls();
-        for (_, (_, reader)) in self.readers.drain() {
-            if let Some(reader) = reader {
+        for (_, reader) in self.readers.drain() {
+            if let Some(reader) = reader.opened {
                 drop_elsewhere(reader);
             }
         }
@@ -815,6 +838,7 @@ impl<N: RosNetwork> Core<N> {
             names: names.collect(),
             drops: self.all_drops(),
             refused: self.all_refused(),
+            local_network_reopened: self.reopening.times,
             router: RouterLine {
                 nodes: router.nodes,
                 names: router.names,

@@ -6,7 +6,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
@@ -43,11 +43,12 @@ use crate::heart::Patience;
 use crate::lanes::LaneDoor;
 use crate::links::{Door, keep_accepting};
 use crate::message_keys;
-use crate::network_slot::NetworkSlot;
+use crate::network_slot::{NetworkSlot, OpenAgain};
 use crate::peer_rate::PeerRates;
 use crate::policy::grantees;
 use crate::protected;
 use crate::reload::{ConfigSource, JoinNetwork, Reloader, Running};
+use crate::reopening;
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
 use crate::run_lock::{IdentityInUse, RunLock};
@@ -286,6 +287,7 @@ pub async fn run(
         );
     }
     let (opener, runtime) = (identity.clone(), tokio::runtime::Handle::current());
+    let is_watched = AtomicBool::new(false);
     let open: OpenNetwork<CycloneNetwork> = Arc::new(move |ros| {
         let config = dds_config(ros, &opener);
         // An ordinary participant, whose topics the node's own sees as any program's.
@@ -294,8 +296,10 @@ pub async fn run(
             CycloneNetwork::open(&of_gateway).map(|network| Arc::new(network) as Arc<dyn LocalRos>)
         });
         let network = Arc::new(CycloneNetwork::open(&config)?);
-        runtime.spawn(discovery_server::watch());
-        runtime.spawn(protected::watch());
+        if !is_watched.swap(true, Ordering::Relaxed) {
+            runtime.spawn(discovery_server::watch());
+            runtime.spawn(protected::watch());
+        }
         Ok((network, Some(gateway)))
     });
     run_opening(config, identity, open, options, shutdown).await
@@ -421,7 +425,8 @@ async fn run_with<N: RosNetwork>(
         }
         local_routes(&identity, shares, uses, &mut rng)
     });
-    let network = NetworkSlot::new(network);
+    let again = open.as_ref().zip(config.ros.as_ref()).map(|(open, ros)| open_again(open, ros));
+    let network = NetworkSlot::new(network, again);
 
     let definitions = Definitions::from_env(config.ros.as_ref().map_or(&[], |ros| &ros.definitions));
     let types = options.types.unwrap_or_default();
@@ -524,6 +529,7 @@ async fn run_with<N: RosNetwork>(
         accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
+    tasks.push(tokio::spawn(reopening::watch(holder.network.clone(), network.clone(), events.clone())));
     let join = open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone()));
     let reloader = Arc::new(Reloader {
         source: options.source,
@@ -634,10 +640,16 @@ fn local_routes(
 }
 
 /// Starts discovery, which the control task hears.
-fn discover<N: RosNetwork>(network: &N, events: mpsc::Sender<CoreEvent>) -> Result<(), RosError> {
+pub(crate) fn discover<N: RosNetwork>(network: &N, events: mpsc::Sender<CoreEvent>) -> Result<(), RosError> {
     network.discover(Box::new(move |event| {
         let _ = events.blocking_send(CoreEvent::Discovery(event));
     }))
+}
+
+/// Returns how a network that was opened with this configuration is opened again. The gateway's part stays as it is.
+fn open_again<N: RosNetwork>(open: &OpenNetwork<N>, ros: &RosConfig) -> OpenAgain<N> {
+    let (open, ros) = (open.clone(), ros.clone());
+    Arc::new(move || open(&ros).map(|(network, _)| network))
 }
 
 /// The way to the local network for a node that began without one.
@@ -652,6 +664,7 @@ fn join_late<N: RosNetwork>(
         let routes = local_routes(identity, Vec::new(), Vec::new(), &mut rng);
         let routes = routes.ok_or_else(|| NodeError::RouterIdentity.to_string())?;
         let (opened, of_gateway) = open(ros).map_err(|error| error.to_string())?;
+        network.set_again(open_again(&open, ros));
         network.put(opened.clone());
         gateway.set_local_network(of_gateway);
         // Ahead of what is discovered.

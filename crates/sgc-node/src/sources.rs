@@ -32,20 +32,74 @@ use crate::shaper::Shaper;
 use crate::stats::DataDrop;
 use crate::tap::{Tapped, Taps};
 
+/// The time stamps of the newest samples that readers of a transient-local topic took, by writer.
+#[derive(Debug, Default)]
+pub(crate) struct NewestSamples(Mutex<BTreeMap<Guid, i64>>);
+
+impl NewestSamples {
+    fn note(&self, writer: Guid, timestamp_ns: i64) {
+        let mut newest = lock(&self.0);
+        if newest.len() < NEWEST_WRITERS_MAX || newest.contains_key(&writer) {
+            let known = newest.entry(writer).or_insert(timestamp_ns);
+            *known = timestamp_ns.max(*known);
+        }
+    }
+}
+
 /// The local reader's end of a share.
-pub(crate) struct Publisher(pub Arc<LocalShare>);
+pub(crate) struct Publisher {
+    share: Arc<LocalShare>,
+    /// The newest that were taken before this reader was made, which its writers give it once more.
+    past: BTreeMap<Guid, i64>,
+    newest: Option<Arc<NewestSamples>>,
+}
+
+impl Publisher {
+    /// The end of a reader; `newest` says what readers before it took, and is kept from here on.
+    pub(crate) fn new(share: Arc<LocalShare>, newest: Option<Arc<NewestSamples>>) -> Self {
+        let past = newest.as_ref().map(|newest| lock(&newest.0).clone()).unwrap_or_default();
+        Self { share, past, newest }
+    }
+
+    /// Returns `true` for a sample that a reader before this one took. A writer dates no two samples alike.
+    fn is_past(&self, sample: &Sample) -> bool {
+        let newest = sample.writer.and_then(|writer| self.past.get(&writer));
+        newest.is_some_and(|newest| sample.source_timestamp_ns <= *newest)
+    }
+
+    /// Leaves a sample out that was taken before, or else gives it to the share and notes it.
+    fn take(
+        &self,
+        sample: Sample,
+        publish: impl FnOnce(&Arc<LocalShare>, Sample) -> Result<(), Sample>,
+    ) -> Result<(), Sample> {
+        if self.is_past(&sample) {
+            self.share.data.count_here(&self.share.name, DataDrop::Repeated, 1);
+            return Ok(());
+        }
+        let (writer, timestamp_ns) = (sample.writer, sample.source_timestamp_ns);
+        publish(&self.share, sample)?;
+        if let (Some(newest), Some(writer)) = (&self.newest, writer) {
+            newest.note(writer, timestamp_ns);
+        }
+        Ok(())
+    }
+}
 
 impl HandleSamples for Publisher {
     fn handle(&mut self, sample: Sample) {
-        self.0.publish(sample);
+        let _ = self.take(sample, |share, sample| {
+            share.publish(sample);
+            Ok(())
+        });
     }
 
     fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
-        self.0.publish_at_once(sample)
+        self.take(sample, |share, sample| share.publish_at_once(sample))
     }
 
     fn overrun(&mut self, samples: u64) {
-        self.0.count_overrun(samples);
+        self.share.count_overrun(samples);
     }
 }
 
@@ -60,6 +114,9 @@ pub(crate) enum IsTooLarge {
 
 /// Samples that may wait for their writer to be discovered, or for what their type looks like.
 const EARLY_SAMPLES_MAX: usize = 256;
+
+/// Writers of a topic whose newest samples are remembered.
+const NEWEST_WRITERS_MAX: usize = 1024;
 
 /// The longest message that the reader's thread sends itself, if nothing comes behind it.
 const AT_HAND_BYTES_MAX: usize = 16 << 10;
@@ -866,6 +923,40 @@ mod tests {
         assert_eq!(unflushed(&slot), 0);
     }
 
+    #[test]
+    fn reader_in_the_place_of_another_takes_nothing_twice() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, _) = share();
+        let newest = Some(Arc::default());
+        let dated = |timestamp| Sample { source_timestamp_ns: timestamp, ..sample(KNOWN, false) };
+        let mut first = Publisher::new(share.clone(), newest.clone());
+        [1, 2, 3].into_iter().for_each(|timestamp| first.handle(dated(timestamp)));
+        assert_eq!(share.published(), 3);
+        // The same samples once more, and those that came meanwhile.
+        let mut second = Publisher::new(share.clone(), newest);
+        [1, 2, 3, 4, 5].into_iter().for_each(|timestamp| second.handle(dated(timestamp)));
+        assert_eq!(share.published(), 5);
+        assert_eq!(share.data.drops().snapshot()["repeated"], 3);
+        // A reader does not compare what it takes itself.
+        second.handle(dated(5));
+        assert_eq!(share.published(), 6);
+    }
+
+    #[test]
+    fn newest_samples_are_kept_of_a_bounded_number_of_writers() {
+        let newest = NewestSamples::default();
+        for n in 0..2 * NEWEST_WRITERS_MAX {
+            let mut guid = [0; 16];
+            guid[..8].copy_from_slice(&n.to_be_bytes());
+            newest.note(Guid(guid), 7);
+            newest.note(Guid(guid), 6);
+        }
+        let newest = lock(&newest.0);
+        assert_eq!(newest.len(), NEWEST_WRITERS_MAX);
+        assert!(newest.values().all(|timestamp| *timestamp == 7));
+    }
+
     /// Until it is so, which has a bound.
     fn wait_until(is_so: impl Fn() -> bool) {
         let end = Instant::now() + Duration::from_secs(30);
@@ -886,7 +977,7 @@ mod tests {
             Tree { up: LinkId::LOCAL, down: [link].as_slice().into(), publishers: [].as_slice().into() };
         let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
         share.data.set(share.name, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
-        let mut publisher = Publisher(share.clone());
+        let mut publisher = Publisher::new(share.clone(), None);
         let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_ok();
         assert!(is_taken(sample(KNOWN, false)));
         assert_eq!((share.published(), flow.is_at_ease()), (1, true));

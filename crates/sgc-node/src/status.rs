@@ -37,6 +37,8 @@ pub struct Status {
     pub drops: BTreeMap<String, u64>,
     /// Peers refused at the door, by kind.
     pub refused: BTreeMap<String, u64>,
+    /// Times that the local network was opened again since this host's addresses changed.
+    pub local_network_reopened: u64,
     /// How much the router knows.
     pub router: RouterLine,
     /// Programs without ROS, if they may connect.

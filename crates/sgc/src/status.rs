@@ -54,6 +54,7 @@ pub(crate) struct Status {
     names: Vec<NameTraffic>,
     pub(crate) drops: BTreeMap<String, u64>,
     pub(crate) refused: BTreeMap<String, u64>,
+    local_network_reopened: u64,
     router: RouterSize,
     gateway: Option<Gateway>,
 }
@@ -343,6 +344,12 @@ impl Status {
         }
         let RouterSize { nodes, names, routed_names, branches } = self.router;
         lines.push(String::new());
+        if self.local_network_reopened > 0 {
+            let times = self.local_network_reopened;
+            lines.push(format!(
+                "Local network: opened again after this host's addresses changed, so often: {times}"
+            ));
+        }
         lines.push(format!(
             "Router: {nodes} nodes and {names} names known, {routed_names} with a route, {branches} branches"
         ));

@@ -5,6 +5,7 @@
 //! nothing matches ([`RosNetwork::show`]). One writer gives the messages of all publishers elsewhere: it is shown as that of the first of
 //! them, and each other one by an endpoint that nothing matches.
 
+use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
@@ -93,6 +94,12 @@ impl FarConsumers {
 
     pub(super) fn show_soon(&mut self, now: Instant) {
         self.show_due.get_or_insert(now + SHOW_AFTER);
+    }
+
+    /// Returns the endpoints of all consumers that are shown, which are not from here on.
+    pub(super) fn take_shown(&mut self) -> Vec<Box<dyn Any + Send>> {
+        let shown = std::mem::take(&mut self.shown).into_values();
+        shown.filter_map(|shown| Some(Box::new(shown.endpoints?) as _)).collect()
     }
 
     /// The type hashes that the subscribers or clients of a share announce, with their SGC nodes.
@@ -306,8 +313,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Shows no consumers any more.
     pub(super) fn end_consumers(&mut self) {
-        let shown = std::mem::take(&mut self.consumers).shown;
-        drop_elsewhere(Box::new(shown.into_values().filter_map(|shown| shown.endpoints).collect::<Vec<_>>()));
+        drop_elsewhere(Box::new(std::mem::take(&mut self.consumers).take_shown()));
     }
 }
 

@@ -54,7 +54,7 @@ impl<N: RosNetwork> Core<N> {
         let mut graph = Graph {
             node: self.identity.node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            has_ros: self.network.get().is_some(),
+            has_ros: self.routes.is_some(),
             drops: self.all_drops(),
             refused: self.all_refused(),
             alerts: self.alerts(),

@@ -93,6 +93,14 @@ impl LocalGraph {
         self.writer_gone(&(*name, None));
     }
 
+    /// No endpoint is there any more; which nodes they are of stays.
+    pub(super) fn endpoints_gone(&mut self) {
+        self.readers.clear();
+        self.writers.clear();
+        self.consumers.clear();
+        self.has_changed = true;
+    }
+
     /// Whose node a writer, here or on its way, stands for; the reader of the name with it, if it is for all sources.
     pub(super) fn set_node(&mut self, key: WriterKey, owner: NodeId, node: Option<RosNode>) {
         self.has_changed |= match node {

@@ -14,7 +14,7 @@ use tracing::{debug, error, warn};
 use super::publish::Offer;
 use super::{
     Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT,
-    drop_elsewhere, now,
+    LocalReader, drop_elsewhere, now,
 };
 use crate::dataplane::{Forward, Out};
 use crate::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
@@ -91,7 +91,7 @@ impl<N: RosNetwork> Core<N> {
             Command::OpenReader { name, spec } => self.open_reader(name, spec),
             Command::CloseReader { name } => {
                 self.graph.reader_gone(&name);
-                if let Some((_, Some(reader))) = self.readers.remove(&name) {
+                if let Some(reader) = self.readers.remove(&name).and_then(|reader| reader.opened) {
                     drop_elsewhere(reader);
                 }
             }
@@ -226,15 +226,19 @@ impl<N: RosNetwork> Core<N> {
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
     }
 
+    /// Makes a reader; while the network is closed it is noted alone. One that takes the place of another does not take again what that
+    /// one had.
     pub(super) fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
-        let (Some(network), Some(share)) = (self.network.get(), self.shares.get(&name).cloned()) else {
-            return;
-        };
-        let Some(events) = self.events.upgrade() else { return };
-        self.readers.insert(name, (spec.clone(), None));
+        let Some(share) = self.shares.get(&name).cloned() else { return };
+        let newest = self.readers.remove(&name).and_then(|old| old.newest);
+        let newest = newest.or_else(|| spec.qos.is_transient_local().then(Arc::default));
+        let wanted = LocalReader { spec: spec.clone(), opened: None, newest: newest.clone() };
+        self.readers.insert(name, wanted);
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
+        let publisher = Box::new(Publisher::new(share, newest));
         let alive = self.alive.clone();
         let failures = self.ros_failures.clone();
-        tokio::task::spawn_blocking(move || match network.create_reader(&spec, Box::new(Publisher(share))) {
+        tokio::task::spawn_blocking(move || match network.create_reader(&spec, publisher) {
             Ok(reader) => {
                 let _ = events.blocking_send(CoreEvent::ReaderReady {
                     name,
@@ -251,9 +255,8 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
-        let Some(network) = self.network.get() else { return };
-        let Some(events) = self.events.upgrade() else { return };
         self.writers.insert((name, source), spec.clone());
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         let alive = self.alive.clone();
         let failures = self.ros_failures.clone();
         let shaping = self.sinks.get(&name).map(|sink| sink.shaping()).unwrap_or_default();

@@ -204,13 +204,13 @@ impl<N: RosNetwork> Core<N> {
         spec: ServiceSpec,
         make: impl FnOnce(&N, &ServiceSpec) -> Result<ServiceEnd, sgc_ros::RosError> + Send + 'static,
     ) {
-        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         self.service_ends.insert(name, spec.clone());
         if let (Some(calls), Some((_, service, _))) =
             (self.calls.get(&name), ServiceTopic::of(&spec.request.topic, &spec.request.type_name))
         {
             calls.ledger().set_topic(service);
         }
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
@@ -225,7 +225,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn service_ready(&mut self, name: Name, spec: &ServiceSpec, end: ServiceEnd) {
-        let wanted = self.service_ends.get(&name) == Some(spec);
+        let wanted = !self.reopening.is_closed && self.service_ends.get(&name) == Some(spec);
         if wanted {
             self.graph.service_there(
                 name,

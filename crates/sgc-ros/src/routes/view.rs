@@ -6,7 +6,7 @@ use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, PayloadForm, Qos};
 
 use super::{Direction, Routes};
 use crate::names::ros_type;
-use crate::network::DiscoveredEndpoint;
+use crate::network::{DiscoveredEndpoint, Guid};
 use crate::qos::weakest;
 
 /// A rule of what is shared, and what runs of it.
@@ -110,6 +110,11 @@ impl<R> Routes<R> {
     /// What was discovered on the local network.
     pub fn local_endpoints(&self) -> impl Iterator<Item = &DiscoveredEndpoint> {
         self.endpoints.values()
+    }
+
+    /// The local participants of which nodes are known.
+    pub fn local_participants(&self) -> impl Iterator<Item = Guid> {
+        self.nodes.keys().copied()
     }
 
     /// The rule that shares a local interface, by its place among [`Self::share_views`].
