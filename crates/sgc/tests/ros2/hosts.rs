@@ -4,9 +4,11 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use sgc_testkit::netsim::Namespace;
+
 use crate::lab::{Lab, Site, robot_to_desk, share, uses};
 use crate::support::{PATIENCE, Peer, eventually};
-use crate::{PAIRS, PLAN};
+use crate::{PAIRS, PLAN, count};
 
 const SERVER: &str = "ROS_DISCOVERY_SERVER=127.0.0.1:11811";
 
@@ -36,7 +38,6 @@ fn packets_that_cannot_be_sent_are_said() {
     let [jazzy, kilted] = PAIRS[0];
     let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
     let Some(robot) = lab.namespace(Site::Robot) else { return };
-    let ip = |args: &str| robot.ip(&args.split_whitespace().collect::<Vec<_>>()).unwrap();
     let talk = ["pub", "--topic", "/load", "--count", "0", "--rate", "20", "--timeout", PLAN.peer_life];
     let _talker = lab.load(Site::Robot, jazzy, &talk);
     let listen = ["sub", "--topic", "/load", "--verbose", "--timeout", PLAN.peer_life];
@@ -44,7 +45,7 @@ fn packets_that_cannot_be_sent_are_said() {
     listener.wait("a message", |event| event["event"] == "received");
     let before = lab.why(Site::Robot, "/load");
     assert!(!before.contains("cannot be sent"), "{before}");
-    ip("addr del 10.92.1.2/24 dev cloud");
+    change(robot, "addr del 10.92.1.2/24 dev cloud");
     eventually("sgc why says so", || lab.why(Site::Robot, "/load").contains("cannot be sent"));
     let lines = lab.log(Site::Robot).lines().filter(|line| line.contains("ddsi_")).count();
     assert_eq!(lines, 0, "lines of Cyclone's own");
@@ -53,36 +54,57 @@ fn packets_that_cannot_be_sent_are_said() {
 /// Bound on the time from the end of a change to the next message.
 const RESUMED: Duration = Duration::from_secs(2);
 
-/// Environments of programs: as ROS 2 ships, and two ways to keep to one's host.
-const RANGES: [(&str, &[(&str, &str)]); 3] = [
-    ("subnet", &[]),
-    ("localhost", &[("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")]),
-    ("localhost_only", &[("ROS_LOCALHOST_ONLY", "1")]),
-];
+/// Variables that say how far a program is discovered: as ROS 2 ships, and two ways to keep to one's host.
+type Environment = &'static [(&'static str, &'static str)];
+const SUBNET: Environment = &[];
+const LOCALHOST: Environment = &[("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")];
+const RANGES: [(&str, Environment); 3] =
+    [("subnet", SUBNET), ("localhost", LOCALHOST), ("localhost_only", &[("ROS_LOCALHOST_ONLY", "1")])];
 
-/// A publisher and a subscriber at the robot, and their counterparts at the desk.
+/// A publisher and a subscriber at a site, and their counterparts at the desk.
 struct Flow {
     name: String,
     listeners: [Peer; 2],
     _talkers: [Peer; 2],
 }
 
+/// The topics of flows, from the site and to it.
+fn topics<'a>(way: &str, labels: impl IntoIterator<Item = &'a str>) -> Vec<String> {
+    labels.into_iter().map(|label| format!("/{way}_{label}")).collect()
+}
+
+/// Tables of the robot and of the desk by which flows of these labels go both ways.
+fn both_ways<'a>(labels: impl IntoIterator<Item = &'a str> + Clone) -> [String; 2] {
+    let [mut robot, mut desk] = robot_to_desk("topic", topics("up", labels.clone()));
+    for topic in topics("down", labels) {
+        robot += &uses("topic", &topic, "desk");
+        desk += &share("topic", &topic, "robot");
+    }
+    [robot, desk]
+}
+
 impl Flow {
-    /// Starts both directions; the robot's programs have this environment.
-    fn start(lab: &Lab, [robot, desk]: [&str; 2], range: (&str, &[(&str, &str)])) -> Self {
-        let topics = ["up", "down"].map(|way| format!("/{way}_{}", range.0));
+    /// Starts both directions, with the environments of the programs at the site and of those at the desk.
+    fn start(
+        lab: &Lab,
+        site: Site,
+        [near, desk]: [&str; 2],
+        label: &str,
+        [at_site, at_desk]: [Environment; 2],
+    ) -> Self {
+        let topics = ["up", "down"].map(|way| format!("/{way}_{label}"));
         let talk =
             |topic| ["pub", "--topic", topic, "--count", "0", "--rate", "20", "--timeout", PLAN.peer_life];
         let listen = |topic| ["sub", "--topic", topic, "--verbose", "--timeout", PLAN.peer_life];
         Self {
-            name: format!("{robot} as {} at the robot, {desk} at the desk", range.0),
+            name: format!("{near} as {label} at the {}, {desk} at the desk", site.name()),
             listeners: [
-                lab.load(Site::Desk, desk, &listen(&topics[0])),
-                lab.load_within(Site::Robot, robot, range.1, &listen(&topics[1])),
+                lab.load_within(Site::Desk, desk, at_desk, &listen(&topics[0])),
+                lab.load_within(site, near, at_site, &listen(&topics[1])),
             ],
             _talkers: [
-                lab.load_within(Site::Robot, robot, range.1, &talk(&topics[0])),
-                lab.load(Site::Desk, desk, &talk(&topics[1])),
+                lab.load_within(site, near, at_site, &talk(&topics[0])),
+                lab.load_within(Site::Desk, desk, at_desk, &talk(&topics[1])),
             ],
         }
     }
@@ -103,29 +125,148 @@ impl Flow {
     }
 }
 
+fn assert_all(flows: &mut [Flow], bound: Duration, when: &str) {
+    let since = Instant::now();
+    flows.iter_mut().for_each(|flow| flow.assert_goes_on(since, bound, when));
+}
+
+/// Changes the network of the robot, as `ip` does with these arguments.
+fn change(robot: &Namespace, args: &str) {
+    robot.ip(&args.split_whitespace().collect::<Vec<_>>()).unwrap();
+}
+
 #[test]
 fn topics_of_programs_of_a_host_survive_its_addresses() {
     for pair in PAIRS {
-        let topics = |way: &str| RANGES.map(|(range, _)| format!("/{way}_{range}"));
-        let [mut robot, mut desk] = robot_to_desk("topic", topics("up"));
-        for topic in topics("down") {
-            robot += &uses("topic", &topic, "desk");
-            desk += &share("topic", &topic, "robot");
-        }
-        let lab = Lab::real(PLAN, [robot, desk]);
-        let mut flows = RANGES.map(|range| Flow::start(&lab, pair, range));
-        let mut assert_all = |bound, when: &str| {
-            let since = Instant::now();
-            flows.iter_mut().for_each(|flow| flow.assert_goes_on(since, bound, when));
-        };
-        assert_all(PATIENCE, "at first");
+        let lab = Lab::real(PLAN, both_ways(RANGES.map(|(label, _)| label)));
+        let mut flows =
+            RANGES.map(|(label, range)| Flow::start(&lab, Site::Robot, pair, label, [range, SUBNET]));
+        assert_all(&mut flows, PATIENCE, "at first");
         let Some(robot) = lab.namespace(Site::Robot) else { continue };
-        let ip = |args: &str| robot.ip(&args.split_whitespace().collect::<Vec<_>>()).unwrap();
-        ip("addr del 10.92.1.2/24 dev cloud");
-        ip("addr add 10.92.1.3/24 dev cloud");
-        assert_all(RESUMED, "with another address");
-        ip("link set cloud down");
-        ip("link set cloud up");
-        assert_all(RESUMED, "after the interface was down");
+        change(robot, "addr del 10.92.1.2/24 dev cloud");
+        change(robot, "addr add 10.92.1.3/24 dev cloud");
+        assert_all(&mut flows, RESUMED, "with another address");
+        change(robot, "link set cloud down");
+        change(robot, "link set cloud up");
+        assert_all(&mut flows, RESUMED, "after the interface was down");
+    }
+}
+
+/// Longer than the leases of Fast DDS (20 s) and of Cyclone DDS (10 s).
+const OUTAGE: Duration = Duration::from_secs(24);
+
+#[test]
+fn topics_survive_an_outage_longer_than_leases_and_reach_programs_that_start_later() {
+    let early = ["early_subnet", "early_localhost"];
+    let late = ["late_subnet", "late_localhost", "late_subnet_too"];
+    let lab = Lab::real(PLAN, both_ways(early.into_iter().chain(late)));
+    let [old, new] = PAIRS;
+    let start = |pair, label, range| Flow::start(&lab, Site::Robot, pair, label, [range, SUBNET]);
+    let mut flows = vec![start(old, early[0], SUBNET), start(new, early[1], LOCALHOST)];
+    assert_all(&mut flows, PATIENCE, "at first");
+    let Some(robot) = lab.namespace(Site::Robot) else { return };
+    change(robot, "addr del 10.92.1.2/24 dev cloud");
+    change(robot, "link set cloud down");
+    // Without an interface nothing reaches the desk; what the lease is about is that programs stay known.
+    let until = Instant::now() + OUTAGE;
+    while Instant::now() < until {
+        let here = lab.status(Site::Robot)["routes"].to_string();
+        assert!(here.matches("1 local publishers").count() >= 2, "a publisher was lost: {here}");
+        std::thread::sleep(Duration::from_millis(500));
+    }
+    change(robot, "addr add 10.92.1.3/24 dev cloud");
+    change(robot, "link set cloud up");
+    eventually("the link to the cloud is back", || {
+        lab.status(Site::Robot)["links"].as_array().is_some_and(|links| !links.is_empty())
+    });
+    assert_all(&mut flows, PATIENCE, "after a long outage");
+    flows.push(start(old, late[0], SUBNET));
+    flows.push(start(new, late[1], LOCALHOST));
+    flows.push(start(new, late[2], SUBNET));
+    assert_all(&mut flows, PATIENCE, "for programs that started after the change");
+}
+
+/// Bound on the time from a change of addresses to messages of programs of other hosts: until a packet to them fails, the addresses count as
+/// settled, and the network is open again.
+const REOPENED: Duration = Duration::from_secs(30);
+
+#[test]
+fn programs_of_other_hosts_come_back_after_an_address_change() {
+    for pair in PAIRS {
+        let [mut robot, mut desk] = both_ways(["same", "other"]);
+        for topic in ["/latched_same", "/latched_other"] {
+            robot += &share("topic", topic, "desk");
+            desk += &uses("topic", topic, "robot");
+        }
+        let mut lab = Lab::silent(PLAN, [robot, desk]);
+        lab.reconfigure(Site::Robot, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+        lab.start_all();
+        let Some(robot) = lab.namespace(Site::Robot) else { return };
+        // The cloud's host is on the robot's network, too: its programs are those of a second computer.
+        // The desk's programs do not hear it.
+        let mut flows = [
+            Flow::start(&lab, Site::Robot, pair, "same", [LOCALHOST, LOCALHOST]),
+            Flow::start(&lab, Site::Cloud, pair, "other", [SUBNET, LOCALHOST]),
+        ];
+        let latch = |site, topic| {
+            let says = ["pub", "--topic", topic, "--transient-local", "--depth", "1", "--count", "1"];
+            lab.load(site, pair[0], &[&says[..], &["--hold", "110", "--timeout", PLAN.peer_life]].concat())
+        };
+        let _latched = [latch(Site::Robot, "/latched_same"), latch(Site::Cloud, "/latched_other")];
+        let hears = ["/latched_same", "/latched_other"].map(|topic| {
+            let listens = ["sub", "--topic", topic, "--transient-local", "--verbose", "--linger", "100"];
+            let listens = [&listens[..], &["--timeout", PLAN.peer_life]].concat();
+            let mut hears = lab.load_within(Site::Desk, pair[1], LOCALHOST, &listens);
+            hears.wait("what is latched", |event| event["event"] == "received");
+            hears
+        });
+        assert_all(&mut flows, PATIENCE, "at first");
+        assert_eq!(lab.status(Site::Robot)["local_network_reopened"], 0);
+        change(robot, "addr del 10.92.1.2/24 dev cloud");
+        change(robot, "addr add 10.92.1.3/24 dev cloud");
+        let changed = Instant::now();
+        eventually("the network is opened again", || lab.status(Site::Robot)["local_network_reopened"] == 1);
+        flows[1].assert_goes_on(
+            Instant::now(),
+            (changed + REOPENED).saturating_duration_since(Instant::now()),
+            "with another address",
+        );
+        assert_all(&mut flows, RESUMED, "once the network is open again");
+        for topic in ["/up_same", "/up_other"] {
+            let why = lab.why(Site::Robot, topic);
+            assert!(!why.contains("cannot be sent"), "{why}");
+        }
+        assert!(lab.log(Site::Robot).contains("the local ROS 2 network was opened again"));
+        for mut hears in hears {
+            hears.end();
+            let summary = hears.summary();
+            assert_eq!([count(&summary, "received"), count(&summary, "duplicated")], [1, 0], "{summary}");
+        }
+        assert_eq!(lab.status(Site::Robot)["local_network_reopened"], 1, "once is enough");
+    }
+}
+
+/// A map in either direction, between programs of Python that discover as ROS 2 does by default.
+#[test]
+fn nodes_with_defaults_are_found_by_a_proxy_that_keeps_to_its_host() {
+    let [mut robot, mut desk] = robot_to_desk("topic", ["/up"]);
+    robot += &uses("topic", "/down", "desk");
+    desk += &share("topic", "/down", "robot");
+    let mut lab = Lab::silent(PLAN, [robot, desk]);
+    lab.start_all();
+    for pair in PAIRS {
+        for (topic, sites) in [("/up", [Site::Robot, Site::Desk]), ("/down", [Site::Desk, Site::Robot])] {
+            let program = |site, distribution, role| {
+                let arguments = [role, "--topic", topic, "--timeout", PLAN.peer_life];
+                lab.rclpy(site, distribution, "latched.py", &arguments)
+            };
+            let mut hears = program(sites[1], pair[1], "hear");
+            let mut map = program(sites[0], pair[0], "map");
+            hears.wait("the last map", |event| event["event"] == "received" && event["seq"] == 2);
+            for program in [&mut hears, &mut map] {
+                program.end();
+                program.summary();
+            }
+        }
     }
 }
