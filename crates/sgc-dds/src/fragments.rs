@@ -2,17 +2,22 @@
 //!
 //! Cyclone takes a sample for complete once its fragments reach the length that the first one announces. It does not compare
 //! that length with the other fragments, which announce one each: a fragment that announces more may reach beyond it. What
-//! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here.
+//! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here, and [`guard_discovery`] has Cyclone's own
+//! types of samples do it.
 //!
 //! The submessages behind a sample in its packet are read here as well: [`kept_by_writer`].
 //!
 //! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`.
 
-use std::ffi::c_void;
+use std::ffi::{c_int, c_long, c_void};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicPtr, Ordering};
 
-use cyclors::ddsi_rdata;
+use cyclors::{ddsi_rdata, ddsi_serdata, ddsi_serdata_kind, ddsi_serdata_ops, ddsi_sertype};
 
 use crate::inline_qos::{DATA, DATA_FRAG, FLAG_LITTLE_ENDIAN};
+use crate::network::read_file;
+use crate::payload::HEADER_BYTES;
 
 /// Submessages behind a sample's that are looked at.
 const SUBMESSAGES_MAX: usize = 4;
@@ -70,6 +75,114 @@ pub(crate) unsafe fn cover_exactly(fragments: *const ddsi_rdata, bytes: usize) -
     covered == bytes
 }
 
+// Of `ddsi__serdata_plist.h`, `ddsi__serdata_pserop.h` and `ddsi__serdata_cdr.h`: the tables of functions of Cyclone's own types, which are those
+// of participants and endpoints, of liveliness and DDS Security, and of questions for types. mprotect(2), sysconf(3).
+#[allow(improper_ctypes)]
+unsafe extern "C" {
+    static ddsi_serdata_ops_plist: ddsi_serdata_ops;
+    static ddsi_serdata_ops_pserop: ddsi_serdata_ops;
+    static ddsi_serdata_ops_cdr: ddsi_serdata_ops;
+    fn mprotect(start: *mut c_void, bytes: usize, protection: c_int) -> c_int;
+    fn sysconf(name: c_int) -> c_long;
+}
+
+/// Linux: `_SC_PAGESIZE`, `PROT_READ`, `PROT_WRITE`.
+const PAGE_SIZE: c_int = 30;
+const READ: c_int = 1;
+const WRITE: c_int = 2;
+
+type FromSer = unsafe extern "C" fn(
+    *const ddsi_sertype,
+    ddsi_serdata_kind,
+    *const ddsi_rdata,
+    usize,
+) -> *mut ddsi_serdata;
+
+/// Cyclone's own functions, by table.
+static FROM_SER: [AtomicPtr<c_void>; 3] = [const { AtomicPtr::new(std::ptr::null_mut()) }; 3];
+
+/// Has Cyclone's own types of samples refuse fragments that do not cover their sample exactly, for the whole process and for ever. To be called
+/// before there is a domain.
+///
+/// The tables are constants, in memory that is protected against writing: it is opened for a moment.
+///
+/// # Errors
+/// The reason, where the memory is not as it should be.
+pub(crate) fn guard_discovery() -> Result<(), &'static str> {
+    static DONE: OnceLock<Result<(), &'static str>> = OnceLock::new();
+    *DONE.get_or_init(|| {
+        let tables = [
+            (&raw const ddsi_serdata_ops_plist, covered::<0> as FromSer),
+            (&raw const ddsi_serdata_ops_pserop, covered::<1> as FromSer),
+            (&raw const ddsi_serdata_ops_cdr, covered::<2> as FromSer),
+        ];
+        tables.into_iter().zip(&FROM_SER).try_for_each(|((table, ours), original)| {
+            // SAFETY: a table of Cyclone's, which lives for ever.
+            let field = unsafe { &raw const (*table).from_ser }.cast_mut().cast::<*mut c_void>();
+            // SAFETY: a function of the table.
+            original.store(unsafe { field.read_volatile() }, Ordering::Release);
+            // SAFETY: ours has the signature of the one before, which it calls, and Cyclone reads the field whole.
+            unsafe { replace(field, ours as *mut c_void) }
+        })
+    })
+}
+
+/// Writes a pointer to memory that may be protected against it.
+///
+/// # Safety
+/// `field` must be aligned and valid for ever, its value one that all who read it can use.
+unsafe fn replace(field: *mut *mut c_void, with: *mut c_void) -> Result<(), &'static str> {
+    let maps = read_file("/proc/self/maps").unwrap_or_default();
+    let is_writable = match protection(&maps, field as usize) {
+        Some("rw-p") => true,
+        Some("r--p") => false,
+        _ => return Err("the memory of its functions is not as expected"),
+    };
+    // SAFETY: takes a number.
+    let page_bytes = unsafe { sysconf(PAGE_SIZE) };
+    let page_bytes = usize::try_from(page_bytes).ok().filter(|bytes| bytes.is_power_of_two());
+    let page_bytes = page_bytes.ok_or("the length of a page is not known")?;
+    let page = field.map_addr(|at| at & !(page_bytes - 1)).cast::<c_void>();
+    // SAFETY: one page of this process. It stays readable throughout, and nothing in it is code.
+    let protect = |protection| unsafe { mprotect(page, page_bytes, protection) } == 0;
+    if !is_writable && !protect(READ | WRITE) {
+        return Err("the memory of its functions cannot be written to");
+    }
+    // SAFETY: by contract, and writable now. An aligned pointer is in one page.
+    unsafe { AtomicPtr::from_ptr(field) }.store(with, Ordering::Release);
+    if !is_writable {
+        // If that fails the page stays writable, as it is where the linker does not protect it.
+        protect(READ);
+    }
+    Ok(())
+}
+
+/// Returns the protection of an address, such as `r--p`, from `/proc/self/maps` (proc_pid_maps(5)).
+fn protection(maps: &str, address: usize) -> Option<&str> {
+    maps.lines().find_map(|line| {
+        let mut words = line.split_ascii_whitespace();
+        let (start, end) = words.next()?.split_once('-')?;
+        let number = |text| usize::from_str_radix(text, 16).ok();
+        (number(start)?..number(end)?).contains(&address).then(|| words.next()).flatten()
+    })
+}
+
+/// Takes the place of Cyclone's own function of a table.
+unsafe extern "C" fn covered<const TABLE: usize>(
+    sertype: *const ddsi_sertype,
+    kind: ddsi_serdata_kind,
+    fragments: *const ddsi_rdata,
+    bytes: usize,
+) -> *mut ddsi_serdata {
+    let original = FROM_SER[TABLE].load(Ordering::Acquire);
+    // SAFETY: the fragments are those that Cyclone gave for this function.
+    if original.is_null() || bytes < HEADER_BYTES || !unsafe { cover_exactly(fragments, bytes) } {
+        return std::ptr::null_mut();
+    }
+    // SAFETY: the function that was there, with its own arguments.
+    unsafe { std::mem::transmute::<*mut c_void, FromSer>(original)(sertype, kind, fragments, bytes) }
+}
+
 /// Returns the number of messages that the writer of a sample keeps, if a heartbeat follows in the packet and says that the writer has
 /// dropped older ones.
 ///
@@ -79,7 +192,6 @@ pub(crate) unsafe fn cover_exactly(fragments: *const ddsi_rdata, bytes: usize) -
 /// # Safety
 /// `fragment` must be one that Cyclone hands to a type of samples, while it does so.
 pub(crate) unsafe fn kept_by_writer(fragment: &ReceivedFragment) -> Option<u64> {
-    let mut at = usize::from(fragment.submessage_offset);
     // SAFETY: valid by contract, and the packet follows the struct.
     let (packet, bytes) = unsafe {
         let bytes = (&raw const (*fragment.message).chunk_bytes).cast::<u32>().read_volatile();
@@ -87,13 +199,14 @@ pub(crate) unsafe fn kept_by_writer(fragment: &ReceivedFragment) -> Option<u64> 
     };
     // Cyclone allocates fragments behind the packet, in the same chunk while there is room.
     let distance = (std::ptr::from_ref(fragment) as usize).wrapping_sub(packet as usize);
-    let end = bytes.min(distance);
-    let read = |at: usize, bytes: usize| {
-        // SAFETY: inside of the packet.
-        at.checked_add(bytes)
-            .filter(|to| *to <= end)
-            .map(|_| unsafe { std::slice::from_raw_parts(packet.add(at), bytes) })
-    };
+    // SAFETY: the packet is as long, or what Cyclone allocated behind it is.
+    let packet = unsafe { std::slice::from_raw_parts(packet, bytes.min(distance)) };
+    kept_behind(packet, usize::from(fragment.submessage_offset))
+}
+
+/// Does so for the sample whose submessage begins there in a packet.
+fn kept_behind(packet: &[u8], mut at: usize) -> Option<u64> {
+    let read = |at: usize, bytes: usize| packet.get(at..at.checked_add(bytes)?);
     let head = read(at, DATA.1)?;
     if ![DATA.0, DATA_FRAG.0].contains(&head[0]) {
         return None;
@@ -137,6 +250,41 @@ fn kept(heartbeat: &[u8]) -> Option<u64> {
     (first > 1).then(|| last.checked_sub(first)?.checked_add(1)).flatten()
 }
 
+/// Panics if a packet, or one that was cut, shows a defect.
+#[cfg(feature = "fuzzing")]
+pub(crate) fn check_kept(packet: &[u8], at: usize) {
+    let kept = kept_behind(packet, at);
+    assert_ne!(kept, Some(0));
+    for cut in (0..packet.len()).step_by(1 + packet.len() / 16) {
+        let of_cut = kept_behind(&packet[..cut], at);
+        assert!(of_cut.is_none() || of_cut == kept, "{of_cut:?} of {cut} bytes, {kept:?} of all");
+    }
+}
+
+/// Panics if fragments that leave a gap in a sample, or reach beyond it, are said to cover it.
+#[cfg(feature = "fuzzing")]
+pub(crate) fn check_cover(ranges: &[(u8, u8)], bytes: u8) {
+    let fragment = |(first, end): &(u8, u8)| ReceivedFragment {
+        message: std::ptr::null(),
+        next: std::ptr::null(),
+        first: u32::from(*first),
+        end: u32::from(*end),
+        submessage_offset: 0,
+        payload_offset: 0,
+    };
+    let mut fragments: Vec<_> = ranges.iter().map(fragment).collect();
+    for at in (1..fragments.len()).rev() {
+        let next: *const ReceivedFragment = &fragments[at];
+        fragments[at - 1].next = next;
+    }
+    let first = fragments.first().map_or(std::ptr::null(), std::ptr::from_ref);
+    // SAFETY: a chain that ends with null.
+    if unsafe { cover_exactly(first.cast(), usize::from(bytes)) } {
+        let is_covered = |byte| ranges.iter().any(|(first, end)| (*first..*end).contains(&byte));
+        assert!((0..bytes).all(is_covered) && ranges.iter().all(|(_, end)| *end <= bytes), "{ranges:?}");
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -178,6 +326,15 @@ mod tests {
     fn heartbeat(writer: u8, first: u8, last: u8) -> Vec<u8> {
         let head = [HEARTBEAT.0, FLAG_LITTLE_ENDIAN, 28, 0, 0, 0, 0, 4, 0, 0, 0x13, writer];
         [&head[..], &[0, 0, 0, 0, first, 0, 0, 0], &[0, 0, 0, 0, last, 0, 0, 0], &[1, 0, 0, 0]].concat()
+    }
+
+    #[test]
+    fn protection_of_an_address_is_that_of_its_mapping() {
+        let maps = "1000-2000 r-xp 00000000 08:01 7 /usr/bin/a b\n2000-3000 r--p 0 08:01 7\n";
+        assert_eq!(
+            [0x1fff, 0x2000, 0x3000].map(|at| protection(maps, at)),
+            [Some("r-xp"), Some("r--p"), None]
+        );
     }
 
     #[test]

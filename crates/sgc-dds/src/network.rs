@@ -27,6 +27,7 @@ use crate::config::{
 use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
 use crate::first_messages;
+use crate::fragments;
 use crate::graph::{Announcer, SharedHandler, lock};
 use crate::host_addresses::{self, Changes};
 use crate::intake::Pace;
@@ -108,6 +109,12 @@ impl CycloneNetwork {
         let opened_after = host_addresses::changes();
         let (alive, all_dropped) = channel();
         let refused = |reason| RosError::Domain { domain: config.domain, reason };
+        if let Err(reason) = fragments::guard_discovery() {
+            tracing::warn!(
+                reason,
+                "this Cyclone DDS is another one: a program of the local network may write beyond this node's memory"
+            );
+        }
         let domain = create_domain(config)?;
         let qos = NativeQos::new().map_err(refused)?;
         let security = config.security.as_ref();
