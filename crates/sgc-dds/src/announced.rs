@@ -228,20 +228,22 @@ unsafe fn changed(
     Some(changed)
 }
 
-/// Gives the identifier of a type the number of a parameter that is ignored; none if there is no identifier.
+/// Gives each identifier of a type the number of a parameter that is ignored; none if there is no identifier.
 fn hide_type(list: &mut [u8]) -> Option<()> {
     let big = list.get(1)? & 1 == 0;
-    let (mut at, mut found) = (HEADER_BYTES, None);
+    let (mut at, mut found) = (HEADER_BYTES, Vec::new());
     for parameter in Parameters::new(list.get(HEADER_BYTES..)?, big) {
         let (pid, value) = parameter?;
         if pid == PID_TYPE_INFORMATION {
-            found = Some(at);
+            found.push(at);
         }
         at += 4 + value.len();
     }
     let number = if big { PID_IGNORED.to_be_bytes() } else { PID_IGNORED.to_le_bytes() };
-    list.get_mut(found?..)?.get_mut(..2)?.copy_from_slice(&number);
-    Some(())
+    for at in &found {
+        list.get_mut(*at..)?.get_mut(..2)?.copy_from_slice(&number);
+    }
+    (!found.is_empty()).then_some(())
 }
 
 /// Adds to the list of parameters of an announcement, in the byte order of this machine; none if there is nothing to add, or it is no
@@ -271,6 +273,24 @@ fn add_missing(list: &mut Vec<u8>, expects_inline_qos: bool) -> Option<()> {
     }
     add(PID_SENTINEL, &[]);
     Some(())
+}
+
+/// Panics if an announcement, received or about to be sent, shows a defect.
+#[cfg(feature = "fuzzing")]
+pub(crate) fn check(list: &[u8], expects_inline_qos: bool) {
+    let pids = |list: &[u8], big| -> Vec<_> {
+        Parameters::new(&list[HEADER_BYTES..], big).map(|p| p.expect("a whole list").0).collect()
+    };
+    let mut hidden = list.to_vec();
+    if hide_type(&mut hidden).is_some() {
+        assert!(!pids(&hidden, hidden[1] & 1 == 0).contains(&PID_TYPE_INFORMATION));
+        assert_eq!(hidden.len(), list.len());
+    }
+    let mut complete = list.to_vec();
+    if add_missing(&mut complete, expects_inline_qos).is_some() {
+        assert!(pids(&complete, cfg!(target_endian = "big")).contains(&PID_PARTICIPANT_GUID));
+        assert_eq!(add_missing(&mut complete.clone(), expects_inline_qos), None, "it is added twice");
+    }
 }
 
 #[cfg(test)]
@@ -306,6 +326,10 @@ mod tests {
         assert!(hide_type(&mut received).is_some());
         assert_eq!(received, type_of(PID_IGNORED));
         assert!(hide_type(&mut received).is_none());
+        let twice = |pid| list(&[parameter(pid, &[5; 12]), endpoint.clone(), parameter(pid, &[6; 12])]);
+        let mut received = twice(PID_TYPE_INFORMATION);
+        assert!(hide_type(&mut received).is_some());
+        assert_eq!(received, twice(PID_IGNORED));
         let mut cut = type_of(PID_TYPE_INFORMATION);
         cut.truncate(HEADER_BYTES + 22);
         assert!(hide_type(&mut cut).is_none());
