@@ -71,18 +71,26 @@ pub(crate) fn follow() {
         let started = kernel.and_then(|kernel| {
             thread::Builder::new().name("sgc-dds-host".into()).spawn(move || {
                 // Between the first look and the thread's beginning something may have changed, which the kernel kept.
-                while wait_for_change(&kernel).is_ok() {
+                let ended = loop {
+                    if let Err(error) = wait_for_change(&kernel) {
+                        break error;
+                    }
                     for pause in PAUSES {
                         thread::sleep(pause);
                         refresh(true);
                     }
-                }
+                };
+                warn_not_followed(&ended);
             })
         });
         if let Err(error) = started {
-            tracing::warn!(%error, "this host's addresses are not followed: local programs are lost when they change");
+            warn_not_followed(&error);
         }
     });
+}
+
+fn warn_not_followed(error: &io::Error) {
+    tracing::warn!(%error, "this host's addresses are not followed: local programs are lost when they change");
 }
 
 /// Returns `true` if an address that this host had is gone. Cheap.
@@ -116,7 +124,9 @@ fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
 
 /// Reads the addresses; what is other than before is a change, except for the first time.
 fn refresh(is_change: bool) {
-    let here = local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), HERE_MAX);
+    // What cannot be read does not say that all addresses are gone.
+    let Some(table) = read_file("/proc/net/fib_trie") else { return };
+    let here = local_addresses(&table, HERE_MAX);
     let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
     if addresses.here != here {
         if is_change {
@@ -127,6 +137,14 @@ fn refresh(is_change: bool) {
         addresses.update(here);
         ANY_GONE.store(addresses.any_gone(), Ordering::Relaxed);
     }
+}
+
+/// Has this host lose an address.
+#[cfg(test)]
+pub(crate) fn lose(address: Ipv4Addr) {
+    let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
+    addresses.known.push(address);
+    ANY_GONE.store(true, Ordering::Relaxed);
 }
 
 fn subscribe() -> io::Result<OwnedFd> {

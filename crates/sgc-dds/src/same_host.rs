@@ -7,7 +7,7 @@
 //!   for each, because Fast DDS sends each message to all. A multicast announcement is sent twice: to other hosts without a copy for
 //!   this one, and to this host with a hop limit of zero.
 //! - When the address that a packet would leave with, or that it is for, is gone, and the receiver is on this host, the packet goes to
-//!   127.0.0.1.
+//!   127.0.0.1. An address that this host had may be another's by now, so what is for it goes there as well.
 //!
 //! All other packets go as Cyclone sends them. This reaches into `struct ddsi_tran_conn` and `struct ddsi_tran_write_msgfrags` of the
 //! Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection that does not refer to its domain, or whose socket is
@@ -271,8 +271,17 @@ impl Beside {
         let is_cut_off = self.is_cut_off_from(to);
         let is_announcement = packet.is_announcement();
         let sent = |socket: &UdpSocket, to, bytes: &[u8]| socket.send_to(bytes, (to, port)).map(drop);
+        let sent_around = |here: &[u8], elsewhere: &[u8]| {
+            if let Some(multicast) = self.multicast.as_ref().filter(|_| host_addresses::is_here(self.address))
+            {
+                // Nobody needs to have the address.
+                let _ = sent(&multicast.to_others, to, elsewhere);
+            }
+            sent(&self.loopback, Ipv4Addr::LOCALHOST, here)
+        };
         if !is_announcement {
-            return is_cut_off.then(|| sent(&self.loopback, Ipv4Addr::LOCALHOST, &packet.bytes()));
+            let whole = is_cut_off.then(|| packet.bytes())?;
+            return Some(sent_around(&whole, &whole));
         }
         let [mut for_this_host, mut for_others] = [packet.bytes(), packet.bytes()];
         announcement::replace(&mut for_this_host, |_| Ipv4Addr::LOCALHOST);
@@ -282,13 +291,14 @@ impl Beside {
                 if !host_addresses::is_here(self.address) {
                     return None;
                 }
-                let _ = sent(&multicast.to_this_host, to, &for_this_host);
-                Some(sent(&multicast.to_others, to, &for_others))
+                // Where either fails Cyclone sends it to both, or says why it cannot.
+                let here = sent(&multicast.to_this_host, to, &for_this_host);
+                Some(sent(&multicast.to_others, to, &for_others).and(here))
             }
             Some(multicast) if !host_addresses::is_known(to) => {
                 Some(sent(&multicast.to_others, to, &for_others))
             }
-            _ if is_cut_off => Some(sent(&self.loopback, Ipv4Addr::LOCALHOST, &for_this_host)),
+            _ if is_cut_off => Some(sent_around(&for_this_host, &for_others)),
             Some(multicast) => Some(sent(&multicast.to_others, to, &for_this_host)),
             None => Some(sent(&self.loopback, to, &for_this_host)),
         }
@@ -398,4 +408,40 @@ fn connection_for(domain: *const ddsi_domaingv, address: Ipv4Addr) -> Option<*co
         ddsi_unref_addrset(set);
     }
     (!connection.is_null()).then_some(connection.cast_const().cast())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    /// To Linux this address is the host itself, as 127.0.0.1 is (ip(7)), and here it is one that can be lost.
+    const LOST: Ipv4Addr = Ipv4Addr::UNSPECIFIED;
+
+    fn socket() -> UdpSocket {
+        UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap()
+    }
+
+    fn port(socket: &UdpSocket) -> u16 {
+        socket.local_addr().unwrap().port()
+    }
+
+    #[test]
+    fn address_that_was_lost_is_reached_here_and_at_its_next_owner() {
+        host_addresses::lose(LOST);
+        let multicast = Multicast { to_others: socket(), to_this_host: socket() };
+        let beside = Beside { address: Ipv4Addr::LOCALHOST, loopback: socket(), multicast: Some(multicast) };
+        let receiver = socket();
+        receiver.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+        let pieces = [Piece { start: b"data".as_ptr(), bytes: 4 }];
+        let sent = beside.send(LOST, port(&receiver), &Packet { pieces: &pieces });
+        assert!(matches!(sent, Some(Ok(()))), "{sent:?}");
+        let mut from: Vec<_> =
+            (0..2).map(|_| receiver.recv_from(&mut [0; 8]).expect("a datagram").1.port()).collect();
+        from.sort_unstable();
+        let mut expected = [&beside.loopback, &beside.multicast.as_ref().unwrap().to_others].map(port);
+        expected.sort_unstable();
+        assert_eq!(from, expected);
+    }
 }
