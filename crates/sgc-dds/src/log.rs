@@ -53,18 +53,23 @@ fn is_elsewhere(to: &str) -> bool {
 
 /// Lines of one kind.
 #[derive(Debug)]
-struct Repeats {
+pub(crate) struct Repeats {
     logged: Option<Instant>,
     since: u64,
 }
 
 impl Repeats {
-    const NONE: Self = Self { logged: None, since: 0 };
+    pub(crate) const NONE: Self = Self { logged: None, since: 0 };
 
     /// Counts a line; the number of earlier ones that were not logged if this one is to be.
     fn note(&mut self, now: Instant) -> Option<u64> {
+        self.add(now, 1).map(|several| several - 1)
+    }
+
+    /// Counts several of what a line is about; the number since the last line if this one is to be logged.
+    pub(crate) fn add(&mut self, now: Instant, several: u64) -> Option<u64> {
+        self.since += several;
         if self.logged.is_some_and(|logged| now.saturating_duration_since(logged) < QUIET) {
-            self.since += 1;
             return None;
         }
         self.logged = Some(now);
@@ -219,6 +224,8 @@ mod tests {
         }
         assert_eq!(repeats.note(start + QUIET), Some(175));
         assert_eq!(repeats.note(start + 2 * QUIET), Some(0));
+        assert_eq!(repeats.add(start + 2 * QUIET, 40), None);
+        assert_eq!(repeats.add(start + 3 * QUIET, 2), Some(42));
     }
 
     #[test]

@@ -309,10 +309,10 @@ pub fn silent_enclaves() -> Vec<String> {
     enclaves.into_iter().collect()
 }
 
-/// Remembers a participant that has announced no endpoint yet.
+/// Remembers a participant that has announced no endpoint yet, if its enclave is one of ROS 2. Logs and alerts show the name.
 pub(crate) fn note_silent(participant: &Guid, enclave: &str) {
     let mut silent = SILENT.lock().unwrap_or_else(PoisonError::into_inner);
-    if silent.len() < SILENT_MAX && enclave.len() <= NAME_BYTES_MAX {
+    if silent.len() < SILENT_MAX && is_enclave(enclave) {
         silent
             .entry(prefix(participant))
             .or_insert_with(|| Silent { enclave: enclave.to_owned(), since: Instant::now() });
@@ -344,6 +344,19 @@ mod tests {
             assert!(!is_enclave(name), "{name}");
         }
         assert!(!is_enclave(&format!("/{}", "a".repeat(NAME_BYTES_MAX))));
+    }
+
+    #[test]
+    fn silent_participants_of_hostile_enclaves_are_not_shown() {
+        let is_noted = |enclave: &str| {
+            let participant = Guid([0xee; 16]);
+            note_silent(&participant, enclave);
+            SILENT.lock().unwrap().remove(&prefix(&participant)).is_some()
+        };
+        assert!(is_noted("/arm"));
+        for hostile in ["/arm\n2026-01-01T00:00:00Z ERROR all is lost", "/\u{1b}[2J", "arm", ""] {
+            assert!(!is_noted(hostile), "{hostile:?}");
+        }
     }
 
     #[test]
