@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::LostReason;
-use sgc_ros::{EndpointKind, EndpointSpec, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
+use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
 use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, Role, RosNode, SinkId};
 use tracing::debug;
 
@@ -20,6 +20,8 @@ use super::{Core, CoreEvent, drop_elsewhere};
 const TELL_AFTER: Duration = Duration::from_millis(100);
 /// How long changes of the consumers elsewhere are gathered before they are shown.
 const SHOW_AFTER: Duration = Duration::from_millis(100);
+/// How long what a node tells next waits for each consumer that it told anew: to show one has all programs of the local network told.
+const SHOW_EACH: Duration = Duration::from_millis(20);
 /// Nodes that are asked for their consumers.
 const ASKED_NODES_MAX: usize = 64;
 /// Consumers elsewhere that are shown, of all nodes and interfaces.
@@ -44,6 +46,15 @@ struct ShownConsumer {
     endpoints: Option<Vec<(EndpointKind, ShownEndpoint)>>,
 }
 
+/// What a node told of its consumers.
+struct PeerConsumers {
+    current: Vec<Consumer>,
+    /// What it told last, until that is taken over.
+    next: Option<Vec<Consumer>>,
+    /// When that may be.
+    ready_at: Instant,
+}
+
 /// The sinks of a node at one share.
 #[derive(Default)]
 struct Sinks {
@@ -61,7 +72,7 @@ pub(super) struct FarConsumers {
     show_due: Option<Instant>,
     sinks: BTreeMap<NodeId, BTreeMap<(Name, Role), Sinks>>,
     asked: BTreeSet<NodeId>,
-    told: BTreeMap<NodeId, Vec<Consumer>>,
+    told: BTreeMap<NodeId, PeerConsumers>,
     /// Nodes that are out of reach, and until when their consumers stay.
     lost: BTreeMap<NodeId, Instant>,
     shown: BTreeMap<ConsumerKey, ShownConsumer>,
@@ -89,7 +100,31 @@ impl FarConsumers {
 
     pub(super) fn deadline(&self) -> Option<Instant> {
         let left = self.sinks.values().flat_map(BTreeMap::values).filter_map(|sinks| sinks.until);
-        left.chain(self.lost.values().copied()).chain(self.tell_due).chain(self.show_due).min()
+        let told = self.told.values().filter(|told| told.next.is_some()).map(|told| told.ready_at);
+        left.chain(told).chain(self.lost.values().copied()).chain(self.tell_due).chain(self.show_due).min()
+    }
+
+    /// Takes what a node tells, to be shown soon, or later if there was much to show of that node.
+    fn tell(&mut self, now: Instant, peer: NodeId, consumers: Vec<Consumer>) {
+        let soon = now + SHOW_AFTER;
+        let new = || PeerConsumers { current: Vec::new(), next: None, ready_at: soon };
+        let told = self.told.entry(peer).or_insert_with(new);
+        if told.next.replace(consumers).is_none() {
+            told.ready_at = told.ready_at.max(soon);
+        }
+    }
+
+    /// Takes over what nodes told whose time has come; true if something was.
+    fn take_over(&mut self, now: Instant) -> bool {
+        let mut took = false;
+        for told in self.told.values_mut().filter(|told| told.ready_at <= now) {
+            let Some(next) = told.next.take() else { continue };
+            let added = next.iter().filter(|consumer| !told.current.contains(consumer)).count();
+            told.ready_at = now + SHOW_EACH * u32::try_from(added).unwrap_or(u32::MAX);
+            told.current = next;
+            took = true;
+        }
+        took
     }
 
     pub(super) fn show_soon(&mut self, now: Instant) {
@@ -108,9 +143,9 @@ impl FarConsumers {
         self.told
             .iter()
             .filter(move |(peer, _)| self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&of)))
-            .flat_map(move |(peer, consumers)| {
+            .flat_map(move |(peer, told)| {
                 let is_it = move |consumer: &&Consumer| (consumer.interface, consumer.role) == of;
-                let of_it = consumers.iter().filter(is_it);
+                let of_it = told.current.iter().filter(is_it);
                 of_it.filter_map(|consumer| consumer.type_hash.as_deref()).map(|hash| (*peer, hash))
             })
     }
@@ -125,8 +160,9 @@ impl FarConsumers {
         };
         self.lost.retain(|peer, until| {
             let is_over = is_over(Some(*until));
-            if is_over {
-                self.told.remove(peer);
+            if is_over && let Some(told) = self.told.get_mut(peer) {
+                // Its pace stays: it may come back at once.
+                (told.current, told.next) = (Vec::new(), None);
             }
             !is_over
         });
@@ -137,26 +173,31 @@ impl FarConsumers {
         forgot
     }
 
-    /// The consumers to be shown, and how many there is no room for.
+    /// The consumers to be shown, and how many there is no room for. Each node has as many places as every other.
     fn wanted(&self) -> (BTreeMap<ConsumerKey, &Consumer>, u64) {
-        let (mut wanted, mut left_out) = (BTreeMap::new(), 0);
-        for (peer, consumers) in &self.told {
+        let (mut ranked, mut left_out) = (Vec::new(), 0);
+        for (peer, told) in &self.told {
             let Some(granted) = self.sinks.get(peer) else { continue };
             let mut of_interface = BTreeMap::<Name, usize>::new();
             let is_granted =
                 |consumer: &&Consumer| granted.contains_key(&(consumer.interface, consumer.role));
-            for consumer in consumers.iter().filter(is_granted) {
+            let mut rank = 0;
+            for consumer in told.current.iter().filter(is_granted) {
                 let known = of_interface.entry(consumer.interface).or_default();
-                if *known >= CONSUMERS_PER_INTERFACE_MAX || wanted.len() >= SHOWN_MAX {
+                if *known >= CONSUMERS_PER_INTERFACE_MAX {
                     left_out += 1;
                     continue;
                 }
                 *known += 1;
                 let key = ConsumerKey { interface: consumer.interface, peer: *peer, id: consumer.id };
-                wanted.insert(key, consumer);
+                ranked.push((rank, key, consumer));
+                rank += 1;
             }
         }
-        (wanted, left_out)
+        ranked.sort_by_key(|(rank, key, _)| (*rank, *key));
+        left_out += ranked.len().saturating_sub(SHOWN_MAX) as u64;
+        ranked.truncate(SHOWN_MAX);
+        (ranked.into_iter().map(|(_, key, consumer)| (key, consumer)).collect(), left_out)
     }
 }
 
@@ -172,8 +213,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn consumers_told(&mut self, now: Now, peer: NodeId, consumers: Vec<Consumer>) {
         if self.consumers.asked.contains(&peer) {
             self.consumers.lost.remove(&peer);
-            self.consumers.told.insert(peer, consumers);
-            self.consumers.show_soon(now.instant);
+            self.consumers.tell(now.instant, peer, consumers);
         }
     }
 
@@ -197,7 +237,8 @@ impl<N: RosNetwork> Core<N> {
             self.endpoint.set_consumers(now, consumers.by_owner);
         }
         let is_due = self.consumers.show_due.take_if(|at| *at <= now.instant).is_some();
-        if self.consumers.forget(now.instant) || is_due {
+        let took_over = self.consumers.take_over(now.instant);
+        if self.consumers.forget(now.instant) || took_over || is_due {
             self.ask_consumers(now);
             self.show_consumers();
         }
@@ -256,6 +297,7 @@ impl<N: RosNetwork> Core<N> {
                 drop_elsewhere(Box::new(endpoints));
             }
         }
+        let mut fresh = Vec::new();
         for (key, (node, ends)) in wanted {
             if let Some(shown) = shown.get_mut(&key) {
                 if std::mem::replace(&mut shown.node, node.clone()) != node
@@ -266,24 +308,31 @@ impl<N: RosNetwork> Core<N> {
                 continue;
             }
             shown.insert(key, ShownConsumer { node, ends: ends.clone(), endpoints: None });
-            let Some(events) = self.events.upgrade() else { return };
-            let (network, alive, failures) = (network.clone(), self.alive.clone(), self.ros_failures.clone());
-            tokio::task::spawn_blocking(move || {
-                let _alive = alive;
-                let mut made = Vec::new();
-                for (kind, spec) in ends {
-                    match network.show(kind, &spec) {
-                        Ok(endpoint) => made.push((kind, spec, endpoint)),
-                        Err(error) => {
-                            failures.count("show_consumer");
-                            debug!(%error, "the local graph does not show a subscriber or client elsewhere");
-                            return;
-                        }
-                    }
-                }
-                let _ = events.blocking_send(CoreEvent::ConsumerShown { key, ends: made });
-            });
+            fresh.push((key, ends));
         }
+        let Some(events) = self.events.upgrade().filter(|_| !fresh.is_empty()) else { return };
+        let (network, alive, failures) = (network.clone(), self.alive.clone(), self.ros_failures.clone());
+        // One after the other: each takes a lock of the local network, and others need such threads, too.
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            for (key, ends) in fresh {
+                let made = ends.into_iter().map(|(kind, spec)| {
+                    let endpoint = network.show(kind, &spec)?;
+                    Ok((kind, spec, endpoint))
+                });
+                let ends = match made.collect::<Result<_, RosError>>() {
+                    Ok(ends) => ends,
+                    Err(error) => {
+                        failures.count("show_consumer");
+                        debug!(%error, "the local graph does not show a subscriber or client elsewhere");
+                        continue;
+                    }
+                };
+                if events.blocking_send(CoreEvent::ConsumerShown { key, ends }).is_err() {
+                    return;
+                }
+            }
+        });
     }
 
     /// Endpoints were made for a consumer, which may be another by now.
@@ -323,8 +372,84 @@ fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> Vec<(EndpointKind, sgc_
 
 #[cfg(test)]
 mod tests {
+    use sgc_wire::{CONSUMERS_MAX, Qos};
+
     use super::*;
-    use sgc_wire::Qos;
+
+    /// The consumers of a node that uses every interface as much as it may; each telling has others.
+    fn all_places(telling: u8) -> Vec<Consumer> {
+        let node = RosNode::new("/", "view", None).unwrap();
+        let consumer = |n: usize| {
+            let interface = Name([(n / CONSUMERS_PER_INTERFACE_MAX) as u8; 32]);
+            let mut id = [telling; 8];
+            id[..2].copy_from_slice(&(n as u16).to_be_bytes());
+            Consumer {
+                interface,
+                id,
+                role: Role::Subscribe,
+                node: node.clone(),
+                type_hash: None,
+                qos: Qos::default(),
+            }
+        };
+        (0..CONSUMERS_MAX).map(consumer).collect()
+    }
+
+    fn granted_all(consumers: &mut FarConsumers, now: Instant, peer: NodeId) {
+        for consumer in all_places(0) {
+            consumers.sink_joined(now, peer, consumer.interface, SinkId([0; 16]), Role::Subscribe);
+        }
+    }
+
+    #[test]
+    fn node_that_tells_others_all_the_time_is_shown_at_a_bounded_pace() {
+        let (mut consumers, start, peer) = (FarConsumers::default(), Instant::now(), NodeId([1; 32]));
+        granted_all(&mut consumers, start, peer);
+        let mut shown = BTreeSet::new();
+        let (mut made, lasts) = (0, Duration::from_secs(60));
+        for n in 0..600_u32 {
+            let now = start + n * lasts / 600;
+            consumers.tell(now, peer, all_places(n as u8));
+            if consumers.take_over(now) {
+                let wanted: BTreeSet<_> = consumers.wanted().0.into_keys().collect();
+                made += wanted.difference(&shown).count();
+                shown = wanted;
+                // Who withdraws them does not begin anew.
+                consumers.lost.insert(peer, now);
+                assert!(consumers.forget(now));
+                consumers.lost.clear();
+            }
+        }
+        let bound = (lasts.as_millis() / SHOW_EACH.as_millis()) as usize + CONSUMERS_MAX;
+        assert!((CONSUMERS_MAX..=bound).contains(&made), "{made} made, {bound} may be");
+    }
+
+    #[test]
+    fn change_of_one_consumer_is_shown_without_delay() {
+        let (mut consumers, start, peer) = (FarConsumers::default(), Instant::now(), NodeId([1; 32]));
+        // Nothing is granted yet, which would be shown soon itself.
+        for n in 0..20_u8 {
+            let now = start + u32::from(n) * 2 * SHOW_AFTER;
+            consumers.tell(now, peer, all_places(n).into_iter().take(1).collect());
+            assert!(!consumers.take_over(now), "changes are gathered");
+            assert_eq!(consumers.deadline(), Some(now + SHOW_AFTER));
+            assert!(consumers.take_over(now + SHOW_AFTER));
+        }
+    }
+
+    #[test]
+    fn node_with_many_consumers_leaves_places_to_others() {
+        let (mut consumers, now) = (FarConsumers::default(), Instant::now());
+        let peers = [NodeId([1; 32]), NodeId([2; 32])];
+        for (peer, count) in peers.into_iter().zip([CONSUMERS_MAX, 1]) {
+            granted_all(&mut consumers, now, peer);
+            consumers.tell(now, peer, all_places(0).into_iter().take(count).collect());
+        }
+        assert!(consumers.take_over(now + SHOW_AFTER));
+        let (wanted, left_out) = consumers.wanted();
+        assert_eq!((wanted.len(), left_out), (SHOWN_MAX, 1));
+        assert!(wanted.keys().any(|key| key.peer == peers[1]));
+    }
 
     #[test]
     fn consumers_are_shown_in_a_role_that_their_node_was_granted() {
@@ -338,7 +463,8 @@ mod tests {
             qos: Qos::default(),
         };
         let mut far = FarConsumers::default();
-        far.told.insert(peer, [Role::Subscribe, Role::Publish].map(consumer).into());
+        far.tell(now, peer, [Role::Subscribe, Role::Publish].map(consumer).into());
+        assert!(far.take_over(now + SHOW_AFTER));
         let wanted = |far: &FarConsumers| far.wanted().0.values().map(|one| one.role).collect::<Vec<_>>();
         assert_eq!(wanted(&far), []);
         far.sink_joined(now, peer, interface, SinkId([3; 16]), Role::Subscribe);
