@@ -59,6 +59,7 @@ use crate::network_slot::NetworkSlot;
 use crate::operations::{OperationError, Operations};
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
+use crate::problem_log::ProblemLog;
 use crate::replays::Replays;
 use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::{LocalShare, NewestSamples};
@@ -322,6 +323,7 @@ pub(crate) struct Core<N: RosNetwork> {
     silence_due: Option<Instant>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
+    problem_log: ProblemLog,
     ros_failures: Arc<Drops>,
     events: mpsc::WeakSender<CoreEvent>,
     started: Instant,
@@ -443,6 +445,7 @@ impl<N: RosNetwork> Core<N> {
             requests,
             control_drops: Drops::default(),
             call_ledgers: BTreeMap::new(),
+            problem_log: ProblemLog::default(),
             ros_failures: Arc::default(),
             events: parts.events,
             started: Instant::now(),

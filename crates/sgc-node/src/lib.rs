@@ -44,6 +44,7 @@ mod outflow;
 pub mod partners;
 mod peer_rate;
 pub mod policy;
+mod problem_log;
 mod protected;
 mod queue;
 mod records;

@@ -9,7 +9,7 @@ use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, serv
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
-use tracing::{debug, error, warn};
+use tracing::{debug, error};
 
 use super::publish::Offer;
 use super::{
@@ -152,7 +152,7 @@ impl<N: RosNetwork> Core<N> {
             Command::SetNode { name, source, owner, node } => {
                 self.graph.set_node((name, source), owner, node)
             }
-            Command::Report(problem) => warn!("{problem}"),
+            Command::Report(problem) => self.problem_log.note(now.instant, &problem),
         }
     }
 

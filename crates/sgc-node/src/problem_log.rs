@@ -1,0 +1,81 @@
+//! The log lines about what is wrong between the two sides: programs of the local network cannot fill the log with types and QoS that change all the time.
+//!
+//! What holds at present is in `status` and `why`, whether it was logged or not.
+
+use std::fmt::Display;
+use std::time::{Duration, Instant};
+
+use tracing::{debug, warn};
+
+/// Problems logged at once.
+const LINES_MAX: u32 = 64;
+/// Time in which one more may be.
+const LINE_EVERY: Duration = Duration::from_secs(1);
+
+/// Lines about problems.
+#[derive(Debug, Default)]
+pub(crate) struct ProblemLog {
+    /// When all lines of [`LINES_MAX`] may be logged again.
+    full_at: Option<Instant>,
+    left_out: u64,
+}
+
+impl ProblemLog {
+    /// Logs a problem, or counts it if there were too many of late.
+    pub(crate) fn note(&mut self, now: Instant, problem: &impl Display) {
+        match self.line(now, problem) {
+            Some(line) => warn!("{line}"),
+            None => debug!("{}", one_line(problem)),
+        }
+    }
+
+    fn line(&mut self, now: Instant, problem: &impl Display) -> Option<String> {
+        let full_at = self.full_at.unwrap_or(now).max(now) + LINE_EVERY;
+        if full_at > now + LINE_EVERY * LINES_MAX {
+            self.left_out += 1;
+            return None;
+        }
+        self.full_at = Some(full_at);
+        let line = one_line(problem);
+        Some(match std::mem::take(&mut self.left_out) {
+            0 => line,
+            more => format!("{line} (and {more} more since the last such line: see `sgc why`)"),
+        })
+    }
+}
+
+/// The text without what would begin another line, or what a terminal would take for orders: names of types are anybody's.
+fn one_line(problem: &impl Display) -> String {
+    problem
+        .to_string()
+        .chars()
+        .map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flood_of_problems_does_not_fill_the_log() {
+        let (mut log, start) = (ProblemLog::default(), Instant::now());
+        let minute = 60_000;
+        let logged = |log: &mut ProblemLog, range: std::ops::Range<u64>| -> Vec<_> {
+            range
+                .filter_map(|ms| log.line(start + Duration::from_millis(ms), &format!("type {ms}")))
+                .collect()
+        };
+        assert_eq!(logged(&mut log, 0..minute).len(), LINES_MAX as usize + 59);
+        let quiet = u64::from(LINES_MAX) * 1000;
+        let later = logged(&mut log, minute + quiet..minute + quiet + 10);
+        assert!(later.len() == 10 && later[0].contains("more since the last such line"), "{later:?}");
+        assert!(!later[1].contains("more"));
+    }
+
+    #[test]
+    fn hostile_names_stay_on_their_line() {
+        let line = ProblemLog::default().line(Instant::now(), &"x\n2026-01-01 ERROR all is lost\u{1b}[2J");
+        assert_eq!(line.as_deref(), Some("x\u{fffd}2026-01-01 ERROR all is lost\u{fffd}[2J"));
+    }
+}
