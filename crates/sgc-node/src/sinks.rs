@@ -145,6 +145,8 @@ impl LocalSink {
                         |source: &SourceId| sources.contains(source) && !self.has_writer(source);
                     state.missed.extend(sink.pass_over(is_writerless));
                     sink.regrant(id, grant, |result| released.push(result));
+                    // A sink forgets sources when there are too many.
+                    state.missed.retain(|source| sink.recovers(source));
                 }
                 sink => {
                     let limits = SinkLimits::default();
@@ -997,6 +999,9 @@ mod tests {
     use std::sync::atomic::AtomicUsize;
 
     use bytes::Bytes;
+    use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
+    use sgc_trust::{MessageKey, Suite};
+    use sgc_wire::{Class, SecretBytes};
 
     use super::*;
     use crate::hold::HOLD_BYTES_MAX;
@@ -1264,5 +1269,39 @@ mod tests {
         assert!(taken.iter().map(|(seq, _)| *seq).eq(0..100));
         assert!(taken[1..].iter().all(|(_, by)| *by != thread::current().id()));
         queue.close();
+    }
+
+    #[tokio::test]
+    async fn sources_that_never_had_a_writer_are_forgotten_with_those_of_the_sink() {
+        let (requests, _receiver) = mpsc::channel(1);
+        let sink = Arc::new(LocalSink::new(Name([1; 32]), false, requests, Arc::default()));
+        let (id, key, suite, data) =
+            (SinkId([9; 16]), SecretBytes::new([3; 32]), Suite::Group, Arc::default());
+        let grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+        sink.grant(id, grant.clone(), &data);
+        let sources_max = SinkLimits::default().sources_max;
+        for n in 0..2 * sources_max as u128 {
+            let config = SourceConfig {
+                name: sink.name,
+                id: SourceId(n.to_be_bytes()),
+                class: Class::Default,
+                reliable: true,
+                history_depth: 1,
+                history_bytes_max: 1 << 10,
+                recovery: RecoveryLimits::default(),
+            };
+            let mut source = Source::new(config, &grant, MessageKey::generate(suite)).unwrap();
+            let mut packets = Vec::new();
+            let head = MessageHead::new(MessageKind::Write, 1);
+            source
+                .publish(&head, Bytes::from_static(b"first"), false, |packet| packets.push(packet))
+                .unwrap();
+            for packet in packets {
+                assert_eq!(sink.deliver(packet, data.drops()).await, None, "it is parked");
+            }
+            sink.grant(id, TopicGrant { sources: vec![source.announce()], ..grant.clone() }, &data);
+        }
+        let missed = sink.lock().missed.len();
+        assert!((1..=sources_max).contains(&missed), "{missed} sources are remembered");
     }
 }
