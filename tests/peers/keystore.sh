@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Makes a keystore as SROS2 lays it out: one CA for identities and permissions, a governance that protects all there is, and enclaves.
 #   keystore.sh DIR ENCLAVE [TOPIC…]   an enclave that may publish and subscribe to these DDS topics; the CA is made with the first one
-# VALID is the identity's life in days; with a negative one it has ended.
+# VALID is the identity's life in days; with a negative one it has ended. UNTIL is when the permissions end. PARTITION is one that they
+# grant beside the default one.
 set -euo pipefail
 
 dir=$1 enclave=$2
@@ -43,8 +44,9 @@ key "$at/key.pem"
 openssl req -new -key "$at/key.pem" -subj "/CN=${enclave//\//\\/}" |
     openssl x509 -req -CA "$ca.cert.pem" -CAkey "$ca.key.pem" -CAcreateserial -days "$days" -out "$at/cert.pem"
 topics=$(printf '<topic>%s</topic>' "$@")
+partitions=${PARTITION:+<partitions><partition></partition><partition>$PARTITION</partition></partitions>}
 say '<?xml version="1.0" encoding="UTF-8"?>' "<dds><permissions><grant name=\"$enclave\"><subject_name>CN=$enclave</subject_name>" \
-    '<validity><not_before>2020-01-01T00:00:00</not_before><not_after>2100-01-01T00:00:00</not_after></validity>' \
-    "<allow_rule>$domains<publish><topics>$topics</topics></publish><subscribe><topics>$topics</topics></subscribe></allow_rule>" \
+    '<validity><not_before>2020-01-01T00:00:00</not_before><not_after>'"${UNTIL:-2100-01-01T00:00:00}"'</not_after></validity>' \
+    "<allow_rule>$domains<publish><topics>$topics</topics>$partitions</publish><subscribe><topics>$topics</topics>$partitions</subscribe></allow_rule>" \
     '<default>DENY</default></grant></permissions></dds>' >"$at/permissions.xml"
 sign "$at/permissions"

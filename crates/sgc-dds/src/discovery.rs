@@ -22,7 +22,7 @@ use crate::graph::{Announcer, Listener, SharedHandler, lock};
 use crate::network::Participant;
 use crate::reader::CycloneReader;
 use crate::wait::{Stop, WaitSet, join};
-use crate::{qos, security, user_data};
+use crate::{qos, strangers, user_data};
 
 /// Samples taken at once.
 const BATCH: usize = 32;
@@ -245,7 +245,7 @@ impl Discovery {
             return;
         }
         if announcement.is_some() {
-            security::forget_silent(&guid);
+            strangers::forget(&guid);
         }
         let endpoint =
             announcement.filter(|a| !(a.tagged && self.participant.ignores_tagged())).map(|a| a.endpoint);
@@ -264,14 +264,16 @@ impl Discovery {
         lock(&self.handler)(DiscoveryEvent::Appeared(endpoint));
     }
 
-    /// Remembers a participant of ROS 2 of which no endpoint is known.
-    fn note_silence(&self, guid: Guid, user_data: Option<&[u8]>) {
-        let of_ros = user_data.filter(|data| !user_data::is_tagged(data)).and_then(user_data::enclave);
-        match of_ros {
-            Some(enclave) if !self.known.keys().any(|endpoint| endpoint.0[..12] == guid.0[..12]) => {
-                security::note_silent(&guid, enclave);
-            }
-            _ => security::forget_silent(&guid),
+    /// Notes a participant in case that it cannot be joined.
+    fn note_stranger(&self, guid: Guid, user_data: Option<&[u8]>) {
+        let Some(data) = user_data.filter(|data| !user_data::is_tagged(data)) else {
+            return strangers::forget(&guid);
+        };
+        // Of others than ROS 2 it is known only if Cyclone refuses them.
+        if let Some(enclave) = user_data::enclave(data)
+            && !self.known.keys().any(|endpoint| endpoint.prefix() == guid.prefix())
+        {
+            strangers::note_participant(&guid, enclave, self.participant.is_secured());
         }
     }
 
@@ -279,7 +281,7 @@ impl Discovery {
         if self.participant.owns(&guid) {
             return;
         }
-        self.note_silence(guid, user_data);
+        self.note_stranger(guid, user_data);
         let Some(graph) = &self.graph else { return };
         match user_data {
             // What SGC nodes say of the nodes that they stand for is for ROS 2, not for SGC nodes.

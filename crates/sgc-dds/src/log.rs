@@ -8,10 +8,14 @@
 use std::cell::RefCell;
 use std::ffi::{CStr, c_void};
 use std::net::SocketAddrV4;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, Once, PoisonError};
 use std::time::{Duration, Instant};
 
 use cyclors::{DDS_LC_ERROR, DDS_LC_FATAL, DDS_LC_WARNING, dds_log_data_t, dds_set_log_sink};
+use sgc_ros::Guid;
+
+use crate::strangers;
 
 use crate::host_addresses;
 
@@ -109,6 +113,44 @@ fn refused_program(message: &str) -> Option<&'static str> {
     }
 }
 
+/// Returns the endpoint of a program without DDS Security that Cyclone refuses: `Non secure remote writer 110a1b2:3:4:103 is not allowed.`
+/// (`ddsi_security_omg.c`).
+fn refused_endpoint(message: &str) -> Option<Guid> {
+    let rest = message.strip_prefix("Non secure remote ")?;
+    let rest = rest.strip_prefix("writer ").or_else(|| rest.strip_prefix("reader "))?;
+    let mut words = rest.strip_suffix(" is not allowed.")?.split(':');
+    let mut guid = [0; 16];
+    for place in guid.chunks_exact_mut(4) {
+        place.copy_from_slice(&u32::from_str_radix(words.next()?, 16).ok()?.to_be_bytes());
+    }
+    words.next().is_none().then_some(Guid(guid))
+}
+
+/// Networks that are being opened.
+static OPENING: AtomicUsize = AtomicUsize::new(0);
+
+/// A network that is being opened. As long as its domain has no participant, Cyclone says of every secured one that it is not allowed.
+pub(crate) struct Opening(());
+
+impl Opening {
+    /// Begins.
+    pub(crate) fn begin() -> Self {
+        OPENING.fetch_add(1, Ordering::Relaxed);
+        Self(())
+    }
+}
+
+impl Drop for Opening {
+    fn drop(&mut self) {
+        OPENING.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// Returns `true` for words that mean nothing while a network is being opened (`ddsi_proxy_participant.c`).
+fn is_premature(message: &str) -> bool {
+    message.starts_with("Remote secure participant ") && OPENING.load(Ordering::Relaxed) > 0
+}
+
 /// Counts an error, and logs it if its kind was not logged of late.
 fn complain(message: &str, now: Instant) {
     let to = unsent_to(message);
@@ -185,9 +227,15 @@ unsafe extern "C" fn sink(_: *mut c_void, data: *const dds_log_data_t) {
         if !heard {
             complain(message, Instant::now());
         }
-    } else if data.priority & DDS_LC_WARNING != 0 && refused_program(message).is_some() {
+    } else if data.priority & DDS_LC_WARNING != 0
+        && refused_program(message).is_some()
+        && !is_premature(message)
+    {
         complain(message, Instant::now());
     } else if data.priority & DDS_LC_WARNING != 0 {
+        if let Some(guid) = refused_endpoint(message) {
+            strangers::note_refused(&guid);
+        }
         // Cyclone's warnings name topics and types.
         tracing::debug!(target: "cyclonedds", "{message}");
     } else {
@@ -213,6 +261,26 @@ mod tests {
         assert!(refused_program(said).is_some_and(|cause| cause.contains("ECDH")));
         assert!(refused_program("Remote secure participant 1:2:3:1c1 not allowed").is_some());
         assert_eq!(refused_program("Non secure remote writer 1:2:3:4 is not allowed."), None);
+    }
+
+    #[test]
+    fn refusals_by_a_domain_without_participants_are_not_told() {
+        let said = "Remote secure participant 1:2:3:1c1 not allowed";
+        let opening = Opening::begin();
+        assert!(is_premature(said));
+        assert!(!is_premature("Begin handshake reply failed: x"));
+        drop(opening);
+        assert!(!is_premature(said));
+    }
+
+    #[test]
+    fn refused_endpoints_are_told_by_their_guid() {
+        let guid = Guid([1, 0x0f, 0xa1, 0xb2, 0, 0, 0, 3, 0, 0, 0, 4, 0, 0, 1, 3]);
+        assert_eq!(refused_endpoint("Non secure remote writer 10fa1b2:3:4:103 is not allowed."), Some(guid));
+        assert!(refused_endpoint("Non secure remote reader 1:2:3:4 is not allowed.").is_some());
+        for other in ["writer 1:2:3 is not allowed.", "writer 1:2:3:4:5 is not allowed.", "writer x:2:3:4"] {
+            assert_eq!(refused_endpoint(&format!("Non secure remote {other}")), None);
+        }
     }
 
     #[test]

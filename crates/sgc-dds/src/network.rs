@@ -32,6 +32,7 @@ use crate::graph::{Announcer, SharedHandler, lock};
 use crate::host_addresses::{self, Changes};
 use crate::intake::Pace;
 use crate::log;
+use crate::plugin_domain;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
 use crate::same_host::SameHost;
@@ -115,13 +116,16 @@ impl CycloneNetwork {
                 "this Cyclone DDS is another one: a program of the local network may write beyond this node's memory"
             );
         }
+        let _opening = log::Opening::begin();
         let domain = create_domain(config)?;
         let qos = NativeQos::new().map_err(refused)?;
         let security = config.security.as_ref();
         let unsecured = |security: &Security, e| refused(format!("enclave {}: {e}", security.enclave));
         if let Some(security) = security {
-            if domain.is_alias() {
-                // Cyclone's plugins compare its own number of the domain with those in governance and permissions.
+            if domain.is_alias()
+                && let Err(reason) = plugin_domain::install(&domain.entity, domain.id, config.domain)
+            {
+                tracing::debug!(reason, "the plugins of DDS Security cannot be told the ROS domain");
                 return Err(unsecured(security, SecurityError::NotFirst));
             }
             security.apply(&qos).map_err(|e| unsecured(security, e))?;
@@ -274,8 +278,18 @@ impl RosNetwork for CycloneNetwork {
             EndpointKind::Reader => "reader",
             EndpointKind::Writer => "writer",
         };
-        shown::create(&self.participant, kind, spec)
-            .map_err(|reason| self.refuse_endpoint(word, spec, reason))
+        shown::create(&self.participant, kind, spec).map_err(|reason| {
+            let forbidden = self.participant.security.as_ref().filter(|_| Security::forbids(&reason));
+            match forbidden {
+                Some(security) => RosError::ForbiddenPartition {
+                    file: security.permissions().display().to_string(),
+                    enclave: security.enclave.clone(),
+                    partition: shown::PARTITION,
+                    topic: spec.topic.clone(),
+                },
+                None => self.refuse_endpoint(word, spec, reason),
+            }
+        })
     }
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
@@ -380,6 +394,11 @@ impl Participant {
     /// How much they wait for readers' threads.
     pub(crate) fn holds(&self) -> &Pace {
         &self.holds
+    }
+
+    /// Returns `true` if DDS Security protects it.
+    pub(crate) fn is_secured(&self) -> bool {
+        self.security.is_some()
     }
 
     /// Adds to the reason why an endpoint cannot be made that DDS Security forbids it, if it is that.

@@ -43,7 +43,7 @@ use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 /// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), `struct ddsi_sertype_plist`
 /// (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of `ddsi_serdata_to_ser_ref`, and the functions
 /// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; all that `first_messages.rs` and
-/// `same_host.rs` name; and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
+/// `same_host.rs` name; `domainId` and its readers (`plugin_domain.rs`); and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(

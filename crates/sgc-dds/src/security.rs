@@ -1,18 +1,18 @@
-//! DDS Security of a local network: an enclave of a SROS2 keystore, and programs that are protected against this one.
+//! DDS Security of a local network: an enclave of a SROS2 keystore.
 //!
-//! Looks at the files of the enclave before Cyclone does, and says of Cyclone's refusals which file is meant and what to do. Reads neither
-//! keys nor certificates: Cyclone's plugins do, with OpenSSL, by the names of the files.
+//! Looks at the files of the enclave before Cyclone does, and says of Cyclone's refusals which file is meant and what to do. Cyclone's plugins
+//! read the files themselves, by their names.
 
-use std::collections::{BTreeMap, BTreeSet};
+#[cfg(feature = "sros2")]
+mod credentials;
+
 use std::fmt;
 use std::fs;
+use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
 
 use cyclors::DDS_RETCODE_NOT_ALLOWED_BY_SECURITY;
-use sgc_ros::Guid;
 
 use crate::entity::reason;
 use crate::qos::NativeQos;
@@ -29,17 +29,25 @@ const NAME_BYTES_MAX: usize = 245;
 /// Bits of a file's mode for others than its owner.
 const MODE_OF_OTHERS: u32 = 0o077;
 
+/// Bound on a file of an enclave, bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
+const IDENTITY_CA: &str = "identity_ca.cert.pem";
+const CERTIFICATE: &str = "cert.pem";
+const KEY: &str = "key.pem";
+const PERMISSIONS_CA: &str = "permissions_ca.cert.pem";
+const GOVERNANCE: &str = "governance.p7s";
+const PERMISSIONS: &str = "permissions.p7s";
+
 /// Files of an enclave, and the properties of a participant that name them (DDS Security 1.1, 9.3.1 and 9.4.1).
 const FILES: [(&str, &str); 6] = [
-    ("identity_ca.cert.pem", "dds.sec.auth.identity_ca"),
-    ("cert.pem", "dds.sec.auth.identity_certificate"),
+    (IDENTITY_CA, "dds.sec.auth.identity_ca"),
+    (CERTIFICATE, "dds.sec.auth.identity_certificate"),
     (KEY, "dds.sec.auth.private_key"),
-    ("permissions_ca.cert.pem", "dds.sec.access.permissions_ca"),
-    ("governance.p7s", "dds.sec.access.governance"),
-    ("permissions.p7s", "dds.sec.access.permissions"),
+    (PERMISSIONS_CA, "dds.sec.access.permissions_ca"),
+    (GOVERNANCE, "dds.sec.access.governance"),
+    (PERMISSIONS, "dds.sec.access.permissions"),
 ];
-
-const KEY: &str = "key.pem";
 
 /// The file that an enclave may have, with its property of Cyclone's own: certificates that were revoked.
 const REVOKED: (&str, &str) = ("crl.pem", "org.eclipse.cyclonedds.sec.auth.crl");
@@ -99,6 +107,61 @@ pub enum SecurityError {
         /// The directory.
         directory: PathBuf,
     },
+    /// A file of the enclave holds something else.
+    Unreadable {
+        /// The file.
+        file: PathBuf,
+        /// The content that it must have.
+        kind: &'static str,
+    },
+    /// The private key is not that of the certificate.
+    KeyMismatch {
+        /// The file of the key.
+        key: PathBuf,
+        /// The file of the certificate.
+        certificate: PathBuf,
+    },
+    /// A certificate or the permissions hold no longer.
+    Ended {
+        /// The file.
+        file: PathBuf,
+        /// The end, as the file writes it.
+        at: String,
+    },
+    /// A certificate or the permissions do not hold yet.
+    NotBegun {
+        /// The file.
+        file: PathBuf,
+        /// The beginning, as the file writes it.
+        at: String,
+    },
+    /// Another CA signed the certificate.
+    ForeignCertificate {
+        /// The file of the certificate.
+        certificate: PathBuf,
+        /// The file of the CA.
+        ca: PathBuf,
+        /// OpenSSL's reason.
+        reason: String,
+    },
+    /// Another CA signed governance or permissions, or they were changed since.
+    ForeignDocument {
+        /// The file of governance or permissions.
+        document: PathBuf,
+        /// The file of the CA.
+        ca: PathBuf,
+    },
+    /// The permissions are those of other enclaves.
+    OtherSubject {
+        /// The file of the permissions.
+        permissions: PathBuf,
+        /// Some subjects that they grant something to.
+        granted: Vec<String>,
+        /// The file of the certificate.
+        certificate: PathBuf,
+        /// Its subject, if it can be written.
+        subject: Option<String>,
+    },
     /// Cyclone's plugins refuse the enclave.
     Refused {
         /// The directory of the enclave.
@@ -106,8 +169,16 @@ pub enum SecurityError {
         /// The plugins' reason.
         said: String,
     },
-    /// This process is in the domain already.
+    /// This Cyclone DDS is another one, and does not take a second participant of this process.
     NotFirst,
+}
+
+impl SecurityError {
+    /// Returns `true` if there is no enclave to join with, rather than one with a mistake. rcl goes without security then, unless
+    /// `ROS_SECURITY_STRATEGY` is `Enforce`.
+    pub fn is_absence(&self) -> bool {
+        matches!(self, Self::NotBuilt | Self::Keystore { .. } | Self::Missing { .. } | Self::File { .. })
+    }
 }
 
 impl fmt::Display for SecurityError {
@@ -134,12 +205,55 @@ impl fmt::Display for SecurityError {
                 file.display()
             ),
             Self::NotText { directory } => write!(f, "{:?} is not UTF-8", directory.display()),
+            Self::Unreadable { file, kind } => write!(
+                f,
+                "{} is not {kind}; `ros2 security create_enclave` makes one where none is",
+                file.display()
+            ),
+            Self::KeyMismatch { key, certificate } => write!(
+                f,
+                "{} is not the private key of {}; put back the key that the certificate was made for, or remove both and let \
+                 `ros2 security create_enclave` make them anew",
+                key.display(),
+                certificate.display()
+            ),
+            Self::Ended { file, at } => {
+                write!(f, "{} ended at {at}; {}", file.display(), renewal(file))
+            }
+            Self::NotBegun { file, at } => {
+                write!(f, "{} begins at {at}; set the clock, or {}", file.display(), renewal(file))
+            }
+            Self::ForeignCertificate { certificate, ca, reason } => write!(
+                f,
+                "{} was not signed by the CA in {} ({reason}); take both from one keystore, or {}",
+                certificate.display(),
+                ca.display(),
+                renewal(certificate)
+            ),
+            Self::ForeignDocument { document, ca } => write!(
+                f,
+                "{} was not signed by the CA in {}, or was changed since; take both from one keystore, or {}",
+                document.display(),
+                ca.display(),
+                renewal(document)
+            ),
+            Self::OtherSubject { permissions, granted, certificate, subject } => {
+                let granted = if granted.is_empty() { "others".to_owned() } else { granted.join(", ") };
+                let subject = subject.as_deref().map_or(String::new(), |subject| format!(" {subject}"));
+                write!(
+                    f,
+                    "{} grants to {granted}, and not to the subject{subject} of {}; take both from one enclave, or {}",
+                    permissions.display(),
+                    certificate.display(),
+                    renewal(permissions)
+                )
+            }
             Self::Refused { directory, said } => {
                 write!(f, "{} is refused: {}", directory.display(), said.trim())?;
                 fix(said).map_or(Ok(()), |fix| write!(f, "; {fix}"))
             }
             Self::NotFirst => f.write_str(
-                "this process is in the domain already, and DDS Security admits one of its participants alone: let a node of its own \
+                "this process is in the domain already, and this Cyclone DDS secures one of its participants alone: let a node of its own \
                  have the gateway",
             ),
         }
@@ -148,28 +262,42 @@ impl fmt::Display for SecurityError {
 
 impl std::error::Error for SecurityError {}
 
-/// Returns what to do where the plugins' words leave it open. The words are those of `dds_security_api_err.h` and `openssl_support.c`.
+/// Returns how a file is made again.
+fn renewal(file: &Path) -> &'static str {
+    match file.file_name().and_then(|name| name.to_str()) {
+        Some(PERMISSIONS) => "let `ros2 security create_permission` sign permissions again",
+        Some(GOVERNANCE) => "sign governance.xml again with the key of that CA",
+        Some(IDENTITY_CA) => "make the keystore again: what its CA signed has ended with it",
+        _ => "remove cert.pem and let `ros2 security create_enclave` make it anew",
+    }
+}
+
+/// Returns what to do where the plugins' words leave it open. The words are those of `dds_security_api_err.h`.
 fn fix(said: &str) -> Option<&'static str> {
-    const FIXES: [(&str, &str); 11] = [
-        ("certificate has expired", "make the enclave again, or sign its cert.pem again"),
-        ("certificate is not yet valid", "compare the clock with the beginning of cert.pem"),
+    const FIXES: [(&str, &str); 3] = [
         ("Can not parse governance", "Cyclone DDS reads governance.p7s strictly, with domains up to 230"),
-        ("validity period expired", "sign permissions.p7s again with a later `not_after`"),
-        ("validity period has not started", "compare the clock with `not_before` in permissions.p7s"),
+        ("Can not parse permissions", "Cyclone DDS reads permissions.p7s strictly, with domains up to 230"),
         ("Could not find domain", "let governance.p7s and permissions.p7s name this ROS domain"),
-        (
-            "Could not find valid grant",
-            "the subject_name of the grant in permissions.p7s must be that of cert.pem",
-        ),
-        (
-            "PKCS7",
-            "permissions_ca.cert.pem must belong to the CA that signed governance.p7s and permissions.p7s",
-        ),
-        ("local issuer certificate", "cert.pem must be signed by the CA in identity_ca.cert.pem"),
-        ("certificate signature failure", "cert.pem must be signed by the CA in identity_ca.cert.pem"),
-        ("Failed to parse certificate", "cert.pem and key.pem must be PEM, and the key without a password"),
     ];
     FIXES.iter().find(|(words, _)| said.contains(words)).map(|(_, fix)| *fix)
+}
+
+/// Reads a file of an enclave.
+fn read_bounded(file: &Path) -> Result<Vec<u8>, SecurityError> {
+    let mut bytes = Vec::new();
+    let read = fs::File::open(file).and_then(|file| file.take(FILE_BYTES_MAX).read_to_end(&mut bytes));
+    match read {
+        Ok(_) => Ok(bytes),
+        Err(reason) => Err(SecurityError::File { file: file.to_owned(), reason }),
+    }
+}
+
+/// Returns some subjects that signed permissions name.
+fn subjects(permissions: &str) -> Vec<String> {
+    let named = permissions.split("<subject_name>").skip(1);
+    let named = named.filter_map(|rest| Some(rest.split_once("</subject_name>")?.0.trim()));
+    let plain = named.filter(|name| name.len() <= NAME_BYTES_MAX && !name.contains(char::is_control));
+    plain.map(str::to_owned).take(NAMED_MAX).collect()
 }
 
 /// Returns `true` for names that rcl accepts as an enclave's: `/`, or tokens of letters, digits and `_`, each after a `/`.
@@ -207,11 +335,10 @@ impl Security {
             return Err(SecurityError::NotText { directory });
         }
         for (name, _) in FILES {
-            let file = directory.join(name);
-            if let Err(reason) = fs::File::open(&file) {
-                return Err(SecurityError::File { file, reason });
-            }
+            read_bounded(&directory.join(name))?;
         }
+        #[cfg(feature = "sros2")]
+        credentials::check(&directory)?;
         Ok(())
     }
 
@@ -247,19 +374,52 @@ impl Security {
         Ok(())
     }
 
-    /// Returns the error for the reason of Cyclone's plugins.
+    /// Returns the error for the reason of Cyclone's plugins. They alone read the permissions: `validate_subject_name_in_permissions` in
+    /// `access_control.c`.
     pub(crate) fn refused(&self, said: String) -> SecurityError {
-        SecurityError::Refused { directory: self.directory(), said }
+        let directory = self.directory();
+        let (permissions, certificate) = (self.permissions(), directory.join(CERTIFICATE));
+        if let Some(at) = between(&said, "validity period expired for ", "(expired: ") {
+            return SecurityError::Ended { file: permissions, at };
+        }
+        if let Some(at) = between(&said, "validity period has not started yet for ", "(start: ") {
+            return SecurityError::NotBegun { file: permissions, at };
+        }
+        if said.contains("Subject name is invalid") {
+            let text = read_bounded(&permissions).unwrap_or_default();
+            let granted = subjects(&String::from_utf8_lossy(&text));
+            #[cfg(feature = "sros2")]
+            let subject = credentials::subject(&certificate);
+            #[cfg(not(feature = "sros2"))]
+            let subject = None;
+            return SecurityError::OtherSubject { permissions, granted, certificate, subject };
+        }
+        SecurityError::Refused { directory, said }
     }
 
     /// Adds to Cyclone's reason for refusing an endpoint which file forbids it, if it is that.
     pub(crate) fn explain(&self, topic: &str, said: String) -> String {
-        if !said.starts_with(&reason(DDS_RETCODE_NOT_ALLOWED_BY_SECURITY)) {
+        if !Self::forbids(&said) {
             return said;
         }
-        let file = self.directory().join("permissions.p7s");
-        format!("{said}: {} does not grant {topic} to enclave {}", file.display(), self.enclave)
+        format!("{said}: {} does not grant {topic} to enclave {}", self.permissions().display(), self.enclave)
     }
+
+    /// Returns `true` if Cyclone refuses an endpoint because DDS Security forbids it.
+    pub(crate) fn forbids(said: &str) -> bool {
+        said.starts_with(&reason(DDS_RETCODE_NOT_ALLOWED_BY_SECURITY))
+    }
+
+    /// Returns the file of its permissions.
+    pub(crate) fn permissions(&self) -> PathBuf {
+        self.directory().join(PERMISSIONS)
+    }
+}
+
+/// Returns the text in the parentheses that begin with `open`, behind `words`.
+fn between(said: &str, words: &str, open: &str) -> Option<String> {
+    let (_, rest) = said.split_once(words)?.1.split_once(open)?;
+    Some(rest.split_once(')')?.0.to_owned())
 }
 
 /// The names of some enclaves below a directory, sorted.
@@ -284,53 +444,6 @@ fn enclaves(root: &Path) -> Vec<String> {
     found
 }
 
-/// Bound on silent participants that are remembered.
-const SILENT_MAX: usize = 64;
-
-/// Time after which a participant that announces no endpoint counts as silent. Those of ROS 2 announce theirs at once, which takes a
-/// second on a busy machine.
-const SILENT_AFTER: Duration = Duration::from_secs(10);
-
-/// A participant of ROS 2 that announces itself and has announced no endpoint.
-struct Silent {
-    enclave: String,
-    since: Instant,
-}
-
-/// Those of the local networks of this process, by the beginning of their GUID.
-static SILENT: Mutex<BTreeMap<[u8; 12], Silent>> = Mutex::new(BTreeMap::new());
-
-/// Returns the enclaves of participants of ROS 2 on the local networks of this process that announce themselves and nothing else: those
-/// that DDS Security protects do so towards participants which they do not admit. Sorted, each once.
-pub fn silent_enclaves() -> Vec<String> {
-    let silent = SILENT.lock().unwrap_or_else(PoisonError::into_inner);
-    let silent = silent.values().filter(|silent| silent.since.elapsed() >= SILENT_AFTER);
-    let enclaves: BTreeSet<String> = silent.map(|silent| silent.enclave.clone()).collect();
-    enclaves.into_iter().collect()
-}
-
-/// Remembers a participant that has announced no endpoint yet, if its enclave is one of ROS 2. Logs and alerts show the name.
-pub(crate) fn note_silent(participant: &Guid, enclave: &str) {
-    let mut silent = SILENT.lock().unwrap_or_else(PoisonError::into_inner);
-    if silent.len() < SILENT_MAX && is_enclave(enclave) {
-        silent
-            .entry(prefix(participant))
-            .or_insert_with(|| Silent { enclave: enclave.to_owned(), since: Instant::now() });
-    }
-}
-
-/// Forgets a participant, which is gone or has announced an endpoint.
-pub(crate) fn forget_silent(participant: &Guid) {
-    SILENT.lock().unwrap_or_else(PoisonError::into_inner).remove(&prefix(participant));
-}
-
-/// The bytes that the GUIDs of a participant and of its endpoints share.
-fn prefix(guid: &Guid) -> [u8; 12] {
-    let mut prefix = [0; 12];
-    prefix.copy_from_slice(&guid.0[..12]);
-    prefix
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -347,27 +460,32 @@ mod tests {
     }
 
     #[test]
-    fn silent_participants_of_hostile_enclaves_are_not_shown() {
-        let is_noted = |enclave: &str| {
-            let participant = Guid([0xee; 16]);
-            note_silent(&participant, enclave);
-            SILENT.lock().unwrap().remove(&prefix(&participant)).is_some()
-        };
-        assert!(is_noted("/arm"));
-        for hostile in ["/arm\n2026-01-01T00:00:00Z ERROR all is lost", "/\u{1b}[2J", "arm", ""] {
-            assert!(!is_noted(hostile), "{hostile:?}");
-        }
+    fn refusals_of_the_plugins_are_told_with_the_file_and_what_to_do() {
+        let security = Security { keystore: "/k".into(), enclave: "/sgc".to_owned() };
+        let refused = |said: &str| security.refused(said.to_owned());
+        let ended = refused("Permissions validity period expired for CN=/sgc (expired: 2021-01-01T00:00:00)")
+            .to_string();
+        let expected = "/k/enclaves/sgc/permissions.p7s ended at 2021-01-01T00:00:00; let `ros2 security create_permission`";
+        assert!(ended.starts_with(expected), "{ended}");
+        let early = refused(
+            "Permissions validity period has not started yet for CN=/sgc (start: 2099-01-01T00:00:00)",
+        );
+        assert!(
+            matches!(&early, SecurityError::NotBegun { at, .. } if at == "2099-01-01T00:00:00"),
+            "{early}"
+        );
+        assert!(matches!(refused("Subject name is invalid"), SecurityError::OtherSubject { .. }));
+        assert!(
+            refused("Could not find domain 7 in governance").to_string().contains("; let governance.p7s")
+        );
+        let unknown = refused("Undefined Error Message").to_string();
+        assert_eq!(unknown, "/k/enclaves/sgc is refused: Undefined Error Message");
     }
 
     #[test]
-    fn refusals_say_what_to_do() {
-        assert!(
-            fix("Certificate not valid: error: certificate has expired; subject: /CN=a")
-                .is_some_and(|fix| fix.contains("cert.pem"))
-        );
-        assert!(
-            fix("Could not find domain 7 in governance").is_some_and(|fix| fix.contains("governance.p7s"))
-        );
-        assert_eq!(fix("Undefined Error Message"), None);
+    fn subjects_are_read_from_signed_permissions() {
+        let text = "MIME\n<grant><subject_name>CN=/a</subject_name></grant><subject_name> CN=/b </subject_name><subject_name>";
+        assert_eq!(subjects(text), ["CN=/a", "CN=/b"]);
+        assert_eq!(subjects(&"<subject_name>x</subject_name>".repeat(NAMED_MAX + 1)).len(), NAMED_MAX);
     }
 }

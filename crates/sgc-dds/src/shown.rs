@@ -2,6 +2,9 @@
 //!
 //! An endpoint that matches none gets no data, answers no heartbeat and keeps nothing. Neither Fast DDS nor Cyclone reports a
 //! partition as an incompatible QoS.
+//!
+//! Where DDS Security protects the network, the permissions of the enclave have to grant the partition, which those of SROS2 do not by
+//! themselves: they name no partitions, and that is the default one alone (DDS Security 1.1, 9.4.1.3.2.3).
 
 use std::sync::Arc;
 
@@ -10,10 +13,11 @@ use sgc_ros::{EndpointKind, EndpointSpec, ShownEndpoint};
 use sgc_wire::{History, Qos};
 
 use crate::entity::Entity;
+use crate::log;
 use crate::network::Participant;
 
 /// Partition of shown endpoints. Endpoints of ROS 2 are in none.
-const PARTITION: &str = "sgc/shown";
+pub(crate) const PARTITION: &str = "sgc/shown";
 
 /// Fields drop in this order: children first.
 struct Shown {
@@ -35,13 +39,15 @@ pub(crate) fn create(
     let topic = participant.topic(&spec)?;
     let group = participant.group(kind, &spec)?;
     let parent = group.as_ref().unwrap_or(participant.entity()).handle();
+    // A refusal is the error's to tell, and no line in the log for each endpoint.
     // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
-    let endpoint = Entity::new(unsafe {
+    let (handle, _) = log::listen(|| unsafe {
         match kind {
             EndpointKind::Reader => dds_create_reader(parent, topic.handle(), qos.as_ptr(), std::ptr::null()),
             EndpointKind::Writer => dds_create_writer(parent, topic.handle(), qos.as_ptr(), std::ptr::null()),
         }
-    })?;
+    });
+    let endpoint = Entity::new(handle)?;
     let guid = endpoint.guid()?;
     let participant = Arc::clone(participant);
     Ok(ShownEndpoint::new(

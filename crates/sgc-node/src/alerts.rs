@@ -89,7 +89,7 @@ pub enum Alert {
         /// The reason.
         reason: String,
     },
-    /// Programs of the local ROS 2 network announce themselves and none of their topics.
+    /// DDS Security protects programs of the local ROS 2 network, and this node has no enclave.
     ProtectedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
         enclave: String,
@@ -100,6 +100,21 @@ pub enum Alert {
         mistakes: String,
         /// Seconds since the node read it.
         ago_s: u64,
+    },
+    /// DDS Security protects programs of the local ROS 2 network and this node, and one does not admit the other.
+    RefusedPrograms {
+        /// The enclave that they name, `/` if they have none of their own.
+        enclave: String,
+    },
+    /// DDS Security protects this node, and programs of the local ROS 2 network have none.
+    UnprotectedPrograms {
+        /// Their number.
+        programs: usize,
+    },
+    /// Programs of the local ROS 2 network announce themselves, and nothing else of them arrives.
+    SilentPrograms {
+        /// The enclave that they name, `/` if they have none of their own.
+        enclave: String,
     },
     /// An alert that this version does not know.
     #[serde(other)]
@@ -141,13 +156,21 @@ impl Alert {
                  up to a minute apart"
             }
             Self::ProtectedPrograms { .. } => {
-                "if DDS Security (SROS2) protects them, set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves, \
-                 with a certificate of their CA and the key of that; if not, look for a firewall that stops UDP between them and sgc"
+                "set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves (docs/vendors.md)"
             }
             Self::ConfigurationRefused { .. } => {
                 "mend the file; `sgc check -c FILE` says everything that is wrong with it. Then `sgc reload`, if the node does not \
                  watch it"
             }
+            Self::RefusedPrograms { .. } => {
+                "the log says who refuses whom where Cyclone DDS does; compare CA, governance and permissions of the two enclaves, and when \
+                 both certificates end"
+            }
+            Self::UnprotectedPrograms { .. } => {
+                "start them with ROS_SECURITY_ENABLE=true and an enclave of this node's keystore, or share their topics with a second node \
+                 of sgc without `enclave`"
+            }
+            Self::SilentPrograms { .. } => "look for a firewall that stops UDP between them and sgc",
             Self::Other => "use an `sgc` of the node's version",
         }
     }
@@ -197,7 +220,24 @@ impl fmt::Display for Alert {
             }
             Self::ProtectedPrograms { enclave } => write!(
                 f,
-                "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) does so"
+                "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) protects it, and \
+                 this node has no enclave"
+            ),
+            Self::RefusedPrograms { enclave } => write!(
+                f,
+                "a program of enclave {enclave} and this node do not admit each other: DDS Security (SROS2) protects both, and none of \
+                 its topics are announced"
+            ),
+            Self::UnprotectedPrograms { programs: 1 } => f.write_str(
+                "1 program has no DDS Security (SROS2) on the local network: this node's governance does not let it in",
+            ),
+            Self::UnprotectedPrograms { programs } => write!(
+                f,
+                "{programs} programs have no DDS Security (SROS2) on the local network: this node's governance does not let them in"
+            ),
+            Self::SilentPrograms { enclave } => write!(
+                f,
+                "a program of enclave {enclave} announces itself to sgc, and nothing else of it arrives; it has no DDS Security"
             ),
             Self::ConfigurationRefused { mistakes, ago_s } => write!(
                 f,

@@ -46,13 +46,13 @@ use crate::message_keys;
 use crate::network_slot::{NetworkSlot, OpenAgain};
 use crate::peer_rate::PeerRates;
 use crate::policy::grantees;
-use crate::protected;
 use crate::reload::{ConfigSource, JoinNetwork, Reloader, Running};
 use crate::reopening;
 use crate::roaming::Network;
 use crate::rules::{Rules, RulesError};
 use crate::run_lock::{IdentityInUse, RunLock};
 use crate::state::{self, StateError};
+use crate::strangers;
 
 /// How much later than a pulse the transport keeps a link alive by itself.
 const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
@@ -298,7 +298,7 @@ pub async fn run(
         let network = Arc::new(CycloneNetwork::open(&config)?);
         if !is_watched.swap(true, Ordering::Relaxed) {
             runtime.spawn(discovery_server::watch());
-            runtime.spawn(protected::watch());
+            runtime.spawn(strangers::watch());
         }
         Ok((network, Some(gateway)))
     });
@@ -710,7 +710,7 @@ fn system_rng() -> Result<ChaCha20Rng, NodeError> {
 
 fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
     let security = ros.security.as_ref().filter(|security| match security.enclave.check() {
-        Err(error) if !security.enforced => {
+        Err(error) if !security.enforced && error.is_absence() => {
             warn!(
                 "ROS_SECURITY_ENABLE is set and ROS_SECURITY_STRATEGY is not Enforce, so this node goes without DDS Security: {error}"
             );

@@ -349,6 +349,18 @@ pub enum RosError {
         /// What the implementation said.
         reason: String,
     },
+    /// DDS Security forbids an endpoint of the graph.
+    #[error("{file} grants enclave {enclave} no partition {partition} on {topic}")]
+    ForbiddenPartition {
+        /// The permissions.
+        file: String,
+        /// The enclave.
+        enclave: String,
+        /// The partition of endpoints that are only shown.
+        partition: &'static str,
+        /// DDS topic.
+        topic: String,
+    },
     /// A payload that is no serialised sample: shorter than its header, or too large.
     #[error("a payload of {bytes} bytes is not a serialised sample")]
     Payload {

@@ -153,8 +153,11 @@ fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<
             "enclave".to_owned(),
             format!("{} in {}", enclave.enclave, enclave.keystore.display()),
         ]);
-        let result = if security.enforced { "does not start like that" } else { "goes without DDS Security" };
-        let unusable = enclave.check().err().map(|error| format!("{error}; the node {result}"));
+        let unusable = enclave.check().err().map(|error| {
+            let goes_without = !security.enforced && error.is_absence();
+            let result = if goes_without { "goes without DDS Security" } else { "does not start like that" };
+            format!("{error}; the node {result}")
+        });
         let exposed = enclave.exposed_key().map(|key| {
             format!("{}: others can read it, and it is a private key: chmod 600 it", key.display())
         });

@@ -121,13 +121,6 @@ pub(super) fn resolve(
         let written = draft.ros.as_ref().unwrap_or(&nothing);
         let ros = ros_env::resolve(written, env, &mut resolver.errors);
         let security = resolver.security(written, env);
-        if let (Some(_), Some(_)) = (&security, &draft.gateway) {
-            let (key, other_value) = ("enclave", "given".to_owned());
-            let right = "DDS Security admits one participant of a process, and the gateway is one beside the node's: let a node of its own \
-                         have the gateway";
-            let mistake = Mistake::Contradiction { key, value: "given", other: "[gateway]", other_value, right };
-            resolver.record(&draft.origin, mistake);
-        }
         RosConfig { definitions: resolver.definitions(written), security, ..ros }
     });
     let partners = resolver.partners(draft);

@@ -12,7 +12,7 @@ use tracing::{debug, info, warn};
 
 use super::{Core, now};
 use crate::alerts::{Alert, clock_alert};
-use crate::protected;
+use crate::strangers;
 
 /// The place of a process that is linked to another router of the mesh.
 const ELSEWHERE: &str = "another router";
@@ -126,7 +126,7 @@ impl<N: RosNetwork> Core<N> {
         }));
         let closed = self.reopening.failed.clone();
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
-        alerts.extend(protected::alerts());
+        alerts.extend(strangers::alerts());
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
             let ahead_ms = self.router.clock_ahead_ms(*id).filter(|ms| clocks_differ(*ms))?;
             let peer = self.called(&entry.link.peer().node_id);

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use sgc_endpoint::LostReason;
 use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
 use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, Role, RosNode, SinkId};
-use tracing::debug;
+use tracing::{debug, info};
 
 use super::{Core, CoreEvent, drop_elsewhere};
 
@@ -322,6 +322,12 @@ impl<N: RosNetwork> Core<N> {
                 });
                 let ends = match made.collect::<Result<_, RosError>>() {
                     Ok(ends) => ends,
+                    Err(error @ RosError::ForbiddenPartition { .. }) => {
+                        if failures.count("consumers_forbidden") {
+                            info!("programs elsewhere are not shown in the local graph: {error}");
+                        }
+                        continue;
+                    }
                     Err(error) => {
                         failures.count("show_consumer");
                         debug!(%error, "the local graph does not show a subscriber or client elsewhere");

@@ -231,6 +231,11 @@ const CONTROL: &[Refusal] = &[
         DDS_LOG,
     ),
     counted(
+        "consumers_forbidden",
+        "the enclave of this node may not show subscribers and clients of other nodes in the local graph; messages flow all the same",
+        "grant it the partition `sgc/shown` in permissions.p7s (docs/vendors.md)",
+    ),
+    counted(
         "consumers_untold",
         "more subscribers or clients use one interface of another node than its owner is told of",
         "",

@@ -38,14 +38,24 @@ impl Keystore {
 
     /// Makes an enclave that may use these topics, with a certificate of so many days.
     fn add(&self, enclave: &str, topics: &[&str], days: &str) {
+        self.add_with(enclave, topics, &[("VALID", days)]);
+    }
+
+    /// Makes an enclave with these variables of `keystore.sh`.
+    fn add_with(&self, enclave: &str, topics: &[&str], variables: &[(&str, &str)]) {
         let mut command = Command::new(support::repository("tests/peers/keystore.sh"));
-        command.arg(&self.0).arg(enclave).args(topics).env("VALID", days);
+        command.arg(&self.0).arg(enclave).args(topics).envs(variables.iter().copied());
         let made = command.output().unwrap();
         assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     }
 
     fn directory(&self, enclave: &str) -> PathBuf {
         self.0.join("enclaves").join(&enclave[1..])
+    }
+
+    /// Gives an enclave a file of another one.
+    fn take(&self, enclave: &str, file: &str, of: &Self, other: &str) {
+        std::fs::copy(of.directory(other).join(file), self.directory(enclave).join(file)).unwrap();
     }
 }
 
@@ -132,7 +142,7 @@ fn programs_that_keep_a_node_out_are_named() {
     let listen = ["--topic", "/out", "--verbose"];
     let mut listener = lab.peer(Site::Desk, "fastdds", "sub", &listen);
     let _talker = secured(&lab, &keystore, "/talker", "pub", &["--topic", "/out"]);
-    let said = "a program of enclave /talker announces itself to sgc, but none of its topics: DDS Security (SROS2) does so";
+    let said = "a program of enclave /talker announces itself to sgc, but none of its topics: DDS Security (SROS2) protects it";
     eventually("sgc why names the enclave", || lab.why(Site::Robot, "/out").contains(said));
     eventually("the log names the enclave", || lab.log(Site::Robot).contains(said));
 
@@ -143,6 +153,8 @@ fn programs_that_keep_a_node_out_are_named() {
     let said = "a program that DDS Security protects is not let in: Begin handshake reply failed";
     eventually("the log says why", || lab.log(Site::Robot).contains(said));
     assert!(lab.log(Site::Robot).contains("preferred_key_agreement to ECDH"), "{}", lab.log(Site::Robot));
+    let said = "a program of enclave /talker and this node do not admit each other";
+    eventually("sgc why names the enclave that is refused", || lab.why(Site::Robot, "/out").contains(said));
 
     lab.end(Site::Robot, Signal::TERM);
     lab.reconfigure(Site::Robot, "\"/sgc\"", "\"/bridge\"");
@@ -152,45 +164,72 @@ fn programs_that_keep_a_node_out_are_named() {
 
 #[cfg(feature = "sros2")]
 #[test]
+fn programs_without_security_are_named_beside_a_secured_node() {
+    let mut lab = lab();
+    let _keystore = Keystore::new(&lab);
+    join(&lab, ENCLAVE);
+    lab.start_all();
+    let _talker = lab.peer(Site::Robot, "cyclone", "pub", &["--topic", "/out", "--node", "/talker"]);
+    let said = "1 program has no DDS Security (SROS2) on the local network";
+    eventually("sgc why names it", || lab.why(Site::Robot, "/out").contains(said));
+    eventually("the log names it", || lab.log(Site::Robot).contains(said));
+}
+
+#[cfg(feature = "sros2")]
+#[test]
 fn enclaves_that_cannot_be_used_are_refused_with_the_file() {
     let mut lab = lab();
     let keystore = Keystore::new(&lab);
-    keystore.add("/ended", &TOPICS, "-1");
-    keystore.add("/without_graph", &["rt/out"], "1");
-    keystore.add("/without_key", &TOPICS, "1");
-    std::fs::remove_file(keystore.directory("/without_key").join("key.pem")).unwrap();
     let foreign = Keystore(lab.dir().join("foreign"));
     foreign.add("/foreign", &TOPICS, "1");
-    keystore.add("/foreign", &TOPICS, "1");
-    let ca = "permissions_ca.cert.pem";
-    std::fs::copy(foreign.directory("/foreign").join(ca), keystore.directory("/foreign").join(ca)).unwrap();
+    keystore.add("/cert_ended", &TOPICS, "-1");
+    keystore.add_with("/permissions_ended", &TOPICS, &[("UNTIL", "2021-01-01T00:00:00")]);
+    keystore.add("/without_graph", &["rt/out"], "1");
+    for enclave in ["/without_key", "/other_key", "/text", "/other_ca", "/other_signer", "/other_governance"]
+    {
+        keystore.add(enclave, &TOPICS, "1");
+    }
+    keystore.add("/other_permissions", &TOPICS, "1");
+    std::fs::remove_file(keystore.directory("/without_key").join("key.pem")).unwrap();
+    std::fs::write(keystore.directory("/text").join("key.pem"), "no key").unwrap();
+    keystore.take("/other_key", "key.pem", &keystore, "/talker");
+    keystore.take("/other_ca", "identity_ca.cert.pem", &foreign, "/foreign");
+    keystore.take("/other_signer", "permissions_ca.cert.pem", &foreign, "/foreign");
+    keystore.take("/other_governance", "governance.p7s", &foreign, "/foreign");
+    keystore.take("/other_permissions", "permissions.p7s", &keystore, "/talker");
     let mut enclave = ENCLAVE.to_owned();
     join(&lab, &enclave);
+    // Cyclone DDS alone reads permissions, which `sgc check` does without.
     for (wrong, said, at_check) in [
-        (
-            "/absent",
-            "enclaves/absent is not there; the keystore has /bridge, /ended, /foreign, /listener",
-            true,
-        ),
+        ("/absent", "enclaves/absent is not there; the keystore has /bridge, /cert_ended, /listener", true),
         ("/without_key", "without_key/key.pem: No such file or directory", true),
+        ("/text", "text/key.pem is not a private key in PEM without a password", true),
+        ("/other_key", "other_key/key.pem is not the private key of", true),
+        ("/other_key", "other_key/cert.pem; put back the key", true),
+        ("/cert_ended", "cert_ended/cert.pem ended at", true),
+        ("/other_ca", "other_ca/cert.pem was not signed by the CA in", true),
+        ("/other_ca", "other_ca/identity_ca.cert.pem (", true),
+        ("/other_signer", "other_signer/permissions.p7s was not signed by the CA in", true),
+        ("/other_governance", "other_governance/governance.p7s was not signed by the CA in", true),
         (
-            "/ended",
-            "enclaves/ended is refused: Error occurred while validating local permission: Certificate not valid",
+            "/other_permissions",
+            "permissions.p7s grants to CN=/talker, and not to the subject CN=/other_perm",
             false,
         ),
-        ("/ended", "certificate has expired", false),
-        ("/foreign", "permissions_ca.cert.pem must belong to the CA that signed", false),
+        ("/permissions_ended", "permissions_ended/permissions.p7s ended at 2021-01-01T00:00:00", false),
         (
             "/without_graph",
             "without_graph/permissions.p7s does not grant ros_discovery_info to enclave /without_graph",
             false,
         ),
     ] {
-        lab.reconfigure(Site::Robot, &format!("\"{enclave}\""), &format!("\"{wrong}\""));
-        wrong.clone_into(&mut enclave);
+        if wrong != enclave {
+            lab.reconfigure(Site::Robot, &format!("\"{enclave}\""), &format!("\"{wrong}\""));
+            wrong.clone_into(&mut enclave);
+        }
         let refused = refusal(&lab);
         assert!(refused.contains(said), "{wrong}: {refused}");
-        assert!(!at_check || check(&lab).contains(said), "{wrong}: {}", check(&lab));
+        assert_eq!(check(&lab).contains(said), at_check, "{wrong}: {}", check(&lab));
     }
 
     // The graph's topic is not needed without a graph, and the other one is not granted.
@@ -199,4 +238,53 @@ fn enclaves_that_cannot_be_used_are_refused_with_the_file() {
     let _talker = lab.peer(Site::Desk, "fastdds", "pub", &["--topic", "/in"]);
     let said = "without_graph/permissions.p7s does not grant rt/in to enclave /without_graph";
     eventually("the log names the topic", || lab.log(Site::Robot).contains(said));
+}
+
+/// Returns how often the robot's node counted something.
+fn counted(lab: &Lab, kind: &str) -> u64 {
+    lab.status(Site::Robot)["drops"][kind].as_u64().unwrap_or_default()
+}
+
+#[cfg(feature = "sros2")]
+#[test]
+fn far_subscribers_that_permissions_do_not_show_are_one_line_in_the_log() {
+    let mut lab = lab();
+    let keystore = Keystore::new(&lab);
+    join(&lab, ENCLAVE);
+    lab.start_all();
+    let _talker = secured(&lab, &keystore, "/talker", "pub", &["--topic", "/out", "--rate", "20"]);
+    let listen =
+        |node| lab.peer(Site::Desk, "cyclone", "sub", &["--topic", "/out", "--node", node, "--verbose"]);
+    for (node, shown) in [("/first", 1), ("/second", 2)] {
+        let mut listener = listen(node);
+        listener.wait("a message", |event| event["event"] == "received");
+        eventually("it is counted", || counted(&lab, "consumers_forbidden") == shown);
+    }
+    let log = lab.log(Site::Robot);
+    let said = "permissions.p7s grants enclave /bridge no partition sgc/shown on rt/out";
+    assert_eq!(log.matches(said).count(), 1, "{log}");
+    assert!(!log.contains("cyclonedds") && !log.contains("sgc_dds"), "{log}");
+}
+
+#[cfg(feature = "sros2")]
+#[test]
+fn gateway_takes_part_in_a_secured_network() {
+    let mut lab = lab();
+    let keystore = Keystore::new(&lab);
+    join(&lab, ENCLAVE);
+    lab.reconfigure(Site::Robot, "[ros]\n", "[gateway]\n[ros]\n");
+    lab.start_all();
+    let _talker = secured(&lab, &keystore, "/talker", "pub", &["--topic", "/out", "--rate", "20"]);
+    let mut listener = secured(&lab, &keystore, "/listener", "sub", &["--topic", "/in", "--verbose"]);
+    for (protocol, address) in [("grpc", "grpc://127.0.0.1:50051"), ("rosbridge", "ws://127.0.0.1:9090")] {
+        let mut program = lab.python(Site::Robot, "gateway.py", &[protocol, address, "--topic", "/out"]);
+        program.wait("a message of a secured publisher", |event| event["event"] == "heard");
+        program.end();
+    }
+    let mut publisher = lab.sgc(Some(Site::Robot), &["topic", "pub", "/in", "std_msgs/String", "data: x"]);
+    let published = publisher.args(["--once", "--socket", "robot.sock"]).output().unwrap();
+    assert!(published.status.success(), "{published:?}");
+    listener.wait("a message of the gateway", |event| event["event"] == "received");
+    let log = lab.log(Site::Robot);
+    assert!(!log.contains("cyclonedds") && !log.contains("sgc_dds"), "{log}");
 }
