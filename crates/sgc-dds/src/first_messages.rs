@@ -33,6 +33,7 @@ use cyclors::{
 
 use crate::entity::{Entity, check};
 use crate::identity::FAST_DDS;
+use crate::manual_leases::{self, Lease};
 
 /// How long after a match a reader asks for a heartbeat, nanoseconds. Cyclone tells of the match a few instructions before it would
 /// handle a heartbeat for the reader. On a busy machine the first answer may come in between; the second request is counted as if it
@@ -141,6 +142,17 @@ struct ProxyWriterState {
     reorder: *const c_void,
     delivery_queue: *const c_void,
     events: *mut c_void,
+    local_readers: LocalReaders,
+    lease: *const Lease,
+}
+
+/// `struct ddsi_local_reader_ary` (`ddsi_entity.h`).
+#[repr(C)]
+struct LocalReaders {
+    lock: pthread_mutex_t,
+    flags: u32,
+    count: u32,
+    readers: *const c_void,
 }
 
 /// `ddsi_protocol_version_t`.
@@ -202,8 +214,8 @@ struct Discovered {
 
 /// Has Cyclone tell this module of the endpoints that it discovers in a domain from now on, by taking the place of the function with
 /// which it publishes them to the built-in topics. It calls that once a writer is known, under the writer's lock, before it
-/// matches readers and before it handles a heartbeat.
-pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<(), String> {
+/// matches readers and before it handles a heartbeat. Returns what identifies the domain to [`manual_leases`].
+pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, String> {
     // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
     let reader = Entity::new(unsafe {
         dds_create_reader(
@@ -235,7 +247,7 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<(), Strin
     }
     let ours = endpoint_changed as WriteEndpoint as *mut c_void;
     if write_endpoint == ours {
-        return Ok(());
+        return Ok(gv);
     }
     let known = WRITE_ENDPOINT.compare_exchange(
         std::ptr::null_mut(),
@@ -248,7 +260,7 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<(), Strin
     }
     // SAFETY: the field is aligned, lives as long as the domain, and Cyclone's other threads read it whole; either function does for them.
     unsafe { AtomicPtr::from_ptr(&raw mut (*topics).write_endpoint) }.store(ours, Ordering::Release);
-    Ok(())
+    Ok(gv)
 }
 
 /// Adds to a listener of a reliable reader that it asks writers for a heartbeat.
@@ -271,6 +283,10 @@ unsafe extern "C" fn endpoint_changed(
     if alive {
         // SAFETY: Cyclone calls this with an entity that it has locked or that no other thread knows.
         DISCOVERED.set(unsafe { discover(entity, domain) });
+    } else {
+        // SAFETY: every entity begins with these.
+        let (gv, guid) = unsafe { ((*entity).gv, (*entity).guid) };
+        manual_leases::forget(gv, guid);
     }
     let original = WRITE_ENDPOINT.load(Ordering::Acquire);
     if !original.is_null() {
@@ -279,7 +295,7 @@ unsafe extern "C" fn endpoint_changed(
     }
 }
 
-/// Returns a reliable writer of Fast DDS that is new, and lets its first heartbeat skip nothing.
+/// Has the lease of a new reliable writer looked at, and returns the writer if it is of Fast DDS, whose first heartbeat is let skip nothing.
 ///
 /// # Safety
 /// `entity` must be a `struct ddsi_entity_common` that may be written to, `domain` the `struct dds_domain` that it belongs to.
@@ -294,15 +310,20 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<D
     // SAFETY: this kind of entity is one, and the fields in front were where they should be.
     let (vendor, qos, unicast, instance) =
         unsafe { ((*writer).vendor, (*writer).qos, (*writer).unicast, (*writer).common.instance) };
-    if vendor != FAST_DDS || qos.is_null() {
+    if qos.is_null() {
         return None;
     }
     let state = SECURITY_BYTES.into_iter().find_map(|security| {
-        // SAFETY: either place is inside of the struct, which is longer by another four pointers at least.
+        // SAFETY: either place is inside of the struct, which is longer by another two pointers at least.
         let state = unsafe { writer.add(1).byte_add(security) }.cast::<ProxyWriterState>().cast_mut();
         // SAFETY: as above.
         unsafe { is_new_and_reliable(&*state) }.then_some(state)
     })?;
+    // SAFETY: the writer is new, as was just seen, and its lease and QoS live as long as it does.
+    unsafe { manual_leases::keep(gv, guid, entity.cast(), qos, (*state).lease) };
+    if vendor != FAST_DDS {
+        return None;
+    }
     let mut durability = dds_durability_kind_DDS_DURABILITY_VOLATILE;
     // SAFETY: the QoS of a writer that its lock is held of; a place for the result. Without a durability it is volatile.
     unsafe { dds_qget_durability(qos, &mut durability) };

@@ -33,6 +33,7 @@ mod intake;
 mod known_writers;
 mod late;
 mod log;
+mod manual_leases;
 mod network;
 pub mod payload;
 mod plugin_domain;

@@ -32,6 +32,7 @@ use crate::graph::{Announcer, SharedHandler, lock};
 use crate::host_addresses::{self, Changes};
 use crate::intake::Pace;
 use crate::log;
+use crate::manual_leases::Leases;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
@@ -84,6 +85,8 @@ pub(crate) struct Participant {
     /// Ends before the domain. None if it loses programs of this host when the host's addresses change.
     same_host: Option<SameHost>,
     domain: Entity,
+    /// If the leases of writers are looked at. Ends behind the domain.
+    leases: Option<Leases>,
     guid: Guid,
     domain_id: u32,
     tag: Option<String>,
@@ -147,16 +150,17 @@ impl CycloneNetwork {
             tracing::warn!(reason, "programs of this host may be lost when its addresses change");
         }
         let guid = entity.guid().map_err(refused)?;
-        if let Err(reason) = first_messages::install(&domain.entity, &entity) {
+        let inside = first_messages::install(&domain.entity, &entity).inspect_err(|reason| {
             tracing::warn!(
                 reason,
                 "this Cyclone DDS is another one: first messages of Fast DDS writers may be lost"
             );
-        }
+        });
         let participant = Participant {
             entity,
             same_host: same_host.ok(),
             domain: domain.entity,
+            leases: inside.ok().map(Leases),
             guid,
             domain_id: config.domain,
             tag: config.tag.clone(),
@@ -213,7 +217,7 @@ impl CycloneNetwork {
 
     /// Makes the network neither hear nor speak for a while, as when its cable is pulled. For tests.
     #[doc(hidden)]
-    pub fn set_deaf_mute(&self, duration: std::time::Duration) {
+    pub fn set_deaf_mute(&self, duration: Duration) {
         let ns = i64::try_from(duration.as_nanos()).unwrap_or(crate::entity::INFINITE);
         // SAFETY: takes numbers only; the handle is checked by Cyclone.
         unsafe { dds_domain_set_deafmute(self.participant.domain.handle(), true, true, ns) };
@@ -267,6 +271,10 @@ impl RosNetwork for CycloneNetwork {
 
     fn reader_guid(&self, reader: &CycloneReader) -> Guid {
         reader.guid()
+    }
+
+    fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
+        self.participant.leases.as_ref()?.renewed_ago(writer)
     }
 
     fn has_graph(&self) -> bool {

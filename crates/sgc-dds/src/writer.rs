@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use cyclors::{
-    DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_create_writer,
-    dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
+    DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_assert_liveliness,
+    dds_create_writer, dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
     dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
@@ -261,6 +261,13 @@ impl RosWriter for CycloneWriter {
         // SAFETY: takes a number, checked by Cyclone.
         if let Err(reason) = check(unsafe { dds_write_flush(self.writer.handle()) }) {
             tracing::error!(reason, "what was written does not leave");
+        }
+    }
+
+    fn assert_liveliness(&self) {
+        // SAFETY: takes a number, checked by Cyclone.
+        if let Err(reason) = check(unsafe { dds_assert_liveliness(self.writer.handle()) }) {
+            tracing::debug!(reason, "the liveliness of a writer is not asserted");
         }
     }
 

@@ -982,6 +982,41 @@ fn discovery_tells_of_a_lapsed_writer_and_of_its_return() {
 }
 
 #[test]
+fn assertions_of_a_writer_that_is_manual_by_topic_are_seen_without_messages() {
+    const LEASE: Duration = Duration::from_millis(200);
+    let (ros, sgc) = (open(160, None), open(160, Some("arm-1")));
+    let manual = with(spec("manual"), |qos| {
+        qos.liveliness = Liveliness::ManualByTopic;
+        qos.lease_ns = Some(LEASE.as_nanos() as u64);
+    });
+    let automatic = with(spec("manual"), |qos| qos.lease_ns = Some(60_000_000_000));
+    let events = discover(&sgc);
+    let (_reader, _samples) = read(&sgc, &automatic);
+    let writers = [writer(&ros, &manual, 1), writer(&ros, &automatic, 1)];
+    let found = [appeared(&events).guid, appeared(&events).guid];
+    assert!(writers.iter().all(|writer| found.contains(&writer.guid())));
+    let [ago, of_automatic] = [0, 1].map(|n| {
+        let (sgc, guid) = (&sgc, writers[n].guid());
+        move || sgc.renewed_ago(&guid)
+    });
+    assert_eq!(ago(), None, "it did not say anything yet");
+    let renewals: [&dyn Fn(); 2] =
+        [&|| writers[0].assert_liveliness(), &|| write(&writers[0], &string_cdr("alive"))];
+    for renew in renewals.into_iter().cycle().take(4) {
+        let since = Instant::now();
+        renew();
+        eventually("the lease is renewed", || ago().is_some_and(|ago| ago <= since.elapsed()));
+        eventually("the lease has run out", || ago() > Some(2 * LEASE));
+    }
+    write(&writers[1], &string_cdr("alive"));
+    assert_eq!(of_automatic(), None);
+    // Its lease runs out where its messages go.
+    quiet(&events);
+    drop(writers);
+    eventually("it is forgotten", || ago().is_none());
+}
+
+#[test]
 fn rmw_cyclonedds_on_localhost_is_found() {
     // What rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (from Iron on), and of
     // ROS_LOCALHOST_ONLY=1 (up to Humble).

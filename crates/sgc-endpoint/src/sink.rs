@@ -70,6 +70,8 @@ pub enum Delivery {
     Incomplete,
     /// No message, but a sign that none is missing.
     Mark,
+    /// No message: the publisher of this source asserted its liveliness.
+    Asserted(SourceId),
     /// The source must be asked for what is missing before its messages can be delivered; see [`Sink::ask`].
     NeedsHistory(SourceId),
     /// The source has sent what it was asked for.
@@ -583,6 +585,18 @@ impl Sink {
         Ok(())
     }
 
+    /// Returns what an assertion comes to that `by` says of a publisher: of one at its own node, which signs with the same key. Others'
+    /// publishers are none of its business.
+    fn asserted(&self, by: &SourceId, publisher: [u8; 8]) -> Delivery {
+        let Some(SourceState { announced_key, .. }) = self.sources.get(by) else { return Delivery::Mark };
+        let [first, last] = [0, 0xff].map(|byte| SourceId::of_publisher(publisher, [byte; 8]));
+        let is_it = |(id, state): &(&SourceId, &SourceState)| {
+            *id != by && state.last_epoch.is_none() && state.announced_key == *announced_key
+        };
+        let found = self.sources.range(first..=last).find(is_it);
+        found.map_or(Delivery::Mark, |(id, _)| Delivery::Asserted(*id))
+    }
+
     /// Takes what a packet opened to: fragment, and behind the first one the head.
     fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
         let head = match opened {
@@ -616,8 +630,13 @@ impl Sink {
         if header.to.is_some() {
             source.heard = true;
         }
-        if head.is_some_and(|head| head.kind == MessageKind::Mark) {
-            return source.take_mark(header, opened.text());
+        if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
+            // What is sent again is no news of anybody's liveliness.
+            let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers);
+            let Some(publisher) = asserted else { return source.take_mark(header, opened.text()) };
+            oldest_of_mark(header, opened.text())?;
+            source.done(header.seq);
+            return Ok(self.asserted(&header.source, publisher));
         }
         if header.to.is_some() && std::mem::take(&mut source.anew) {
             source.expected = header.seq;
@@ -764,10 +783,7 @@ impl SourceState {
 
     /// Takes a mark, of which each has its number. One that goes ahead of an answer says what is lost for good.
     fn take_mark(&mut self, header: &PacketHeader, text: &[u8]) -> Result<Delivery, SinkDrop> {
-        let oldest = text.try_into().map(u64::from_be_bytes).map_err(|_| SinkDrop::Head)?;
-        if oldest > header.seq {
-            return Err(SinkDrop::Head);
-        }
+        let oldest = oldest_of_mark(header, text)?;
         let in_turn = !self.recovers || header.seq == self.expected;
         if header.to.is_none() {
             if !in_turn {
@@ -829,6 +845,12 @@ impl SourceState {
         }
         Ok(())
     }
+}
+
+/// Returns the oldest number that the source of a mark could send again.
+fn oldest_of_mark(header: &PacketHeader, text: &[u8]) -> Result<u64, SinkDrop> {
+    let oldest = text.try_into().map(u64::from_be_bytes).map_err(|_| SinkDrop::Head)?;
+    if oldest > header.seq { Err(SinkDrop::Head) } else { Ok(oldest) }
 }
 
 /// The key that a packet was sealed with, if it is what it says.

@@ -264,6 +264,28 @@ impl Source {
         self.flush(emit);
     }
 
+    /// Says to all that a publisher asserted its liveliness, by a mark: in the name of a source that keeps nothing, so that
+    /// assertions take no place of messages.
+    ///
+    /// # Errors
+    /// [`PublishError::Keeps`] if this source keeps messages, [`PublishError::Exhausted`] if it has no number left.
+    pub fn assert_publisher(
+        &mut self,
+        publisher: [u8; 8],
+        mut emit: impl FnMut(Packet),
+    ) -> Result<(), PublishError> {
+        if self.config.history_depth > 0 || self.progress.recovers {
+            return Err(PublishError::Keeps);
+        }
+        let seq = self.next_number(&Bytes::new())?;
+        let (head, payload) =
+            (MessageHead::of_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
+        self.seal_fragments(None, seq, &head, &payload, &mut emit);
+        self.keep(Kept { seq, head, payload });
+        self.flush(emit);
+        Ok(())
+    }
+
     /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the
     /// sign that they were sent. What was published before leaves before. From 0 it is what late joiners get; if the
     /// first that is asked for is here no more, a mark that says so goes ahead.

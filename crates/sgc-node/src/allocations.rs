@@ -129,7 +129,8 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
         let (alive, _) = mpsc::channel(1);
         let share = Arc::new(LocalShare::new(NAME, data, alive, u64::MAX, Arc::default()));
         let slot = SourceSlot::new(source(suite).0, false, true);
-        share.set_map(SourceMap { shared: None, per_writer: true, own: HashMap::from([(WRITER, slot)]) });
+        let own = HashMap::from([(WRITER, slot)]);
+        share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
         let payload = Bytes::from(vec![7; MESSAGE_BYTES]);
         // Shared from the beginning, as samples of a DDS reader are.
         let _other = payload.clone();

@@ -10,6 +10,7 @@ pub mod admin;
 pub mod alerts;
 #[cfg(test)]
 mod allocations;
+mod assertions;
 pub mod audit;
 mod authority;
 #[cfg(feature = "benchmarks")]

@@ -18,8 +18,8 @@ use sgc_ros::{
 };
 use sgc_router::LinkId;
 use sgc_wire::{
-    History, KEY_HASH_BYTES, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId, SourceId,
-    TopicGrant,
+    History, KEY_HASH_BYTES, Liveliness, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId,
+    SourceId, TopicGrant,
 };
 use tokio::sync::{OwnedMutexGuard, mpsc};
 use tokio::time::{sleep_until, timeout_at};
@@ -50,6 +50,8 @@ const TIMER_SLACK_NS: u64 = 1_000;
 const RECENT_MAX: usize = 4096;
 /// The longest message that is written by who received it.
 const AT_ONCE_BYTES_MAX: usize = 16 << 10;
+/// How long a writer's liveliness is not asserted again: shorter than any lease of those that are.
+const ASSERTION_SPACING: Duration = Duration::from_millis(20);
 /// How long the network is held back by a local writer that takes nothing.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -409,6 +411,12 @@ impl LocalSink {
         match result {
             Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => None,
             Ok(Delivery::Message(message)) => self.write(message).await,
+            Ok(Delivery::Asserted(source)) => {
+                if let Some(writer) = self.open_writer(Some(source)) {
+                    writer.assert_liveliness();
+                }
+                None
+            }
             Ok(Delivery::NeedsHistory(source)) => {
                 let _ = self.requests.send(SinkRequest::History(self.name, source)).await;
                 None
@@ -572,6 +580,8 @@ pub(crate) struct WriterQueue {
     /// overtakes what was queued.
     take: Mutex<Take>,
     behind: Behind,
+    /// Whether its liveliness was asserted just now, or is being.
+    is_asserted: Arc<AtomicBool>,
     /// Closed once the thread has nothing more to take.
     thread: mpsc::Sender<()>,
 }
@@ -586,6 +596,8 @@ pub(crate) struct Behind {
     is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
     /// Has it give late joiners so many messages. May block.
     resize: Box<dyn Fn(u32) + Send + Sync>,
+    /// Renews its liveliness lease without a message, if that is manual by topic. May block.
+    assert: Option<Box<dyn Fn() + Send + Sync>>,
 }
 
 impl Default for Behind {
@@ -596,6 +608,7 @@ impl Default for Behind {
             matched: Box::new(|| 0),
             is_free: Box::new(|_| false),
             resize: Box::new(|_| ()),
+            assert: None,
         }
     }
 }
@@ -658,8 +671,17 @@ impl WriterQueue {
                 writer.set_late_depth(depth);
             }
         });
+        let to_assert = weak.clone();
+        let assert = Box::new(move || {
+            if let Some(writer) = to_assert.upgrade() {
+                writer.assert_liveliness();
+            }
+        });
+        let is_manual = spec.qos.liveliness == Liveliness::ManualByTopic && spec.qos.lease_ns.is_some();
+        let assert = is_manual.then_some(assert as Box<dyn Fn() + Send + Sync>);
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let behind = Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize };
+        let behind =
+            Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let mut key_hash = None;
@@ -766,6 +788,7 @@ impl WriterQueue {
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
             behind,
+            is_asserted: Arc::default(),
             thread: running,
         });
         let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
@@ -856,6 +879,20 @@ impl WriterQueue {
     pub(crate) fn resize(&self, depth: u32) {
         self.with_recent(|recent| recent.keep(depth as usize));
         (self.behind.resize)(depth);
+    }
+
+    /// Renews the writer's liveliness lease, at most once in [`ASSERTION_SPACING`].
+    fn assert_liveliness(self: &Arc<Self>) {
+        if self.behind.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
+            return;
+        }
+        let (this, is_asserted) = (self.clone(), self.is_asserted.clone());
+        tokio::spawn(async move {
+            let assert = move || this.behind.assert.as_ref().map(|assert| assert());
+            let _ = tokio::task::spawn_blocking(assert).await;
+            tokio::time::sleep(ASSERTION_SPACING).await;
+            is_asserted.store(false, Relaxed);
+        });
     }
 
     /// From here on what was written before may come once more.
@@ -1238,6 +1275,27 @@ mod tests {
         // The first may have been taken before the queue was closed, and behind the last there is nothing.
         assert!(taken[1..49].iter().all(|(_, next)| *next == Next::Last), "{taken:?}");
         sink.close();
+    }
+
+    #[tokio::test]
+    async fn liveliness_of_a_writer_is_asserted_once_in_a_while() {
+        let count = Arc::new(AtomicUsize::new(0));
+        let counted = count.clone();
+        let assert = Box::new(move || {
+            counted.fetch_add(1, Relaxed);
+        });
+        let behind = Behind { assert: Some(assert), ..Behind::default() };
+        let (alive, _) = mpsc::channel(1);
+        let (shaping, drops) = (Shaping::default(), Arc::default());
+        let queue = WriterQueue::spawn_with("test", behind, shaping, drops, alive, |_, _| ()).unwrap();
+        let begun = Instant::now();
+        wait_until(|| {
+            queue.assert_liveliness();
+            count.load(Relaxed) == 3
+        })
+        .await;
+        assert!(begun.elapsed() >= 2 * ASSERTION_SPACING);
+        queue.close();
     }
 
     #[tokio::test]

@@ -25,6 +25,7 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 use tracing::{debug, warn};
 
+use crate::assertions::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
 use crate::hold::Hold;
@@ -138,6 +139,8 @@ pub(crate) struct SourceSlot {
     pub lifespan: Option<Duration>,
     /// Messages that it keeps for late joiners.
     pub depth: usize,
+    /// If its publisher may assert its liveliness without a message.
+    pub manual: Option<Arc<ManualLease>>,
 }
 
 impl SourceSlot {
@@ -145,7 +148,7 @@ impl SourceSlot {
     pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
         let (id, progress) = (source.id(), source.progress());
         let source = Arc::new(Mutex::new(source));
-        Self { id, source, progress, keeps_history, reliable, lifespan: None, depth: 0 }
+        Self { id, source, progress, keeps_history, reliable, lifespan: None, depth: 0, manual: None }
     }
 }
 
@@ -159,6 +162,8 @@ pub(crate) struct SourceMap {
     pub(crate) per_writer: bool,
     /// By writer.
     pub own: HashMap<Guid, SourceSlot>,
+    /// What says that writers live which published nothing. It keeps nothing.
+    pub assertions: Option<SourceSlot>,
 }
 
 impl SourceMap {
@@ -174,7 +179,7 @@ impl SourceMap {
 
     /// All.
     pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
-        self.own.values().chain(&self.shared)
+        self.own.values().chain(&self.shared).chain(&self.assertions)
     }
 }
 
@@ -246,6 +251,8 @@ pub(crate) struct LocalShare {
     quiet: AtomicBool,
     published: AtomicU64,
     taps: Taps,
+    /// Whether it is looked for publishers that assert their liveliness.
+    is_watched: AtomicBool,
 }
 
 impl LocalShare {
@@ -288,6 +295,7 @@ impl LocalShare {
             quiet: AtomicBool::new(true),
             published: AtomicU64::new(0),
             taps: Taps::default(),
+            is_watched: AtomicBool::new(false),
         }
     }
 
@@ -567,6 +575,9 @@ impl LocalShare {
             SampleKind::Unregister => MessageKind::Unregister,
         };
         let head = MessageHead { form, encoding, ..MessageHead::new(kind, sample.source_timestamp_ns) };
+        if let Some(manual) = slot.manual.as_ref().filter(|_| wanted) {
+            manual.note_heard(Instant::now());
+        }
         let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
             // Fragments leave as they are sealed: a large message is under way before its end is read.
@@ -737,6 +748,54 @@ impl LocalShare {
         });
     }
 
+    /// Returns `true`, once, if it is to be looked for publishers that assert their liveliness ([`crate::assertions::watch`]).
+    pub(crate) fn begins_watch(&self) -> bool {
+        self.map.load().assertions.is_some() && !self.is_watched.swap(true, SeqCst)
+    }
+
+    /// Lets publishers be heard that renewed their leases without a message. Returns how long to wait for the next look; None if there is
+    /// nobody to look for any more.
+    pub(crate) fn look_for_assertions(
+        self: &Arc<Self>,
+        now: Instant,
+        renewed_ago: impl Fn(&Guid) -> Option<Duration>,
+    ) -> Option<Duration> {
+        if self.closed.load(Relaxed) {
+            return None;
+        }
+        let mut map = self.map();
+        if map.assertions.is_none() {
+            self.is_watched.store(false, SeqCst);
+            // One may have come between the two.
+            if !self.begins_watch() {
+                return None;
+            }
+            map = self.map();
+        }
+        let manual =
+            || map.own.iter().filter_map(|(writer, slot)| Some((writer, slot, slot.manual.as_ref()?)));
+        let wait = manual().map(|(_, _, lease)| lease.look_every()).min().unwrap_or(ASSERTION_LOOK_MAX);
+        if !self.data.is_wanted(&self.name) {
+            return Some(wait);
+        }
+        let news = manual()
+            .filter(|(writer, _, lease)| renewed_ago(writer).is_some_and(|ago| lease.is_news(now, ago)));
+        let news: Vec<_> = news.map(|(_, slot, lease)| (slot.id.publisher(), lease.clone())).collect();
+        if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
+            let share = self.clone();
+            self.run_blocking(move || {
+                // Who has the source is pushed back.
+                let Ok(mut source) = slot.source.try_lock() else { return };
+                for (publisher, lease) in news {
+                    if source.assert_publisher(publisher, share.emit()).is_ok() {
+                        lease.note_heard(now);
+                    }
+                }
+            });
+        }
+        Some(wait)
+    }
+
     /// Does something that may block, on a thread where it may.
     pub(crate) fn run_blocking(&self, work: impl FnOnce() + Send + 'static) {
         let alive = self.alive.clone();
@@ -887,11 +946,8 @@ mod tests {
         };
         let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
         let slot = SourceSlot::new(source, true, true);
-        share.set_map(SourceMap {
-            shared: None,
-            per_writer: true,
-            own: HashMap::from([(KNOWN, slot.clone())]),
-        });
+        let own = HashMap::from([(KNOWN, slot.clone())]);
+        share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
         (share, slot)
     }
 
@@ -1040,7 +1096,7 @@ mod tests {
         for keeps_history in [true, false] {
             slot.keeps_history = keeps_history;
             let own = HashMap::from([(KNOWN, slot.clone())]);
-            share.set_map(SourceMap { shared: None, per_writer: true, own });
+            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
             share.set_type(KnownType::Asked);
             let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
             lock(&share.inbox).early.push(long_ago, 1, sample());
@@ -1116,7 +1172,7 @@ mod tests {
             let (share, mut slot) = share();
             slot.reliable = reliable;
             let own = HashMap::from([(KNOWN, slot)]);
-            share.set_map(SourceMap { shared: None, per_writer: true, own });
+            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
             share.set_shaping(Shaping { max_age: Some(Duration::from_secs(5)), ..Shaping::default() });
             [0, 60, 0].into_iter().for_each(|age| share.publish(dated(age)));
             assert_eq!(share.published(), if reliable { 3 } else { 2 });

@@ -436,6 +436,13 @@ pub trait RosNetwork: Send + Sync + 'static {
     /// GUID of a reader made here.
     fn reader_guid(&self, reader: &Self::Reader) -> Guid;
 
+    /// How long ago a writer of the local network renewed its liveliness lease, by a message or without one. None if it did not yet, and of
+    /// writers that are not reliable, not manual by topic, or made by SGC. Does not block.
+    fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
+        let _ = writer;
+        None
+    }
+
     /// Returns `true` if nodes are told of and announced.
     fn has_graph(&self) -> bool;
 
@@ -483,6 +490,9 @@ pub trait RosWriter: Send + Sync + 'static {
 
     /// Lets leave what was written ahead.
     fn flush(&self) {}
+
+    /// Renews its liveliness lease at its readers without a sample, if it is manual by topic. May block.
+    fn assert_liveliness(&self) {}
 
     /// Gives late joiners the last samples, so many, from here on. Only a writer made with [`sgc_wire::History::UNSAID`] does, and never more
     /// than before.

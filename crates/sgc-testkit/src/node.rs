@@ -705,7 +705,7 @@ impl Running {
                     local.retry_at = None;
                 }
             }
-            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => {}
+            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Asserted(_) | Delivery::Parked) => {}
             Err(why) => self.drop_packet(name, LinkId::LOCAL, DataDrop::Sink(why)),
         }
     }

@@ -128,8 +128,10 @@ impl SourceId {
     }
 
     /// What all sources of one publisher begin with.
-    pub fn publisher(&self) -> &[u8] {
-        &self.0[..8]
+    pub fn publisher(&self) -> [u8; 8] {
+        let mut publisher = [0; 8];
+        publisher.copy_from_slice(&self.0[..8]);
+        publisher
     }
 }
 

@@ -85,6 +85,17 @@ impl MessageHead {
         Self::new(kind, number as i64)
     }
 
+    /// The head of a mark by which a node says that this publisher of its local network asserted its liveliness.
+    pub const fn of_assertion(publisher: [u8; 8]) -> Self {
+        Self::new(MessageKind::Mark, i64::from_be_bytes(publisher))
+    }
+
+    /// Returns what the source ids of the publisher begin with that a mark says to have asserted its liveliness, if it says so.
+    pub fn asserted(&self) -> Option<[u8; 8]> {
+        let says_so = self.kind == MessageKind::Mark && self.source_timestamp_ns != 0;
+        says_so.then(|| self.source_timestamp_ns.to_be_bytes())
+    }
+
     /// The encoding.
     pub fn to_array(self) -> [u8; MESSAGE_HEAD_BYTES] {
         let mut out = [0; MESSAGE_HEAD_BYTES];
@@ -177,6 +188,16 @@ mod tests {
         }
         assert!(decode(0, 2, 0).is_ok() && decode(0, 3, 0).is_err());
         assert!(decode(0, 2, 1).is_ok() && decode(0, 0, 2).is_ok() && decode(0, 0, 3).is_err());
+    }
+
+    #[test]
+    fn mark_with_a_time_stamp_names_the_publisher_that_asserted_its_liveliness() {
+        let publisher = [0xff, 2, 3, 4, 5, 6, 7, 8];
+        let bytes = MessageHead::of_assertion(publisher).to_vec();
+        assert_eq!(bytes, [&[4, 0, 0, 0][..], &publisher].concat());
+        assert_eq!(MessageHead::from_slice(&bytes).unwrap().asserted(), Some(publisher));
+        assert_eq!(MessageHead::new(MessageKind::Mark, 0).asserted(), None);
+        assert_eq!(MessageHead::new(MessageKind::Write, 7).asserted(), None);
     }
 
     /// The bytes are normative.

@@ -31,6 +31,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--rate", type=float, default=10)
     parser.add_argument("--count", type=int, default=0)
     parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--asserts", action="store_true")
     return parser.parse_args()
 
 
@@ -58,7 +59,7 @@ def incompatible(status: object) -> None:
 
 
 def publish(node: Node, args: argparse.Namespace) -> None:
-    """Each line on standard input pauses, or goes on with, publishing."""
+    """Each line on standard input pauses, or goes on with, publishing; a number is that of further messages."""
     callbacks = PublisherEventCallbacks(
         deadline=lambda status: report("deadline_missed", total=status.total_count),
         liveliness=lambda status: report("liveliness_lost", total=status.total_count),
@@ -72,13 +73,18 @@ def publish(node: Node, args: argparse.Namespace) -> None:
 
     def tick() -> None:
         nonlocal sent
-        if runs.is_set() and (args.count == 0 or sent < args.count):
+        if runs.is_set() and args.asserts:
+            publisher.assert_liveliness()
+        elif runs.is_set() and (args.count == 0 or sent < args.count):
             publisher.publish(String(data=str(args.start + sent)))
             sent += 1
 
     def listen() -> None:
-        for _ in sys.stdin:
-            runs.clear() if runs.is_set() else runs.set()
+        for line in sys.stdin:
+            if line.strip().isdigit():
+                args.count += int(line)
+            else:
+                runs.clear() if runs.is_set() else runs.set()
 
     node.create_timer(1 / args.rate, tick)
     threading.Thread(target=listen, daemon=True).start()

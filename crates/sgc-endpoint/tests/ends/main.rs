@@ -1,6 +1,7 @@
 //! The two ends of the data path against each other, in every suite: what a source makes, a sink delivers,
 //! once, and nothing else.
 
+mod assertions;
 mod epochs;
 mod forgery;
 mod messages;

@@ -16,6 +16,7 @@ use super::{
     Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT,
     LocalReader, drop_elsewhere, now,
 };
+use crate::assertions::{self, ManualLease};
 use crate::dataplane::{Forward, Out};
 use crate::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::sinks::{LocalSink, WriterQueue};
@@ -188,7 +189,9 @@ impl<N: RosNetwork> Core<N> {
             };
             let source = Source::new(config, &grant, message_key.clone())?;
             let lifespan = qos.lifespan_ns.map(Duration::from_nanos);
-            Some(SourceSlot { lifespan, depth, ..SourceSlot::new(source, keeps_history, qos.is_reliable()) })
+            let manual = ManualLease::of(qos, Instant::now());
+            let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
+            Some(SourceSlot { lifespan, depth, manual, ..slot })
         };
         // Some publishers may have one source together, which keeps what the deepest of them does.
         let mut depths = BTreeMap::<SourceId, usize>::new();
@@ -214,9 +217,22 @@ impl<N: RosNetwork> Core<N> {
             let mut id = || self.endpoint.new_source_id();
             map.shared = old.shared.clone().or_else(|| slot(id(), &service_qos(), 1));
         }
+        if map.own.values().any(|slot| slot.manual.is_some()) {
+            map.assertions = old.assertions.clone().or_else(|| {
+                let id = self.endpoint.new_source_id();
+                let recovery = RecoveryLimits::NONE;
+                let (history_depth, history_bytes_max, reliable) = (0, 0, true);
+                let config =
+                    SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery };
+                Some(SourceSlot::new(Source::new(config, &grant, message_key.clone())?, false, reliable))
+            });
+        }
         let sources: BTreeMap<_, _> = map.slots().map(|s| (s.id, s.progress.clone())).collect();
         self.endpoint.set_sources(now(), &name, sources.into_values().collect());
         share.set_map(map);
+        if share.begins_watch() {
+            tokio::spawn(assertions::watch(Arc::downgrade(&share), self.network.clone()));
+        }
     }
 
     /// The key that messages are signed with in this suite: one for the whole node. Those that take long to make are

@@ -146,7 +146,7 @@ impl<R: RngCore> Routes<R> {
     }
 
     /// A local writer's lease ran out, or the writer lives again. The far writer of one that is manual by topic is renewed by its
-    /// messages alone, and so expires by itself; all others live for as long as this node's.
+    /// messages and assertions, and so expires by itself; all others live for as long as this node's.
     pub(super) fn handle_liveliness(&mut self, guid: Guid, is_alive: bool) {
         let is_concerned = |own: &OwnSource| {
             own.is_lapsed == is_alive && (is_alive || own.qos.liveliness != Liveliness::ManualByTopic)

@@ -159,6 +159,36 @@ fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_a
 }
 
 #[test]
+fn far_subscriber_hears_of_a_publisher_that_only_asserts_its_liveliness_as_a_near_one_does() {
+    const LEASE: Duration = Duration::from_secs(2);
+    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let manual = ["--lease", "2", "--kind", "manual"];
+    let asserts = [&manual[..], &["--asserts", "--rate", "2"]].concat();
+    let mut all = Pair::start_all(&lab, ["/native", "/carried"], [&asserts, &manual]);
+    for pair in all.iter().flatten() {
+        pair.hears_alive(1);
+    }
+    for _ in 0..2 {
+        std::thread::sleep(2 * LEASE);
+        for pair in all.iter().flatten() {
+            let lost = pair.reported().into_iter().find(|e| e["event"] == "liveliness" && e["alive"] == 0);
+            assert_eq!(lost, None, "{}", pair.name);
+        }
+        for (alive, what) in [(0, "a loss of liveliness"), (1, "its return")] {
+            let since = all.each_mut().map(|pairs| {
+                pairs.each_mut().map(|pair| {
+                    pair.talker.go();
+                    Instant::now()
+                })
+            });
+            for (pairs, since) in all.iter().zip(since) {
+                assert_as_soon(what, pairs, since, pairs.each_ref().map(|pair| pair.hears_alive(alive)));
+            }
+        }
+    }
+}
+
+#[test]
 fn far_subscriber_that_asks_for_too_much_and_its_publisher_are_told_as_near_ones_are() {
     let lab = Lab::real(PLAN, carried(&["/carried"]));
     let qos: [&[&str]; 2] =
