@@ -118,6 +118,57 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
     }
 }
 
+/// As natively of a latched publisher that starts again: the far node's writer is another one to a subscriber that has it all.
+#[test]
+fn restart_beside_a_latched_subscriber_repeats_what_is_kept_once_and_loses_nothing() {
+    let pairs = PAIRS.iter().flat_map(|pair| [(pair, 1), (pair, 5)]);
+    let topics = pairs.clone().map(|([talks, _], depth)| topic(talks, &format!("kept_{depth}")));
+    let mut lab = Lab::real(PLAN, robot_to_desk("topic", topics.clone()));
+    let mut all: Vec<_> = pairs
+        .zip(topics)
+        .map(|(([talks, listens], depth), topic)| {
+            let latched = ["--transient-local", "--topic", &topic];
+            let hears = [&["sub", "--depth", "100"][..], &latched].concat();
+            let listener = started(lab.rclpy(Site::Desk, listens, "events.py", &hears));
+            let count = depth.to_string();
+            let says =
+                [&["pub", "--depth", &count, "--count", &count, "--rate", "20"][..], &latched].concat();
+            (started(lab.rclpy(Site::Robot, talks, "events.py", &says)), listener, depth)
+        })
+        .collect();
+    // Everything that comes up to this number.
+    let heard = |listener: &mut Peer, last: u64| {
+        let mut seqs = Vec::new();
+        while seqs.last() != Some(&last) {
+            let event = listener.wait(&format!("message {last}"), |event| event["event"] == "received");
+            seqs.push(count(&event, "seq"));
+        }
+        seqs
+    };
+    for (_, listener, depth) in &mut all {
+        assert_eq!(heard(listener, *depth - 1), Vec::from_iter(0..*depth));
+    }
+    lab.end(Site::Desk, Signal::KILL);
+    lab.start(Site::Desk);
+    for (talker, listener, depth) in &mut all {
+        assert_eq!(heard(listener, *depth - 1), Vec::from_iter(0..*depth), "repeated");
+        talker.tell("1");
+        assert_eq!(heard(listener, *depth), [*depth], "and no more");
+    }
+    lab.end(Site::Desk, Signal::TERM);
+    // As many as the publisher keeps are said meanwhile, or a moment later.
+    all.iter_mut().for_each(|(talker, _, depth)| talker.tell(&depth.to_string()));
+    lab.start(Site::Desk);
+    for (talker, listener, depth) in &mut all {
+        let (first_new, last) = (*depth + 1, 2 * *depth);
+        let seqs = heard(listener, last);
+        assert!(seqs[0] <= first_new, "{seqs:?}");
+        assert_eq!(seqs, Vec::from_iter(seqs[0]..=last), "once each, in their order");
+        talker.tell("1");
+        assert_eq!(heard(listener, last + 1), [last + 1], "and no more");
+    }
+}
+
 /// Each latched publisher of a topic is heard by a late joiner, not the last of them alone.
 #[test]
 fn late_joiners_hear_each_latched_publisher_of_a_topic() {

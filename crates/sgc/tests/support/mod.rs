@@ -222,7 +222,12 @@ impl Peer {
 
     /// Lets it go on: one line on its standard input.
     pub(crate) fn go(&mut self) {
-        self.stdin.as_mut().unwrap().write_all(b"go\n").unwrap();
+        self.tell("go");
+    }
+
+    /// Gives it a line on its standard input.
+    pub(crate) fn tell(&mut self, line: &str) {
+        writeln!(self.stdin.as_mut().unwrap(), "{line}").unwrap();
     }
 
     /// SIGTERM; its summary follows.
