@@ -275,26 +275,11 @@ fn add_missing(list: &mut Vec<u8>, expects_inline_qos: bool) -> Option<()> {
     Some(())
 }
 
-/// Panics if an announcement, received or about to be sent, shows a defect.
-#[cfg(feature = "fuzzing")]
-pub(crate) fn check(list: &[u8], expects_inline_qos: bool) {
-    let pids = |list: &[u8], big| -> Vec<_> {
-        Parameters::new(&list[HEADER_BYTES..], big).map(|p| p.expect("a whole list").0).collect()
-    };
-    let mut hidden = list.to_vec();
-    if hide_type(&mut hidden).is_some() {
-        assert!(!pids(&hidden, hidden[1] & 1 == 0).contains(&PID_TYPE_INFORMATION));
-        assert_eq!(hidden.len(), list.len());
-    }
-    let mut complete = list.to_vec();
-    if add_missing(&mut complete, expects_inline_qos).is_some() {
-        assert!(pids(&complete, cfg!(target_endian = "big")).contains(&PID_PARTICIPANT_GUID));
-        assert_eq!(add_missing(&mut complete.clone(), expects_inline_qos), None, "it is added twice");
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use rand_chacha::ChaCha8Rng;
+    use rand_core::{RngCore, SeedableRng};
+
     use super::*;
 
     fn parameter(pid: u16, value: &[u8]) -> Vec<u8> {
@@ -343,6 +328,40 @@ mod tests {
             let before = made.clone();
             assert!(add_missing(&mut made, true).is_none());
             assert_eq!(made, before);
+        }
+    }
+
+    /// Panics if an announcement is hidden in part, or completed twice.
+    fn check(list: &[u8], expects_inline_qos: bool) {
+        let pids = |list: &[u8], big| -> Vec<_> {
+            Parameters::new(&list[HEADER_BYTES..], big).map(|p| p.expect("a whole list").0).collect()
+        };
+        let mut hidden = list.to_vec();
+        if hide_type(&mut hidden).is_some() {
+            assert!(!pids(&hidden, hidden[1] & 1 == 0).contains(&PID_TYPE_INFORMATION));
+            assert_eq!(hidden.len(), list.len());
+        }
+        let mut complete = list.to_vec();
+        if add_missing(&mut complete, expects_inline_qos).is_some() {
+            assert!(pids(&complete, cfg!(target_endian = "big")).contains(&PID_PARTICIPANT_GUID));
+            assert_eq!(add_missing(&mut complete.clone(), expects_inline_qos), None, "it is added twice");
+        }
+    }
+
+    #[test]
+    fn altered_announcements_are_dealt_with_whole_or_not_at_all() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut below = |bound: usize| random.next_u32() as usize % bound;
+        let parts = [(PID_ENDPOINT_GUID, 16), (PID_TYPE_INFORMATION, 12), (5, 8), (PID_TYPE_INFORMATION, 4)];
+        let whole = list(&parts.map(|(pid, bytes)| parameter(pid, &[7; 16][..bytes])));
+        for n in 0..20_000 {
+            let mut altered = whole.clone();
+            for _ in 0..below(4) {
+                let at = below(altered.len());
+                altered[at] = below(256) as u8;
+            }
+            altered.truncate(whole.len() - below(1 + n % 16));
+            check(&altered, n % 2 == 0);
         }
     }
 }

@@ -250,43 +250,11 @@ fn kept(heartbeat: &[u8]) -> Option<u64> {
     (first > 1).then(|| last.checked_sub(first)?.checked_add(1)).flatten()
 }
 
-/// Panics if a packet, or one that was cut, shows a defect.
-#[cfg(feature = "fuzzing")]
-pub(crate) fn check_kept(packet: &[u8], at: usize) {
-    let kept = kept_behind(packet, at);
-    assert_ne!(kept, Some(0));
-    for cut in (0..packet.len()).step_by(1 + packet.len() / 16) {
-        let of_cut = kept_behind(&packet[..cut], at);
-        assert!(of_cut.is_none() || of_cut == kept, "{of_cut:?} of {cut} bytes, {kept:?} of all");
-    }
-}
-
-/// Panics if fragments that leave a gap in a sample, or reach beyond it, are said to cover it.
-#[cfg(feature = "fuzzing")]
-pub(crate) fn check_cover(ranges: &[(u8, u8)], bytes: u8) {
-    let fragment = |(first, end): &(u8, u8)| ReceivedFragment {
-        message: std::ptr::null(),
-        next: std::ptr::null(),
-        first: u32::from(*first),
-        end: u32::from(*end),
-        submessage_offset: 0,
-        payload_offset: 0,
-    };
-    let mut fragments: Vec<_> = ranges.iter().map(fragment).collect();
-    for at in (1..fragments.len()).rev() {
-        let next: *const ReceivedFragment = &fragments[at];
-        fragments[at - 1].next = next;
-    }
-    let first = fragments.first().map_or(std::ptr::null(), std::ptr::from_ref);
-    // SAFETY: a chain that ends with null.
-    if unsafe { cover_exactly(first.cast(), usize::from(bytes)) } {
-        let is_covered = |byte| ranges.iter().any(|(first, end)| (*first..*end).contains(&byte));
-        assert!((0..bytes).all(is_covered) && ranges.iter().all(|(_, end)| *end <= bytes), "{ranges:?}");
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use rand_chacha::ChaCha8Rng;
+    use rand_core::{RngCore, SeedableRng};
+
     use super::*;
 
     /// A message of Cyclone's with a packet of one sample and what follows it.
@@ -351,5 +319,64 @@ mod tests {
         let mut big_endian = heartbeat(3, 6, 10);
         big_endian[1] = 0;
         assert_eq!(kept_in(&[&big_endian], 128), None);
+    }
+
+    /// Panics if a packet, or one that was cut, shows a defect.
+    fn check_kept(packet: &[u8], at: usize) {
+        let kept = kept_behind(packet, at);
+        assert_ne!(kept, Some(0));
+        for cut in (0..packet.len()).step_by(1 + packet.len() / 16) {
+            let of_cut = kept_behind(&packet[..cut], at);
+            assert!(of_cut.is_none() || of_cut == kept, "{of_cut:?} of {cut} bytes, {kept:?} of all");
+        }
+    }
+
+    /// Panics if fragments that leave a gap in a sample, or reach beyond it, are said to cover it.
+    fn check_cover(ranges: &[(u8, u8)], bytes: u8) {
+        let fragment = |(first, end): &(u8, u8)| ReceivedFragment {
+            message: std::ptr::null(),
+            next: std::ptr::null(),
+            first: u32::from(*first),
+            end: u32::from(*end),
+            submessage_offset: 0,
+            payload_offset: 0,
+        };
+        let mut fragments: Vec<_> = ranges.iter().map(fragment).collect();
+        for at in (1..fragments.len()).rev() {
+            let next: *const ReceivedFragment = &fragments[at];
+            fragments[at - 1].next = next;
+        }
+        let first = fragments.first().map_or(std::ptr::null(), std::ptr::from_ref);
+        // SAFETY: a chain that ends with null.
+        if unsafe { cover_exactly(first.cast(), usize::from(bytes)) } {
+            let is_covered = |byte| ranges.iter().any(|(first, end)| (*first..*end).contains(&byte));
+            assert!((0..bytes).all(is_covered) && ranges.iter().all(|(_, end)| *end <= bytes), "{ranges:?}");
+        }
+    }
+
+    #[test]
+    fn altered_packets_tell_nothing_that_is_not_in_them() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut below = |bound: usize| random.next_u32() as usize % bound;
+        let data = [&[DATA.0, FLAG_LITTLE_ENDIAN, 24, 0][..], &[0; 24]].concat();
+        let whole = [&[0; 20][..], &data, &heartbeat(0, 6, 10), &heartbeat(0, 6, 12)].concat();
+        for _ in 0..20_000 {
+            let mut altered = whole.clone();
+            for _ in 0..below(4) {
+                let at = 20 + below(altered.len() - 20);
+                altered[at] = below(256) as u8;
+            }
+            check_kept(&altered, 20);
+        }
+    }
+
+    #[test]
+    fn random_fragments_cover_a_sample_only_without_gap_or_excess() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let mut below = |bound: usize| (random.next_u32() as usize % bound) as u8;
+        for _ in 0..20_000 {
+            let ranges: Vec<_> = (0..1 + below(3)).map(|_| (below(5), below(6))).collect();
+            check_cover(&ranges, below(6));
+        }
     }
 }

@@ -124,7 +124,7 @@ fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
 
 /// Reads the addresses; what is other than before is a change, except for the first time.
 fn refresh(is_change: bool) {
-    // What cannot be read does not say that all addresses are gone.
+    // A table that cannot be read does not mean that all addresses are gone.
     let Some(table) = read_file("/proc/net/fib_trie") else { return };
     let here = local_addresses(&table, HERE_MAX);
     let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);

@@ -75,7 +75,7 @@ impl HandleMessages for Replies {
         };
         // Replies to all clients are on one topic.
         let is_ours = if client == self.writing {
-            // Who names the writer may have been matched just after a request was written in the other mapping,
+            // The client that names the writer may have been matched just after a request was written in the other mapping,
             // and have answered what nobody asked.
             number > self.last_in_body.load(Relaxed)
         } else {

@@ -1,6 +1,6 @@
 //! [`CycloneNetwork`] beside a program of the local network that lies: it speaks RTPS by hand, over a socket of its own.
 //!
-//! Whatever it says, the process goes on, and topics of others do. The peer calls itself one of Fast DDS, of whose writers most is believed.
+//! The process and the topics of others go on, whatever the peer says. It calls itself one of Fast DDS, of whose writers most is believed.
 
 #![allow(clippy::unwrap_used)]
 

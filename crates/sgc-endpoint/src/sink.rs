@@ -631,7 +631,7 @@ impl Sink {
             source.heard = true;
         }
         if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
-            // What is sent again is no news of anybody's liveliness.
+            // An assertion that is sent again is no news of a publisher's liveliness.
             let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers);
             let Some(publisher) = asserted else { return source.take_mark(header, opened.text()) };
             oldest_of_mark(header, opened.text())?;

@@ -1,6 +1,6 @@
 //! The log lines about what is wrong between the two sides: programs of the local network cannot fill the log with types and QoS that change all the time.
 //!
-//! What holds at present is in `status` and `why`, whether it was logged or not.
+//! Present problems are in `status` and `why`, whether they were logged or not.
 
 use std::fmt::Display;
 use std::time::{Duration, Instant};

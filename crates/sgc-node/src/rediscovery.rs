@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, Guid, REDISCOVERY_HOLD};
 
-/// What was known and is not found again yet.
+/// Endpoints and nodes that were known and are not found again yet.
 #[derive(Debug, Default)]
 pub(crate) struct Rediscovery {
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,

@@ -162,7 +162,7 @@ pub(crate) struct SourceMap {
     pub(crate) per_writer: bool,
     /// By writer.
     pub own: HashMap<Guid, SourceSlot>,
-    /// What says that writers live which published nothing. It keeps nothing.
+    /// The source that says that writers live which published nothing. It keeps nothing.
     pub assertions: Option<SourceSlot>,
 }
 
@@ -784,7 +784,7 @@ impl LocalShare {
         if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
             let share = self.clone();
             self.run_blocking(move || {
-                // Who has the source is pushed back.
+                // The holder of the source is pushed back.
                 let Ok(mut source) = slot.source.try_lock() else { return };
                 for (publisher, lease) in news {
                     if source.assert_publisher(publisher, share.emit()).is_ok() {

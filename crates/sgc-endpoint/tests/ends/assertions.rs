@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// What the source ids of the publisher begin with.
+/// The first bytes of the publisher's source ids.
 const PUBLISHER: [u8; 8] = [5; 8];
 
 fn asserted(source: &mut Source, publisher: [u8; 8]) -> Packet {

@@ -46,10 +46,10 @@ struct ShownConsumer {
     endpoints: Option<Vec<(EndpointKind, ShownEndpoint)>>,
 }
 
-/// What a node told of its consumers.
+/// The consumers that a node told of.
 struct PeerConsumers {
     current: Vec<Consumer>,
-    /// What it told last, until that is taken over.
+    /// Its last answer, until that is taken over.
     next: Option<Vec<Consumer>>,
     /// When that may be.
     ready_at: Instant,
@@ -420,7 +420,7 @@ mod tests {
                 let wanted: BTreeSet<_> = consumers.wanted().0.into_keys().collect();
                 made += wanted.difference(&shown).count();
                 shown = wanted;
-                // Who withdraws them does not begin anew.
+                // A node that withdraws them does not begin anew.
                 consumers.lost.insert(peer, now);
                 assert!(consumers.forget(now));
                 consumers.lost.clear();

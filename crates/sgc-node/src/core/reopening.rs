@@ -45,7 +45,7 @@ impl<N: RosNetwork> Core<N> {
         for calls in self.calls.values() {
             ending.extend(match calls {
                 Calls::Served(served) => {
-                    // What a server answers from here on reaches nobody.
+                    // Answers of a server reach nobody from here on.
                     served.servers_gone();
                     served.set_client(None)
                 }
