@@ -232,6 +232,28 @@ fn a_restarted_publisher_keeps_its_share_and_a_gone_one_loses_it() {
 }
 
 #[test]
+fn publisher_that_is_discovered_again_keeps_its_source_unless_another_has_it() {
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    let source = |commands: &[Command], n: u8| {
+        published(commands).1.iter().find(|(guid, _)| *guid == Guid([n; 16])).unwrap().1
+    };
+    let before = source(&b.appears(writer(2, "/a", Qos::default())), 2);
+    b.vanishes(2);
+    let deeper = Qos { history: History::KeepLast(3), ..Qos::default() };
+    let again = b.appears(writer(2, "/a", deeper));
+    assert_eq!((source(&again, 2), published(&again).0.len()), (before, 2));
+    b.vanishes(2);
+    b.passes(WRITERLESS_HOLD / 2);
+    b.appears(writer(2, "/a", Qos::default()));
+    let later = [b.passes(WRITERLESS_HOLD), b.appears(writer(3, "/a", Qos::default()))].concat();
+    assert_eq!(source(&later, 2), before, "it is there again");
+    b.vanishes(2);
+    assert_eq!(source(&b.appears(writer(4, "/a", Qos::default())), 4), before);
+    assert_ne!(source(&b.appears(writer(2, "/a", Qos::default())), 2), before);
+}
+
+#[test]
 fn each_latched_publisher_has_a_source_of_its_own_and_keeps_it() {
     let mut b = bench(&[("/tf_static", "")], &[]);
     let sources = |commands: Vec<Command>| match commands.into_iter().rev().find_map(|c| match c {

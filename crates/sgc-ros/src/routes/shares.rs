@@ -202,9 +202,13 @@ impl<R: RngCore> Routes<R> {
         let mut problems = BTreeSet::new();
         for (guid, writer) in share.writers.iter().filter(|_| !is_service) {
             let qos = carried(&wanted.apply(&writer.qos), &offer);
+            let passed_on = was_passed_on(&share.own, guid);
             match share.own.get_mut(guid) {
                 // Another kind of source is another source.
-                Some(own) if own.gone.is_none() && same_kind(&own.qos, &qos) => own.qos = qos,
+                Some(own) if !passed_on && same_kind(&own.qos, &qos) => {
+                    own.qos = qos;
+                    own.gone = None;
+                }
                 _ => {
                     let is_lapsed = share.own.remove(guid).is_some_and(|own| own.is_lapsed);
                     let mut new = || source_of(&self.secret, guid, &mut self.rng);
@@ -344,6 +348,14 @@ fn own_source(
         known.retain(|_, own| own.source != oldest);
     }
     Some(new())
+}
+
+/// Returns `true` if the writer vanished and another has its source since.
+fn was_passed_on(own: &BTreeMap<Guid, OwnSource>, writer: &Guid) -> bool {
+    let Some(source) = own.get(writer).filter(|own| own.gone.is_some()).map(|own| own.source) else {
+        return false;
+    };
+    own.values().any(|other| other.source == source && other.gone.is_none())
 }
 
 /// What of a writer's offer is carried: what all together offer is read, and kept for who joins late.
