@@ -31,7 +31,7 @@ typedef struct {
     uint64_t count, size, last;
     double rate, timeout, linger, hold, begin;
     long depth;
-    bool best_effort, transient_local, wait_go, wait_stop, verbose;
+    bool best_effort, transient_local, wait_go, wait_stop, verbose, insist;
     unsigned wait_matched;
 } Options;
 
@@ -182,10 +182,10 @@ static int publish(int64_t deadline) {
     for (; (options.count == 0 || seq < options.count) && !is_over(deadline); seq++) {
         if (options.wait_stop && line_came(0)) break;
         fill(&message, seq);
-        rcl_ret_t ret = rcl_publish(&publisher, &message, NULL);
-        if (ret != RCL_RET_OK) {
+        while (rcl_publish(&publisher, &message, NULL) != RCL_RET_OK) {
             refused++;
             rcl_reset_error();
+            if (!options.insist || is_over(deadline)) break;
         }
         if (options.verbose) printf("{\"event\": \"sent\", \"seq\": %" PRIu64 "}\n", seq);
         if (seq == 0 && options.begin > 0) {
@@ -418,6 +418,7 @@ static void read_options(int argc, char **argv) {
         else if (IS("--transient-local")) options.transient_local = true;
         else if (IS("--wait-go")) options.wait_go = true;
         else if (IS("--wait-stop")) options.wait_stop = true;
+        else if (IS("--insist")) options.insist = true;
         else if (IS("--verbose")) options.verbose = true;
         else {
             fprintf(stderr, "unknown option %s\n", name);

@@ -39,7 +39,8 @@ fn assert_whole(summary: &Value, messages: u64, what: &str) {
 fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() {
     const MESSAGES: u64 = 10_000;
     let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
-    let extra = ["--depth", "0", "--rate", "0", "--size", "1000"];
+    // Fast DDS refuses a message if 5000 wait for a subscriber that gets no CPU for 100 ms.
+    let extra = ["--depth", "0", "--rate", "0", "--size", "1000", "--insist"];
     for pair in PAIRS {
         let native = carry(&lab, pair, [Site::Desk, Site::Desk], MESSAGES, &extra);
         assert_whole(&native, MESSAGES, "with nothing in between");
