@@ -1,4 +1,4 @@
-//! A type with all that it contains as bytes, so that who has no definition of it can be given one (REP 2011).
+//! A type with all that it contains as bytes, so that who has no definition of it can be given one (REP 2016).
 //!
 //! The form is the message `type_description_interfaces/msg/TypeDescription`, serialised as any other: what nodes of ROS 2
 //! answer when they are asked for the description of a type. Who sends it, and with what, is for others.

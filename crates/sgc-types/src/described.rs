@@ -1,4 +1,4 @@
-//! A type that is known, with the description that others can be given (REP 2011).
+//! A type that is known, with the description that others can be given (REP 2016).
 
 use std::sync::Arc;
 

@@ -32,7 +32,7 @@ pub struct DescribedType {
     pub type_hash: String,
     /// How the description is compressed: not at all, or by Zstandard.
     pub encoding: PayloadEncoding,
-    /// A serialised `type_description_interfaces/msg/TypeDescription` (REP 2011).
+    /// A serialised `type_description_interfaces/msg/TypeDescription` (REP 2016).
     pub description: Bytes,
 }
 

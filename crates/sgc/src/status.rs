@@ -350,8 +350,11 @@ impl Status {
                 "Local network: opened again after this host's addresses changed, so often: {times}"
             ));
         }
+        let several = |n: u64, noun| format!("{n} {noun}{}", if n == 1 { "" } else { "s" });
         lines.push(format!(
-            "Router: {nodes} nodes and {names} names known, {routed_names} with a route, {branches} branches"
+            "Router: {} and {} known, {routed_names} with a route; branches: {branches}",
+            several(nodes as u64, "node"),
+            several(names, "name"),
         ));
         lines
     }
@@ -477,7 +480,7 @@ mod tests {
             "",
             "Refused peers: none",
             "",
-            "Router: 3 nodes and 1 names known, 0 with a route, 2 branches",
+            "Router: 3 nodes and 1 name known, 0 with a route; branches: 2",
         ];
         assert_eq!(lines, expected);
     }

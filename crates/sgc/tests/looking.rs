@@ -176,7 +176,7 @@ fn messages_are_shown_at_both_ends_and_what_is_missing_is_named() {
 
     let list = String::from_utf8(lab.topic("robot", &["list"]).stdout).unwrap();
     let line = list.lines().find(|line| line.starts_with("/chatter")).unwrap_or_else(|| panic!("{list}"));
-    assert!(line.contains("std_msgs/msg/String") && line.contains("shared: 1 nodes have it"), "{list}");
+    assert!(line.contains("std_msgs/msg/String") && line.contains("shared: 1 node has it"), "{list}");
     let info = String::from_utf8(lab.topic("desk", &["info", "-v", "/chatter"]).stdout).unwrap();
     assert!(info.contains("Reliability: RELIABLE") && info.contains("Shared by robot"), "{info}");
 

@@ -16,7 +16,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use clap::{Args, Subcommand};
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
-use sgc_node::LockedFleet;
+use sgc_node::{LockedFleet, config};
 use sgc_trust::Fleet;
 use sgc_wire::UnixMillis;
 use zeroize::Zeroize;
@@ -151,21 +151,12 @@ fn is_elsewhere(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent != Path::new("") && parent != Path::new("."))
 }
 
-/// `90d`, `12h`, `30m`.
+/// Parses how long a certificate is valid: `90d`, `12h`, `30min`.
 fn parse_span(text: &str) -> Result<Duration, String> {
-    let wrong = || "a time is a number with its unit: 90d, 12h or 30m".to_owned();
-    let unit = text.chars().next_back().ok_or_else(wrong)?;
-    let number: u32 = text.strip_suffix(unit).and_then(|n| n.parse().ok()).ok_or_else(wrong)?;
-    let seconds = match unit {
-        'd' => 86_400,
-        'h' => 3600,
-        'm' => 60,
-        _ => return Err(wrong()),
-    };
-    if number == 0 {
-        Err("it has to be longer than nothing".into())
-    } else {
-        Ok(Duration::from_secs(seconds) * number)
+    match config::parse_duration(text) {
+        Some(Duration::ZERO) => Err("it has to be longer than nothing".into()),
+        Some(span) => Ok(span),
+        None => Err("a time is a number with its unit: 90d, 12h or 30min".into()),
     }
 }
 

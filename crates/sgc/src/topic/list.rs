@@ -141,6 +141,7 @@ fn local_state(graph: &Graph, topic: &str, type_name: &str, publishers: usize) -
         return match route.granted.len() {
             0 if route.refused.is_empty() => "shared: nobody asked for it".to_owned(),
             0 => "shared: who asked was refused".to_owned(),
+            1 => "shared: 1 node has it".to_owned(),
             n => format!("shared: {n} nodes have it"),
         };
     }
@@ -219,7 +220,7 @@ mod tests {
         let shown: Vec<_> =
             lines(&graph).into_iter().map(|l| format!("{} {}: {}", l.topic, l.whose, l.state)).collect();
         let expected = [
-            "/a here: shared: 1 nodes have it",
+            "/a here: shared: 1 node has it",
             "/absent here: shared, but nobody publishes it here",
             "/b here: not shared",
             "/far arm: used: 2 local readers",
