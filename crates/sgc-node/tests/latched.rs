@@ -212,3 +212,24 @@ fn who_is_late_gets_nothing_whose_lifespan_is_over() {
     let _desk = trio.desk(&[TOPIC]);
     late_listener_hears(&trio, deep(10), &["a while ago", "now"]);
 }
+
+#[test]
+fn changed_lifespan_counts_for_messages_that_are_kept() {
+    let trio = Trio::new();
+    let _cloud = trio.cloud();
+    let robot = trio.robot(&[TOPIC], "desk");
+    let talker = Talker::new(&trio.robot_net, TOPIC, deep(10));
+    let (now, hour_ns) = (unix_now().0 as i64 * 1_000_000, 3_600_000_000_000);
+    let say = |age_ns: i64, text: &'static str| {
+        talker.writer.write(SampleKind::Write, now - age_ns, Bytes::from_static(text.as_bytes())).unwrap();
+    };
+    say(2 * hour_ns, "too long ago");
+    say(0, "now");
+    let desk = trio.desk(&[TOPIC]);
+    let early = late_listener_hears(&trio, deep(10), &["too long ago", "now"]);
+    desk.stop();
+    drop(early);
+    robot.reload(|config| config.shares[0].qos.lifespan_ns = Some(hour_ns as u64));
+    let _desk = trio.desk(&[TOPIC]);
+    late_listener_hears(&trio, deep(10), &["now"]);
+}

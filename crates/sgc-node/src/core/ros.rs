@@ -188,10 +188,9 @@ impl<N: RosNetwork> Core<N> {
                 recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
             };
             let source = Source::new(config, &grant, message_key.clone())?;
-            let lifespan = qos.lifespan_ns.map(Duration::from_nanos);
             let manual = ManualLease::of(qos, Instant::now());
             let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
-            Some(SourceSlot { lifespan, depth, manual, ..slot })
+            Some(SourceSlot { depth, manual, ..slot })
         };
         // Some publishers may have one source together, which keeps what the deepest of them does.
         let mut depths = BTreeMap::<SourceId, usize>::new();
@@ -210,6 +209,8 @@ impl<N: RosNetwork> Core<N> {
                     share.set_history_depth(&slot, depth);
                     slot.depth = depth;
                 }
+                // Unlike reliability and durability it can change while the source goes on.
+                slot.lifespan = qos.lifespan_ns.map(Duration::from_nanos);
                 map.own.insert(guid, slot);
             }
         }
