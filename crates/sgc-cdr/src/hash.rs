@@ -1,4 +1,4 @@
-//! The hash of a type (REP 2011 and 2016): what tells two definitions of one name apart.
+//! The hash of a type (REP 2016): what tells two definitions of one name apart.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -18,6 +18,11 @@ pub(crate) fn clean(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
 }
 
+/// Returns a count with its noun: `1 node`, `3 nodes`.
+pub(crate) fn several(count: u64, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
+}
+
 /// Writes a part of the result as it is, control sequences included.
 pub(crate) fn raw(text: &str) -> Result<(), CliError> {
     let mut out = io::stdout().lock();

@@ -350,11 +350,10 @@ impl Status {
                 "Local network: opened again after this host's addresses changed, so often: {times}"
             ));
         }
-        let several = |n: u64, noun| format!("{n} {noun}{}", if n == 1 { "" } else { "s" });
         lines.push(format!(
             "Router: {} and {} known, {routed_names} with a route; branches: {branches}",
-            several(nodes as u64, "node"),
-            several(names, "name"),
+            output::several(nodes as u64, "node"),
+            output::several(names, "name"),
         ));
         lines
     }

@@ -1022,8 +1022,7 @@ fn told(graph: &Graph, topic: &str, otherwise: &str) -> String {
 }
 
 fn whom([nodes, groups, fleets]: [usize; 3]) -> String {
-    let count =
-        |n: usize, what: &str| (n > 0).then(|| format!("{n} {what}{}", if n == 1 { "" } else { "s" }));
+    let count = |n: usize, noun: &str| (n > 0).then(|| crate::output::several(n as u64, noun));
     let all: Vec<_> = [count(nodes, "node"), count(groups, "group"), count(fleets, "whole fleet")]
         .into_iter()
         .flatten()

@@ -308,7 +308,7 @@ pub struct GetTypeRequest {
 /// What a type is.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct GetTypeResponse {
-    /// The hash by which ROS 2 tells types apart (REP 2011), "RIHS01\_…": of a message. Of a service or an action it is empty.
+    /// The hash by which ROS 2 tells types apart (REP 2016), "RIHS01\_…": of a message. Of a service or an action it is empty.
     #[prost(string, tag = "1")]
     pub type_hash: ::prost::alloc::string::String,
     /// The type itself, then all that it needs, each once. Without those whose text the gateway does not have, since another
