@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use cyclors::{
     DDS_RETCODE_PRECONDITION_NOT_MET, dds_create_domain, dds_create_participant, dds_create_publisher,
-    dds_create_subscriber, dds_domain_set_deafmute, dds_get_children, dds_get_entity_sertype,
+    dds_create_subscriber, dds_domain_set_deafmute, dds_get_children, dds_get_entity_sertype, dds_set_qos,
 };
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{
@@ -36,7 +36,7 @@ use crate::manual_leases::Leases;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
 use crate::reader::CycloneReader;
-use crate::same_host::SameHost;
+use crate::same_host::{SameHost, Silence};
 use crate::sample;
 use crate::security::{Security, SecurityError};
 use crate::service::{CycloneClient, CycloneServer};
@@ -133,10 +133,11 @@ impl CycloneNetwork {
             }
             security.apply(&qos).map_err(|e| unsecured(security, e))?;
         }
-        let same_host = SameHost::install(&domain.entity, domain.id, &qos);
         let named = security.map_or(user_data::DEFAULT_ENCLAVE, |security| &security.enclave);
         let enclave = config.graph.then_some(named);
-        qos.set_user_data(&user_data::of_participant(config.tag.as_deref(), enclave));
+        let data = user_data::of_participant(config.tag.as_deref(), enclave);
+        qos.set_user_data(&user_data::while_opening(&data));
+        let silence = Silence::begin(&domain.entity);
         // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
         let (handle, said) =
             log::listen(|| unsafe { dds_create_participant(domain.id, qos.as_ptr(), std::ptr::null()) });
@@ -146,6 +147,7 @@ impl CycloneNetwork {
             None if said.is_empty() => refused(reason),
             None => refused(format!("{reason}: {said}")),
         })?;
+        let same_host = silence.as_ref().map_err(String::clone).and_then(|_| SameHost::install(&entity));
         if let Err(reason) = &same_host {
             tracing::warn!(reason, "programs of this host may be lost when its addresses change");
         }
@@ -186,6 +188,11 @@ impl CycloneNetwork {
                 "readers and writers are announced as Cyclone does: Fast DDS 3 shows no node for them"
             );
         }
+        drop(silence);
+        // A change makes Cyclone announce the participant at once. By itself it would announce it to peers again after 30 s.
+        qos.set_user_data(&data);
+        // SAFETY: the QoS object outlives the call, which copies it; the handle is checked by Cyclone.
+        check(unsafe { dds_set_qos(participant.entity.handle(), qos.as_ptr()) }).map_err(refused)?;
         let participant = Arc::new(participant);
         let explained = |reason| refused(participant.explain(&graph_writer().topic, reason));
         let announcer = config.graph.then(|| Announcer::new(&participant)).transpose().map_err(explained)?;
@@ -204,10 +211,12 @@ impl CycloneNetwork {
     fn outward_now(&self) -> Result<Vec<Ipv4Addr>, RosError> {
         let refused = |reason| RosError::Domain { domain: self.config.domain, reason };
         let domain = create_domain(&self.config)?;
-        let qos = NativeQos::new().map_err(refused)?;
-        SameHost::install(&domain.entity, domain.id, &qos)
-            .map(|same_host| same_host.outward().to_vec())
-            .map_err(refused)
+        let _silence = Silence::begin(&domain.entity).map_err(refused)?;
+        // SAFETY: null means the default QoS and no listener.
+        let (handle, _) =
+            log::listen(|| unsafe { dds_create_participant(domain.id, std::ptr::null(), std::ptr::null()) });
+        let same_host = Entity::new(handle).and_then(|participant| SameHost::install(&participant));
+        Ok(same_host.map_err(refused)?.outward().to_vec())
     }
 
     /// GUID of the participant; readers and writers made here share its first 12 bytes.

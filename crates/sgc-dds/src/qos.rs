@@ -125,7 +125,9 @@ impl NativeQos {
                 dds_qset_writer_data_lifecycle(native.0, false);
             }
         }
-        native.set_user_data(user_data);
+        if !user_data.is_empty() {
+            native.set_user_data(user_data);
+        }
         native.set_representations(kind, qos.representations);
         Ok(native)
     }
@@ -159,10 +161,8 @@ impl NativeQos {
     }
 
     pub(crate) fn set_user_data(&self, user_data: &[u8]) {
-        if !user_data.is_empty() {
-            // SAFETY: pointer and length are those of a slice, which is copied.
-            unsafe { dds_qset_userdata(self.0, user_data.as_ptr().cast(), user_data.len()) };
-        }
+        // SAFETY: pointer and length are those of a slice, which is copied.
+        unsafe { dds_qset_userdata(self.0, user_data.as_ptr().cast(), user_data.len()) };
     }
 
     /// A writer offers one: XCDR2 if nothing else will do.

@@ -21,8 +21,8 @@ use std::sync::atomic::{AtomicPtr, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
 
 use cyclors::{
-    DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, dds_create_participant, dds_create_reader, dds_domain_set_deafmute,
-    dds_get_entity_sertype, ddsi_domaingv, ddsi_locator, ddsi_tran_conn, ddsi_xlocator,
+    DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, dds_create_reader, dds_domain_set_deafmute, dds_entity_t,
+    dds_get_entity_sertype, dds_return_t, ddsi_domaingv, ddsi_locator, ddsi_tran_conn, ddsi_xlocator,
 };
 use rustix::net::sockopt;
 
@@ -30,9 +30,7 @@ use crate::announcement::{self, HEAD_BYTES};
 use crate::config::local_addresses;
 use crate::entity::{Entity, INFINITE, check};
 use crate::host_addresses;
-use crate::log;
 use crate::network::read_file;
-use crate::qos::NativeQos;
 
 /// `DDSI_LOCATOR_KIND_UDPv4`.
 const UDP_V4: i32 = 1;
@@ -147,22 +145,42 @@ impl Drop for SameHost {
     }
 }
 
+/// Keeps a domain from hearing and from speaking until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Silence {
+    domain: dds_entity_t,
+}
+
+impl Silence {
+    /// # Errors
+    /// Where Cyclone refuses.
+    pub(crate) fn begin(domain: &Entity) -> Result<Self, String> {
+        let silence = Self { domain: domain.handle() };
+        check(silence.set(true))?;
+        Ok(silence)
+    }
+
+    fn set(&self, is_silent: bool) -> dds_return_t {
+        // SAFETY: takes numbers only; the handle is checked by Cyclone.
+        unsafe { dds_domain_set_deafmute(self.domain, is_silent, is_silent, INFINITE) }
+    }
+}
+
+impl Drop for Silence {
+    fn drop(&mut self) {
+        // Fails only for a domain that is gone.
+        self.set(false);
+    }
+}
+
 impl SameHost {
-    /// Makes a new domain send by this module, before anybody hears of it. `qos` is that of the domain's participants: where DDS Security
-    /// protects one, Cyclone ends the others as if it protected them, too.
+    /// Makes the domain of a participant send by this module. Other participants should hear of it only afterwards: see [`Silence`].
     ///
     /// # Errors
     /// Where Cyclone is not as this module knows it, or does not use UDP over IPv4.
-    pub(crate) fn install(domain: &Entity, id: u32, qos: &NativeQos) -> Result<Self, String> {
+    pub(crate) fn install(participant: &Entity) -> Result<Self, String> {
         host_addresses::follow();
-        // SAFETY: takes numbers only; the handle is checked by Cyclone.
-        let silence = |on| unsafe { dds_domain_set_deafmute(domain.handle(), on, on, INFINITE) };
-        check(silence(true))?;
-        // The way to the inside of a domain begins at a participant.
-        // SAFETY: the QoS object outlives the call, which copies it; null means no listener. Errors are said when the network's own is made.
-        let (handle, _) = log::listen(|| unsafe { dds_create_participant(id, qos.as_ptr(), ptr::null()) });
-        let installed = Entity::new(handle).and_then(|participant| install(inside(&participant)?));
-        check(silence(false)).and(installed)
+        install(inside(participant)?)
     }
 
     /// Returns the addresses besides loopback from which the domain speaks to other hosts.

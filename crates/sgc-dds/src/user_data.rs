@@ -33,6 +33,11 @@ pub fn of_participant(tag: Option<&str>, enclave: Option<&str>) -> Vec<u8> {
     joined([(ENCLAVE_KEY, enclave), (TAG_KEY, tag)])
 }
 
+/// The USER_DATA of a participant while it is opened: different from what it has later, so that Cyclone announces the change.
+pub fn while_opening(later: &[u8]) -> Vec<u8> {
+    [later, b"opening=1;"].concat()
+}
+
 fn joined(elements: [(&str, Option<&str>); 2]) -> Vec<u8> {
     let mut text = String::new();
     for (key, value) in elements {

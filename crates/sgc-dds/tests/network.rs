@@ -1080,6 +1080,19 @@ fn the_users_configuration_overrides_ours() {
     quiet(&events);
 }
 
+/// Cyclone 11 takes what others announce for received, and never hears of it, if a second participant of the domain goes meanwhile.
+#[test]
+fn network_has_one_participant_from_the_beginning() {
+    let directory = tempfile::tempdir().unwrap();
+    let trace = directory.path().join("trace");
+    let output = trace.display();
+    let uri = format!("<Tracing><Category>discovery</Category><OutputFile>{output}</OutputFile></Tracing>");
+    let traced = DdsConfig { cyclonedds_uri: Some(uri), ..config(102, Some("arm-1")) };
+    drop(CycloneNetwork::open(&traced).unwrap());
+    let trace = std::fs::read_to_string(&trace).unwrap();
+    assert_eq!(trace.matches("ddsi_new_participant(").count(), 1, "{trace}");
+}
+
 #[test]
 fn content_that_is_traced_ends_nobody() {
     let trace = "<Tracing><Category>trace,content</Category><OutputFile>/dev/null</OutputFile></Tracing>";
