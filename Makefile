@@ -176,7 +176,7 @@ bench-peers: deps-bench
 bench-instructions: deps-bench
 	$(CARGO) bench --locked --manifest-path bench/Cargo.toml -p sgc-bench-instructions --bench hot -- $(ARGS)
 
-# How the control protocol grows, in simulation; the tables of docs/performance.md. The suite runs ten routers of it.
+# How the control protocol grows, in simulation; the tables of benchmarks/routing.md. The suite runs ten routers of it.
 scale:
 	$(CARGO) run --release --locked -p sgc-testkit --example scale -- $(ARGS)
 

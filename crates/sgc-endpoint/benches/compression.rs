@@ -2,7 +2,7 @@
 //! other end.
 //!
 //! The ways take turns, so that what else the machine does meets all of them; of each the median counts.
-//! `cargo bench -p sgc-endpoint --bench compression` prints the table of `docs/performance.md`.
+//! `cargo bench -p sgc-endpoint --bench compression` prints the table of `benchmarks/large-messages.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};

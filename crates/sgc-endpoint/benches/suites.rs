@@ -2,7 +2,7 @@
 //! thread.
 //!
 //! The suites take turns in short rounds, so that what else the machine does meets all of them; of each the
-//! median round counts. `cargo bench -p sgc-endpoint` prints the tables of `docs/performance.md`.
+//! median round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};

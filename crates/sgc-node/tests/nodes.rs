@@ -327,7 +327,7 @@ fn signed_messages_pass_one_by_one_and_in_batches() {
 }
 
 /// Not a test: how many messages of 1 KB pass from a local network over a robot, a cloud router and a desk to another
-/// local network, in one process, as fast as they go. `docs/performance.md` says how to run it.
+/// local network, in one process, as fast as they go. `benchmarks/throughput.md` says how to run it.
 #[test]
 #[ignore = "measures"]
 fn throughput_of_the_suites() {

@@ -1,5 +1,5 @@
 //! Not a test: what passes between two ROS 2 networks, over a robot, a cloud router and a desk, as users have it: DDS at
-//! both ends, QUIC between. `docs/performance.md` says how to run it and what came out.
+//! both ends, QUIC between. `benchmarks/throughput.md` says how to run it and what came out.
 //!
 //! All run in one process, which the suites share in turns, so that what else the machine does meets both.
 

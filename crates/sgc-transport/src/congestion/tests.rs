@@ -353,7 +353,7 @@ fn paths() -> Vec<(&'static str, Path)> {
 }
 
 #[test]
-#[ignore = "prints the table of docs/performance.md"]
+#[ignore = "prints the tables of benchmarks/congestion.md"]
 fn table() {
     println!("| path | controller | used | queue p50, ms | p99 | lost |\n|---|---|---|---|---|---|");
     for (name, path) in paths() {

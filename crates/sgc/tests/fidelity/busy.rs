@@ -2,7 +2,7 @@
 //! nothing is published.
 //!
 //! `SGC_GRAPH_NODES`, each of ten endpoints, `SGC_GRAPH_SHARED` and `SGC_GRAPH_SECONDS` make it larger (`make
-//! bench-graph`: the figures of docs/performance.md).
+//! bench-graph`: the figures of benchmarks/graph.md).
 
 use std::fs;
 use std::time::{Duration, Instant};
