@@ -34,14 +34,14 @@ fn every_test_that_the_security_document_cites_exists() {
 }
 
 /// Folders of the repository that documents name paths in.
-const FOLDERS: [&str; 6] = ["bench/", "clients/", "crates/", "docs/", "fuzz/", "scripts/"];
+const FOLDERS: [&str; 7] = ["bench/", "benchmarks/", "clients/", "crates/", "docs/", "fuzz/", "scripts/"];
 
 #[test]
 fn every_link_and_path_of_a_document_leads_somewhere() {
     let root = root();
     let mut documents: Vec<_> =
         ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"].map(|d| root.join(d)).into();
-    let mut folders = vec![root.join("docs")];
+    let mut folders = vec![root.join("benchmarks"), root.join("docs")];
     while let Some(folder) = folders.pop() {
         for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
             match path.is_dir() {
