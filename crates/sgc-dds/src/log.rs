@@ -97,7 +97,7 @@ fn refused_program(message: &str) -> Option<&'static str> {
     if says("handshake reply failed") && says("ASN1 integer") {
         Some(
             "Fast DDS before 3.2 proposes keys by DH, which it encodes in another way than Cyclone DDS: set its property \
-             dds.sec.auth.builtin.PKI-DH.preferred_key_agreement to ECDH, or name the enclave of sgc `/bridge` (docs/vendors.md)",
+             dds.sec.auth.builtin.PKI-DH.preferred_key_agreement to ECDH, or name the enclave of sgc `/bridge` (docs/how-to/sros2.md)",
         )
     } else if says("andshake")
         || says("Remote secure participant")

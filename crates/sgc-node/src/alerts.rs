@@ -145,7 +145,7 @@ impl Alert {
             }
             Self::DiscoveryServer { .. } => {
                 "start programs whose topics cross without ROS_DISCOVERY_SERVER, with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST \
-                 and ROS_STATIC_PEERS where multicast is to be avoided (docs/vendors.md)"
+                 and ROS_STATIC_PEERS where multicast is to be avoided (docs/reference/compatibility.md)"
             }
             Self::LocalNetworkFails { .. } => {
                 "compare `ip addr` and `ip route` with that address; if this host's own address changed, the node opens its network again \
@@ -156,7 +156,7 @@ impl Alert {
                  up to a minute apart"
             }
             Self::ProtectedPrograms { .. } => {
-                "set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves (docs/vendors.md)"
+                "set `security_root` in [ros] to their keystore and `enclave` to one of its enclaves (docs/how-to/sros2.md)"
             }
             Self::ConfigurationRefused { .. } => {
                 "mend the file; `sgc check -c FILE` says everything that is wrong with it. Then `sgc reload`, if the node does not \

@@ -1832,7 +1832,7 @@ fn a_file_of_nothing_but_mistakes_is_answered_in_time() {
 }
 
 fn reference() -> String {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/configuration.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/reference/configuration.md");
     fs::read_to_string(path).expect("the reference is in docs/")
 }
 

@@ -2,7 +2,7 @@
 //! signed frames of the network, work together, and draw hostile actions from a grammar.
 //!
 //! The adversary's links are slower than any honest way, so no way between two honest nodes leads over it while an honest one is
-//! there; what a router may do to those behind it is in `docs/security.md`. With such a way, no honest pair loses its route, its
+//! there; what a router may do to those behind it is in `docs/explanation/security.md`. With such a way, no honest pair loses its route, its
 //! allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and says which fail.
 
 use std::cell::RefCell;

@@ -1,7 +1,7 @@
-//! The documents cite what exists: each test that `docs/security.md` names is in the repository, and each link and path of
-//! every document leads somewhere.
+//! The documents cite what exists: each test that `docs/explanation/security.md` names is in the repository, and each link and path of
+//! every document leads somewhere. The summary of the book names every page below `docs/`.
 //!
-//! That document says before its first table how tests are cited. A citation that cannot be checked is a fault.
+//! The security document says before its first table how tests are cited. A citation that cannot be checked is a fault.
 
 #![allow(clippy::unwrap_used)]
 
@@ -20,12 +20,12 @@ fn root() -> PathBuf {
 
 #[test]
 fn every_test_that_the_security_document_cites_exists() {
-    let text = fs::read_to_string(root().join("docs/security.md")).unwrap();
+    let text = fs::read_to_string(root().join("docs/explanation/security.md")).unwrap();
     let mut checker = Checker::new(&text, &root());
     checker.check(&text);
     assert!(
         checker.faults.is_empty(),
-        "docs/security.md cites tests that cannot be found:\n  {}\nCorrect the citation, or the test's name. \
+        "docs/explanation/security.md cites tests that cannot be found:\n  {}\nCorrect the citation, or the test's name. \
          The forms are `NAME: test`, then `test` for more of the same file, `…end_of_a_name`, and `NAME` (all). \
          NAME is in the table at the top, or a path below crates/.",
         checker.faults.join("\n  ")
@@ -41,16 +41,7 @@ fn every_link_and_path_of_a_document_leads_somewhere() {
     let root = root();
     let mut documents: Vec<_> =
         ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"].map(|d| root.join(d)).into();
-    let mut folders = vec![root.join("benchmarks"), root.join("docs")];
-    while let Some(folder) = folders.pop() {
-        for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
-            match path.is_dir() {
-                true => folders.push(path),
-                false if path.extension().is_some_and(|extension| extension == "md") => documents.push(path),
-                false => {}
-            }
-        }
-    }
+    documents.extend(["benchmarks", "docs"].iter().flat_map(|folder| pages_below(&root.join(folder))));
     let (mut faults, mut checked) = (Vec::new(), 0);
     for document in &documents {
         let text = fs::read_to_string(document).unwrap();
@@ -77,6 +68,35 @@ fn every_link_and_path_of_a_document_leads_somewhere() {
     }
     assert!(faults.is_empty(), "these links and paths lead nowhere:\n  {}", faults.join("\n  "));
     assert!(checked > 100, "only {checked} links and paths were recognised");
+}
+
+/// Returns the Markdown files below a folder.
+fn pages_below(folder: &Path) -> Vec<PathBuf> {
+    let (mut pages, mut folders) = (Vec::new(), vec![folder.to_owned()]);
+    while let Some(folder) = folders.pop() {
+        for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+            match path.is_dir() {
+                true => folders.push(path),
+                false if path.extension().is_some_and(|extension| extension == "md") => pages.push(path),
+                false => {}
+            }
+        }
+    }
+    pages
+}
+
+#[test]
+fn the_summary_of_the_book_names_every_page_once() {
+    let docs = root().join("docs");
+    let summary = fs::read_to_string(docs.join("SUMMARY.md")).unwrap();
+    let mut named: Vec<_> =
+        summary.split("](").skip(1).filter_map(|rest| rest.split(')').next()).map(PathBuf::from).collect();
+    let mut pages: Vec<_> =
+        pages_below(&docs).iter().map(|page| page.strip_prefix(&docs).unwrap().to_owned()).collect();
+    pages.retain(|page| page != Path::new("SUMMARY.md"));
+    named.sort();
+    pages.sort();
+    assert_eq!(named, pages, "left: docs/SUMMARY.md, right: the pages below docs/");
 }
 
 /// Returns `true` if a link of a document names a file that exists, and a heading of it.

@@ -507,7 +507,7 @@ pub enum Denied {
         node: NodeId,
     },
     /// It is over.
-    #[error("the certificate of node {node} ended at {expires}: renew it (docs/fleet.md)")]
+    #[error("the certificate of node {node} ended at {expires}: renew it (docs/how-to/fleet.md)")]
     CertificateExpired {
         /// Whose.
         node: NodeId,

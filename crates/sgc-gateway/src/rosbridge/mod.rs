@@ -1,7 +1,7 @@
 //! The rosbridge protocol (version 2, as `rosbridge_suite` of ROS 2 speaks it): what roslibjs and roslibpy talk.
 //!
 //! [`serve`] serves one WebSocket. It listens to nothing and admits nobody by itself: the socket comes accepted, with the
-//! session of who was admitted. What the protocol does here, op by op, is in `docs/gateway-rosbridge.md`.
+//! session of who was admitted. What the protocol does here, op by op, is in `docs/reference/gateway-rosbridge.md`.
 
 mod actions;
 mod calls;

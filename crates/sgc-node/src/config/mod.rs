@@ -2,7 +2,7 @@
 //!
 //! Two sources, a TOML file and the command line, become a draft (`file`, `args`); one set of rules
 //! (`resolve`, `names`, `ros_env`) makes a [`Config`] of it or says everything that is wrong with it
-//! ([`ConfigErrors`]). The reference for users is `docs/configuration.md`.
+//! ([`ConfigErrors`]). The reference for users is `docs/reference/configuration.md`.
 //!
 //! Nothing here reads the environment or opens a socket: variables come through [`Environment`], and of files only
 //! [`load`] and [`load_args`] read any. Whether the identity file holds what it should, its owner's name

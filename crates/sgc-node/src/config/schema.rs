@@ -1,6 +1,6 @@
 //! Which tables and keys a configuration has, which are planned, and which one a misspelt key was meant to be.
 //!
-//! This table is the one place where a key becomes known; `docs/configuration.md` is tested against it.
+//! This table is the one place where a key becomes known; `docs/reference/configuration.md` is tested against it.
 //! What the values may be is the business of `resolve`.
 
 /// A table of the file.

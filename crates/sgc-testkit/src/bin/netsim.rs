@@ -1,4 +1,4 @@
-//! A bad network at the command line: `docs/netsim.md`.
+//! A bad network at the command line: `docs/how-to/netsim.md`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "it is a program")]
 
 use std::io::BufRead as _;

@@ -945,7 +945,7 @@ fn linked(graph: &Graph, steps: &mut Walk) -> bool {
             let why = search.last_failure.as_deref().map(|why| format!(": {why}")).unwrap_or_default();
             let fix = search.last_failure.as_deref().and_then(refusals::fix_of_link).unwrap_or(
                 "is the router running and in reach? Where UDP is blocked, a URL with tls:// or wss:// passes \
-                 (docs/transports.md)",
+                 (docs/explanation/transports.md)",
             );
             Step::wrong(format!("no link is up; {} is {}{why}", search.router, search.state), fix)
         }

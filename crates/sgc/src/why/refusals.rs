@@ -48,7 +48,7 @@ const FLEET_FILE: &str =
     "look into the node's log: is the fleet's file there, and may the node's user write it?";
 const RAISE_CLIENTS: &str = "close clients that are not needed, or raise `clients_max` in [gateway]; of one token, certificate or \
                              address a quarter of the places at most: make several tokens for many viewers";
-const FEWER: &str = "subscribe to and publish less in one client, or spread it over several tokens (docs/gateway.md, how much one \
+const FEWER: &str = "subscribe to and publish less in one client, or spread it over several tokens (docs/reference/gateway.md, how much one \
                      may have)";
 const SLOW_CLIENTS: &str = "if it is somebody who connects again and again, keep the address out by a firewall; programs of this \
                             host have places of their own";
@@ -233,7 +233,7 @@ const CONTROL: &[Refusal] = &[
     counted(
         "consumers_forbidden",
         "the enclave of this node may not show subscribers and clients of other nodes in the local graph; messages flow all the same",
-        "grant it the partition `sgc/shown` in permissions.p7s (docs/vendors.md)",
+        "grant it the partition `sgc/shown` in permissions.p7s (docs/how-to/sros2.md)",
     ),
     counted(
         "consumers_untold",

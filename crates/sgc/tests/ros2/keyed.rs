@@ -1,5 +1,5 @@
 //! Topics with keys, which Kilted has and Jazzy does not. A Kilted subscriber ends with a segmentation fault at a message that comes without
-//! the hash of its key (`docs/vendors.md`).
+//! the hash of its key (`docs/reference/compatibility.md`).
 
 use serde_json::{Value, json};
 

@@ -173,7 +173,7 @@ impl Case {
 
     /// A subscriber that comes when all has been said and heard gets what the publisher keeps, once.
     ///
-    /// Only Cyclone announces how many it keeps; of others the last one is kept on the way (`docs/vendors.md`).
+    /// Only Cyclone announces how many it keeps; of others the last one is kept on the way (`docs/reference/compatibility.md`).
     fn late(&self, lab: &Lab, far: Site) -> Result<Outcome, String> {
         let (kept, depth) = match (KINDS[self.kind], self.from) {
             // One of each of the five instances.
