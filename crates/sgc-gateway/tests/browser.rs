@@ -159,6 +159,6 @@ async fn a_page_shows_a_camera_if_it_is_of_this_host_or_has_a_token() {
 fn the_page_is_the_one_in_the_documentation() {
     let read = |file| std::fs::read_to_string(repository(file)).unwrap();
     let page = format!("```html\n{}```\n", read("tests/js/camera.html"));
-    let is_there = read("docs/reference/gateway-rosbridge.md").contains(&page);
-    assert!(is_there, "docs/reference/gateway-rosbridge.md has another page than tests/js/camera.html");
+    let is_there = read("docs/tutorials/browser-dashboard.md").contains(&page);
+    assert!(is_there, "docs/tutorials/browser-dashboard.md has another page than tests/js/camera.html");
 }

@@ -89,14 +89,17 @@ fn pages_below(folder: &Path) -> Vec<PathBuf> {
 fn the_summary_of_the_book_names_every_page_once() {
     let docs = root().join("docs");
     let summary = fs::read_to_string(docs.join("SUMMARY.md")).unwrap();
-    let mut named: Vec<_> =
-        summary.split("](").skip(1).filter_map(|rest| rest.split(')').next()).map(PathBuf::from).collect();
-    let mut pages: Vec<_> =
+    let mut named = BTreeSet::new();
+    for page in summary.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+        assert!(named.insert(PathBuf::from(page)), "docs/SUMMARY.md names {page} twice");
+    }
+    let mut pages: BTreeSet<_> =
         pages_below(&docs).iter().map(|page| page.strip_prefix(&docs).unwrap().to_owned()).collect();
-    pages.retain(|page| page != Path::new("SUMMARY.md"));
-    named.sort();
-    pages.sort();
-    assert_eq!(named, pages, "left: docs/SUMMARY.md, right: the pages below docs/");
+    pages.remove(Path::new("SUMMARY.md"));
+    let unnamed: Vec<_> = pages.difference(&named).collect();
+    assert!(unnamed.is_empty(), "docs/SUMMARY.md does not name {unnamed:?}");
+    let absent: Vec<_> = named.difference(&pages).collect();
+    assert!(absent.is_empty(), "docs/SUMMARY.md names {absent:?}, which are not below docs/");
 }
 
 /// Returns `true` if a link of a document names a file that exists, and a heading of it.

@@ -548,7 +548,7 @@ impl Place {
     }
 }
 
-/// The recipe of docs/how-to/fleet.md, and the request of a node that wants more than it is given.
+/// The recipe of docs/how-to/own-ca.md, and the request of a node that wants more than it is given.
 #[test]
 fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
     let place = Place::new();
