@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""What mdbook does not do for the book of docs/.
+"""Adapts the links of docs/ to the book, and checks those of the book.
 
-book.py               as a preprocessor of mdbook: a link that leaves docs/ becomes its text and the path in the repository, since
-                      the book has no such page. GitHub's readers keep the link.
+book.py               is a preprocessor of mdbook. A link that leaves docs/ becomes its text and the path in the repository, since
+                      the book has no such page.
 book.py check FOLDER  checks that each link within a built book leads to a page, and to a heading of it.
 """
 
@@ -18,8 +18,8 @@ from urllib.parse import unquote, urlsplit
 LINK = re.compile(r"\[([^\]\n]*(?:\n[^\]\n]+)?)\]\(([^)\s]+)\)")
 
 
-def without_repository(content: str, page: str) -> str:
-    """Returns a page's text without links that leave the book."""
+def adapted(content: str, page: str) -> str:
+    """Returns a page's text with links that hold in the book."""
 
     def replace(link: re.Match[str]) -> str:
         text, target = link.groups()
@@ -28,7 +28,8 @@ def without_repository(content: str, page: str) -> str:
             return link[0]
         path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), path))
         if path.startswith("docs/"):
-            return link[0]
+            # mdbook calls the page of a folder index.
+            return link[0].replace("README.md", "index.md")
         return f"`{path}`" if path.endswith(text.strip("`")) else f"{text} (`{path}`)"
 
     parts = re.split(r"(^```.*?^```\s*$)", content, flags=re.MULTILINE | re.DOTALL)
@@ -36,10 +37,11 @@ def without_repository(content: str, page: str) -> str:
 
 
 def preprocess(items: list) -> None:
+    """Adapts the links of chapters and of those below them."""
     for item in items:
         if isinstance(item, dict) and "Chapter" in item:
             chapter = item["Chapter"]
-            chapter["content"] = without_repository(chapter["content"], chapter.get("source_path") or "")
+            chapter["content"] = adapted(chapter["content"], chapter.get("source_path") or "")
             preprocess(chapter["sub_items"])
 
 
@@ -61,6 +63,7 @@ class Page(HTMLParser):
 
 
 def check(folder: Path) -> int:
+    """Returns 1 if a link of a built book leads nowhere, else 0."""
     # The page of all pages repeats the links of each from another place.
     pages = {path: Page(path) for path in folder.rglob("*.html") if path.name not in ("print.html", "404.html", "toc.html")}
     faults, checked = set(), 0

@@ -1,4 +1,4 @@
-//! Two companies, each with a fleet of its own: what they give each other by tokens, as `docs/how-to/sharing.md` has it, crosses, and nothing else.
+//! Two companies, each with a fleet of its own: what they give each other by tokens, as `docs/how-to/partner.md` has it, crosses, and nothing else.
 
 use std::fs;
 use std::io::Write;
