@@ -6,13 +6,14 @@ ARGS ?=
 # What release builds have. Tests have it, too, so that Cyclone DDS is built once.
 FEATURES := --features sgc/sros2
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
-	@echo 'not in it:       peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
+	@echo 'not in it:       book (the documents as a book, target/book/index.html; builds mdbook once)'
+	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 restarts at random; SGC_CHURN_SEED, SGC_CHURN_STEPS), stall (ten minutes of images to who stands still)'
 	@echo '                 gateway-soak (500 clients of the gateway, and 20000 that come and go; SGC_SOAK_CLIENTS, SGC_SOAK_CONNECTS)'
@@ -78,6 +79,10 @@ unit: peers
 
 docs:
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked
+
+# The pages below docs/ as a book, with its links checked.
+book:
+	@scripts/book.sh
 
 deny:
 	@scripts/deny.sh
