@@ -91,19 +91,21 @@ class Calls:
             self.executor = SingleThreadedExecutor(context=self.context)
             self.node = rclpy.create_node(self.options.node, context=self.context, start_parameter_services=False)
             self.executor.add_node(self.node)
-            self.thread = threading.Thread(target=self.executor.spin, daemon=True)
-            self.thread.start()
 
     def end(self) -> None:
         self.executor.shutdown()
-        self.thread.join()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
     def until(self, is_so) -> bool:
+        # On this thread: an executor on another one ends when it meets an action client that is half made.
         while not is_so() and time.monotonic() < self.deadline:
-            time.sleep(POLL_S)
+            self.executor.spin_once(timeout_sec=POLL_S)
         return is_so()
+
+    def finish(self) -> None:
+        """Waits until what was asked is answered and counted."""
+        self.until(lambda: self.answered == self.asked)
 
     def ask(self, client, request, is_right) -> None:
         self.asked += 1
@@ -121,7 +123,7 @@ class Calls:
         future.add_done_callback(done)
         self.open.append((future, client))
         if not self.options.overlap:
-            self.until(future.done)
+            self.finish()
 
     def call(self, name: str, number: int) -> None:
         client = self.node.create_client(BasicTypes, name, qos_profile=QoSProfile(depth=DEPTH))
@@ -160,7 +162,7 @@ def call(options) -> int:
                 if options.participants:
                     calls.end()
     if not options.participants:
-        calls.until(lambda: all(future.done() for future, _ in calls.open))
+        calls.finish()
         calls.end()
     say("summary", role="call", asked=calls.asked, answered=calls.answered, wrong=calls.wrong, slowest=calls.slowest)
     return 0 if calls.answered == calls.asked and not calls.wrong else 3
