@@ -41,6 +41,7 @@ const SET_CLOCK: &str =
     "compare `date -u` on both machines and set the clock that is wrong, for instance by NTP (`timedatectl`)";
 const ENROLL_AGAIN: &str = "if the node is to come back, `sgc fleet enroll` it again, which gives it the next incarnation, and \
                             install the new identity there";
+const TAMPERED: &str = "somebody on the way alters packets; do all nodes have one version of sgc?";
 const DDS_LOG: &str = "look into the node's log for what DDS said";
 const DEFINITIONS: &str =
     "name a directory that defines it with `definitions` in [ros]; a few when a topic begins are no fault";
@@ -319,7 +320,7 @@ const CONTROL: &[Refusal] = &[
     named(
         "over_rate",
         "a peer sends more than `peer_rate` lets it: best-effort messages are dropped, reliable ones slowed",
-        "raise `peer_rate` in [transport], or set max_rate or max_bandwidth in the [[share]] on the peer",
+        "raise `peer_rate` in [router], or set max_rate or max_bandwidth in the [[share]] on the peer",
     ),
     counted("mdns_crowded", "more nodes announce themselves on the local network than are listened to", ""),
     counted("mdns_unknown", "an announcement on the local network is of another version", SAME_VERSION),
@@ -396,6 +397,69 @@ const PACKETS: &[Refusal] = &[
         "not_converted",
         "a publisher wrote something else than its type says, so that it could not become JSON",
         "build the publisher and the definitions that this node finds from one version of the package",
+    ),
+];
+
+/// Packets that a sink refuses (`SinkDrop` of `sgc-endpoint`), and messages that are lost for good.
+const SINK: &[Refusal] = &[
+    counted("sink_suite", "a packet is sealed in another suite than its owner granted", SAME_VERSION),
+    counted(
+        "sink_epoch",
+        "a packet is sealed with a key that this node has retired",
+        "a few after a key change are no fault",
+    ),
+    counted("sink_length", "a packet is longer or shorter than its header says", TAMPERED),
+    counted(
+        "sink_forged",
+        "a seal does not verify: the packet was altered, or its sender lacks the key",
+        TAMPERED,
+    ),
+    counted("sink_trailer", "a signature names an impossible place in its batch", TAMPERED),
+    counted(
+        "sink_signature",
+        "the publisher did not sign the packet: it was altered, or another member made it",
+        "if the count grows, find out which member of the topic or which router does this",
+    ),
+    counted(
+        "sink_not_for_us",
+        "a packet is for another subscriber, or for an earlier request of this one",
+        "",
+    ),
+    counted(
+        "sink_unknown_source",
+        "the owner does not announce the publisher of a packet",
+        "a few when a publisher starts or ends are no fault",
+    ),
+    counted(
+        "sink_unknown_epoch",
+        "no grant brought the key of a packet",
+        "a few after a key change are no fault; else look for refusals at the owner with `sgc why TOPIC` there",
+    ),
+    counted(
+        "sink_parking_full",
+        "too many packets wait for a grant; the oldest went",
+        "a few when a topic begins are no fault; else look at the way to the owner with `sgc why TOPIC`",
+    ),
+    counted("sink_below_floor", "a message is older than what this subscriber asked for", ""),
+    counted(
+        "sink_replayed",
+        "a message was delivered before, or is too old to tell",
+        "a few when a route changes are no fault; many are a replay by somebody on the way",
+    ),
+    counted("sink_late", "a newer message of a best-effort publisher was delivered before", ""),
+    counted("sink_duplicate_fragment", "a part of a message came twice", ""),
+    counted("sink_inconsistent", "a part of a message contradicts another part", SAME_VERSION),
+    counted("sink_head", "the head of a message cannot be read", SAME_VERSION),
+    counted("sink_awaiting_history", "the history that this subscriber asked for contains the message", ""),
+    counted(
+        "sink_partials_full",
+        "there is no room for more messages of which parts are missing",
+        "many large messages lose packets: limit the topic with max_rate or max_bandwidth in the [[share]]",
+    ),
+    counted(
+        "sink_lost",
+        "a publisher's node no longer keeps messages that were lost on the way",
+        "the interruption was longer than what the node keeps; is a link too thin for the topic?",
     ),
 ];
 
@@ -630,7 +694,7 @@ pub(super) fn of_calls(key: &str) -> Option<(&'static str, &'static str)> {
 /// Returns what a row of `sgc status`, Drops, means.
 pub(crate) fn drop_meaning(row: &str) -> String {
     let key = row.split(" from ").next().unwrap_or(row);
-    let all = [find(CONTROL, key), find(PACKETS, key)];
+    let all = [CONTROL, PACKETS, SINK].map(|table| find(table, key));
     let mut all: Vec<_> = all.into_iter().flatten().map(|refusal| refusal.means).collect();
     all.dedup();
     all.join("; or ")
@@ -726,6 +790,7 @@ pub(super) mod tests {
         let control: BTreeSet<_> = control.into_iter().flat_map(specified).collect();
         assert_eq!(control, keys(CONTROL));
         assert_eq!(specified("data path"), keys(PACKETS));
+        assert_eq!(specified("sink"), keys(SINK));
         assert_eq!(specified("links refused"), keys(DOOR));
         let kinds = RefusalKind::ALL.into_iter().map(|kind| kind.label().to_owned());
         assert_eq!(kinds.collect::<BTreeSet<_>>(), keys(DOOR));
