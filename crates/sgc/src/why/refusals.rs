@@ -16,15 +16,56 @@ const NAMED_MAX: usize = 8;
 
 /// A counter's explanation.
 #[derive(Debug)]
-pub(crate) struct Refusal {
+pub struct Refusal {
     /// The counter, as the node spells it.
-    pub(super) key: &'static str,
-    pub(super) means: &'static str,
+    pub key: &'static str,
+    /// The meaning.
+    pub means: &'static str,
     /// The user's remedy; empty where nothing has to be done.
-    pub(super) fix: &'static str,
+    pub fix: &'static str,
     /// True if an honest network never causes it, or somebody has to see to it: `sgc why` names it for any topic.
-    pub(super) is_named: bool,
+    pub is_named: bool,
 }
+
+/// The counters of one kind.
+#[derive(Debug)]
+pub struct CounterTable {
+    /// A heading.
+    pub title: &'static str,
+    /// Where a user finds the counters.
+    pub place: &'static str,
+    /// The counters.
+    pub counters: &'static [Refusal],
+}
+
+/// All counters that have a meaning and a remedy.
+pub const COUNTERS: [CounterTable; 5] = [
+    CounterTable {
+        title: "Control plane and local network",
+        place: "`sgc status` lists them under Drops, and `sgc status --json` has them in `drops`.",
+        counters: CONTROL,
+    },
+    CounterTable {
+        title: "Packets and messages",
+        place: "`sgc status` lists them under Drops, and `sgc why TOPIC` those of one topic.",
+        counters: PACKETS,
+    },
+    CounterTable {
+        title: "Packets that a subscribing node refuses",
+        place: "`sgc status` lists them under Drops. Each packet also counts as `sink`.",
+        counters: SINK,
+    },
+    CounterTable {
+        title: "Refused links",
+        place: "`sgc status` lists them under Refused peers, and `sgc status --json` has them in `refused`.",
+        counters: DOOR,
+    },
+    CounterTable {
+        title: "Refused clients of a gateway",
+        place: "`sgc status` lists them under Refused there, and `sgc status --json` has them in `refused` of `gateway`.",
+        counters: GATEWAY,
+    },
+];
 
 /// A refusal that somebody has to see to.
 const fn named(key: &'static str, means: &'static str, fix: &'static str) -> Refusal {

@@ -1,0 +1,138 @@
+//! `sgc`: the command line of SGC, secure global connectivity for ROS 2.
+//!
+//! It parses arguments, reads and writes files, prints, and hands everything else to `sgc-node` and
+//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by `demo` and `bench`, whose
+//! programs are plain DDS participants.
+//!
+//! It is a library so that tests can compare documents with [`command_line`] and [`COUNTERS`]. The program is [`main`].
+//!
+//! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
+//! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
+#![deny(unsafe_code)]
+
+mod audit;
+mod bench;
+mod check;
+mod demo;
+mod error;
+mod files;
+mod fleet;
+mod heap;
+mod memory;
+mod name;
+mod output;
+mod policy;
+mod reload;
+mod run;
+mod service;
+mod share_token;
+mod status;
+mod token;
+mod topic;
+mod use_token;
+mod why;
+mod yaml;
+
+use std::process::ExitCode;
+
+use clap::{CommandFactory as _, Parser, Subcommand};
+
+use crate::error::CliError;
+pub use crate::why::refusals::{COUNTERS, CounterTable, Refusal};
+
+/// Secure global connectivity for ROS 2: share exactly the topics you name with exactly the nodes you trust,
+/// between ROS 2 networks anywhere.
+#[derive(Debug, Parser)]
+#[command(name = "sgc", version, max_term_width = 100)]
+#[command(after_help = "A first use:
+  sgc demo                                  see it work on this machine
+  sgc fleet create lab                      make a fleet: lab.fleet
+  sgc fleet enroll arm-1                    make a node's identity: arm-1.identity
+  sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk")]
+struct Cli {
+    /// Allow core dumps, and debuggers of the same user: the keys of the node are in its memory
+    /// [env: SGC_ALLOW_CORE_DUMPS]
+    #[arg(long, global = true, hide_short_help = true)]
+    allow_core_dumps: bool,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Demo(demo::DemoArgs),
+    Bench(bench::BenchArgs),
+    Fleet(fleet::FleetArgs),
+    Run(run::RunArgs),
+    Router(run::RouterArgs),
+    Check(check::CheckArgs),
+    Status(status::StatusArgs),
+    Topic(topic::TopicArgs),
+    Service(service::ServiceArgs),
+    Why(why::WhyArgs),
+    Reload(reload::ReloadArgs),
+    Audit(audit::AuditArgs),
+    Policy(policy::PolicyArgs),
+    Token(token::TokenArgs),
+    ShareToken(share_token::ShareTokenArgs),
+    Use(use_token::UseArgs),
+    Name(name::NameArgs),
+    #[command(hide = true)]
+    DemoPeer(demo::PeerArgs),
+}
+
+/// Runs the command that the arguments of the process name.
+pub fn main() -> ExitCode {
+    let result = match Cli::try_parse() {
+        Ok(cli) => {
+            memory::close(cli.allow_core_dumps);
+            run(cli.command)
+        }
+        Err(error) => return error::usage(&error, &called(std::env::args())),
+    };
+    match result {
+        Ok(code) => code,
+        Err(error) => error.report(),
+    }
+}
+
+/// Returns the definition of the command line.
+pub fn command_line() -> clap::Command {
+    Cli::command()
+}
+
+/// The command that arguments name, as far as there is one of that name: `sgc fleet enroll`, for example.
+fn called(args: impl Iterator<Item = String>) -> String {
+    let mut command = &Cli::command();
+    let mut called = command.get_name().to_owned();
+    for arg in args.skip(1) {
+        let Some(found) = command.find_subcommand(&arg) else { break };
+        command = found;
+        called = format!("{called} {}", found.get_name());
+    }
+    called
+}
+
+fn run(command: Command) -> Result<ExitCode, CliError> {
+    match command {
+        Command::Demo(args) => return demo::demo(args),
+        Command::Bench(args) => return bench::bench(args),
+        Command::Fleet(args) => fleet::fleet(args),
+        Command::Run(args) => run::run(args),
+        Command::Router(args) => run::router(args),
+        Command::Check(args) => check::check(&args),
+        Command::Why(args) => return why::why(&args),
+        Command::Topic(args) => return topic::topic(&args),
+        Command::Service(args) => return service::service(&args),
+        Command::Status(args) => status::status(&args),
+        Command::Reload(args) => reload::reload(&args),
+        Command::Audit(args) => audit::audit(&args),
+        Command::Policy(args) => return policy::policy(&args),
+        Command::Token(args) => token::token(&args),
+        Command::ShareToken(args) => share_token::share_token(&args),
+        Command::Use(args) => use_token::use_token(&args),
+        Command::Name(args) => name::name(&args),
+        Command::DemoPeer(args) => demo::peer(args),
+    }
+    .map(|()| ExitCode::SUCCESS)
+}
