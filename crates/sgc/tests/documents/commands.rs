@@ -1,0 +1,156 @@
+//! Command lines of `sgc` parse with the definition that the program parses with.
+//!
+//! A line of a code block must be a whole command. A code span may leave arguments out: it may name no more than a command,
+//! and an `…` in it stands for anything.
+
+use clap::Command;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+
+use crate::markdown::Document;
+use crate::report::Report;
+use crate::repository::REPOSITORY;
+use crate::shell;
+
+/// The last word of strings that keys are derived with and signatures are made over, such as "sgc join v1". They are no
+/// command lines.
+const OF_CRYPTOGRAPHY: &str = "v1";
+
+#[test]
+fn every_cited_command_line_parses() {
+    let mut report = Report::default();
+    for document in REPOSITORY.documents() {
+        check(&document, &mut report);
+    }
+    report.finish(100, "`sgc` does not take these command lines:");
+}
+
+fn check(document: &Document, report: &mut Report) {
+    for line in shell::command_lines(document) {
+        for words in shell::commands(&line.text) {
+            let is_sgc = words.first().is_some_and(|word| word == "sgc" || word.ends_with("/sgc"));
+            if !is_sgc || words.last().is_some_and(|word| word == OF_CRYPTOGRAPHY) {
+                continue;
+            }
+            let outcome = match words.iter().any(|word| word.contains('…')) {
+                true => check_flags(&words),
+                false => parse(&words, line.is_whole),
+            };
+            report.check(
+                &document.path,
+                line.line,
+                outcome.map_err(|fault| format!("`{}`: {fault}", line.text)),
+            );
+        }
+    }
+    check_flags_of_commands(document, report);
+}
+
+/// Parses a command line as the program does.
+fn parse(words: &[String], is_whole: bool) -> Result<(), String> {
+    let Err(error) = sgc::command_line().try_get_matches_from(words) else { return Ok(()) };
+    // A placeholder is no valid value.
+    let has_placeholder = words.iter().any(|word| is_placeholder(word));
+    let lacks_value = !is_whole && words.last().is_some_and(|word| word.starts_with('-'));
+    let is_fine = match error.kind() {
+        ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => true,
+        ErrorKind::InvalidSubcommand => matches!(
+            error.get(ContextKind::InvalidSubcommand),
+            Some(ContextValue::String(word)) if is_placeholder(word)
+        ),
+        ErrorKind::InvalidValue if lacks_value => true,
+        ErrorKind::InvalidValue | ErrorKind::ValueValidation => has_placeholder,
+        ErrorKind::MissingRequiredArgument
+        | ErrorKind::MissingSubcommand
+        | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => !is_whole,
+        _ => false,
+    };
+    if is_fine { Ok(()) } else { Err(error.to_string().lines().next().unwrap_or_default().to_owned()) }
+}
+
+fn is_placeholder(word: &str) -> bool {
+    word.len() > 1 && word.chars().all(|c| c.is_ascii_uppercase())
+}
+
+/// Looks for the command that words begin with, and for their flags there or in a command below it.
+fn check_flags(words: &[String]) -> Result<(), String> {
+    let program = sgc::command_line();
+    let mut command = &program;
+    for word in words.iter().skip(1).take_while(|word| is_command(word)) {
+        let Some(found) = command.find_subcommand(word) else {
+            // The name of a topic, a node or a file may stand here.
+            if command.has_subcommands() {
+                return Err(format!("{} has no command {word}", command.get_name()));
+            }
+            break;
+        };
+        command = found;
+    }
+    let flags = words.iter().filter(|word| word.starts_with("--"));
+    let missing =
+        flags.map(|flag| flag.split('=').next().unwrap_or(flag)).find(|flag| !has_flag(command, flag));
+    missing.map_or(Ok(()), |flag| Err(format!("{} has no {flag}", command.get_name())))
+}
+
+fn is_command(word: &str) -> bool {
+    !word.starts_with('-') && word.chars().all(|c| c.is_ascii_lowercase() || c == '-')
+}
+
+/// Returns `true` if a command, or one below it, has a flag.
+fn has_flag(command: &Command, flag: &str) -> bool {
+    let name = flag.trim_start_matches('-');
+    let is_own = command.get_arguments().any(|arg| {
+        arg.get_long() == Some(name) || arg.get_all_aliases().is_some_and(|all| all.contains(&name))
+    });
+    is_own || command.get_subcommands().any(|below| has_flag(below, flag))
+}
+
+/// A flag that is said to be one "of" a command is.
+fn check_flags_of_commands(document: &Document, report: &mut Report) {
+    for paragraph in document.paragraphs() {
+        let spans = paragraph.spans();
+        for (flag, command) in spans.iter().zip(spans.iter().skip(1)) {
+            let is_of = paragraph.text[flag.place.end..command.place.start].trim() == "of";
+            if is_of && flag.text.starts_with("--") && command.text.starts_with("sgc ") {
+                let flag_word = flag.text.split([' ', '=']).next().unwrap_or_default();
+                let words: Vec<_> =
+                    command.text.split_whitespace().chain([flag_word]).map(str::to_owned).collect();
+                let outcome = check_flags(&words);
+                report.check(&document.path, flag.line, outcome);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_wrong_command_line_is_found_in_each_form() {
+    let faults = |text: &str| {
+        let mut report = Report::default();
+        check(&Document::new("page.md", text), &mut report);
+        report.faults()
+    };
+    for right in [
+        "`sgc`, `sgc why`, `sgc fleet`, `sgc fleet revoke`, `sgc why --name HEX`, `sgc fleet … --at`, `sgc run --identity`, `sgc use …`",
+        "`sgc run --help`, `sgc COMMAND --help`, `/usr/bin/sgc why`, `--at NODE` of `sgc fleet revoke`, `sgc join v1`, `sgc audit --since TIME`",
+        "```sh\nlab$ sgc fleet create lab  # one\nsgc run --identity a.identity --router quic://a:1 \\\n  --use 'b:/**' > log\n```",
+        "```\nsgc nothing\nsgc: an error\n```\n\n```toml\n# sgc nothing\n```",
+    ] {
+        assert_eq!(faults(right), "", "{right}");
+    }
+    for (wrong, said) in [
+        ("`sgc fly`", "page.md:1: `sgc fly`: error: unrecognized subcommand 'fly'"),
+        ("`sgc fleet rewoke arm-1`", "unrecognized subcommand 'rewoke'"),
+        ("`sgc why /a --no-such`", "unexpected argument '--no-such'"),
+        ("`sgc status\nmore`", "unexpected argument 'more'"),
+        ("`sgc fleet … --fly`", "fleet has no --fly"),
+        ("`sgc flet … --at`", "sgc has no command flet"),
+        ("`--fly` of `sgc run`", "run has no --fly"),
+        (
+            "```sh\ncd x && sgc why\n```",
+            "page.md:2: `cd x && sgc why`: error: the following required arguments",
+        ),
+        ("```ini\nExecStart=/usr/bin/sgc fly\n```", "unrecognized subcommand 'fly'"),
+        ("```\n$ sgc fly\n```", "unrecognized subcommand 'fly'"),
+    ] {
+        assert!(faults(wrong).contains(said), "{wrong}: {}", faults(wrong));
+    }
+}

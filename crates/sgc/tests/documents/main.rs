@@ -1,0 +1,19 @@
+//! Documents cite what exists.
+//!
+//! Each module with a rule walks all Markdown files of the repository and compares what they cite with the code: paths and
+//! links ([`paths`]), tests and long names ([`test_names`]), keys of the configuration ([`configuration`]), counters
+//! ([`counters`]), command lines of `sgc` ([`commands`]), `make` and `cargo test` ([`build_commands`]). Placeholders, such
+//! as `…` and words in capitals, are passed over.
+
+#![allow(clippy::unwrap_used)]
+
+mod build_commands;
+mod commands;
+mod configuration;
+mod counters;
+mod markdown;
+mod paths;
+mod report;
+mod repository;
+mod shell;
+mod test_names;
