@@ -34,29 +34,29 @@ const CREDENTIAL_PART: usize = 4;
 /// Longest token that is looked at, bytes.
 const TOKEN_BYTES_MAX: usize = 32 << 10;
 
-/// Who is connected, for status.
+/// A client that is connected.
 #[derive(Clone, Debug, Serialize, PartialEq, Eq)]
 pub struct ClientStatus {
-    /// What it is called.
+    /// The name of the client: the label of its token, its node, or its address.
     pub name: String,
-    /// `"rosbridge"`, `"foxglove"` or `"grpc"`.
+    /// The protocol: `"rosbridge"`, `"foxglove"` or `"grpc"`.
     pub protocol: String,
-    /// Where it is.
+    /// The address of the client.
     pub address: String,
-    /// Since when, milliseconds since the Unix epoch.
+    /// The time of its connection, milliseconds since the Unix epoch.
     pub since: u64,
 }
 
-/// What goes on at the gateway, for status.
+/// The state of the gateway.
 #[derive(Clone, Debug, Default, Serialize, PartialEq, Eq)]
 pub struct GatewayStatus {
-    /// Where it listens.
+    /// The URLs that the gateway listens at.
     pub listen: Vec<String>,
-    /// Who is connected.
+    /// The clients that are connected.
     pub clients: Vec<ClientStatus>,
-    /// How many connections were refused, and why.
+    /// Counts of refused connections, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Readers on the local network, shared by all clients.
+    /// The number of readers on the local network, which all clients share.
     pub readers: usize,
 }
 

@@ -12,75 +12,76 @@ use crate::alerts::Alert;
 use crate::finding::RouterStatus;
 use crate::stats::NameStats;
 
-/// Everything.
+/// The status document.
 #[derive(Clone, Debug, Serialize)]
 pub struct Status {
     /// The node's name.
     pub node: String,
-    /// Version of the program.
+    /// The version of the program.
     pub version: String,
-    /// Seconds since it started.
+    /// Seconds since the node started.
     pub uptime_s: u64,
-    /// Links that are up.
+    /// The links that are up.
     pub links: Vec<LinkStatus>,
-    /// Routers that are looked for, how, and how that goes.
+    /// The routers that the node looks for, and the state of each search.
     pub routers: Vec<RouterStatus>,
-    /// Shares and uses, and where each stands.
+    /// Shares and uses, and the state of each.
     pub routes: Vec<RouteLine>,
     /// Alerts for an operator.
     pub alerts: Vec<Alert>,
-    /// What is wrong between local endpoints and the other side, with both values and the fix; gone when it is.
+    /// Contradictions between local endpoints and the other side, with both values and the fix. An entry lasts as long as its
+    /// contradiction.
     pub problems: Vec<String>,
-    /// Names that carry data through this node.
+    /// Names whose data passes this node.
     pub names: Vec<NameStatus>,
-    /// What was dropped or refused, by kind.
+    /// Counts of drops and refusals, by reason, and by reason and culprit.
     pub drops: BTreeMap<String, u64>,
-    /// Peers refused at the door, by kind.
+    /// Counts of refused links, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Times that the local network was opened again since this host's addresses changed.
+    /// The number of times that the node opened the local network again because this host's addresses changed.
     pub local_network_reopened: u64,
-    /// How much the router knows.
+    /// The size of the routing state.
     pub router: RouterLine,
-    /// Programs without ROS, if they may connect.
+    /// The gateway for programs without ROS; null without `[gateway]`.
     pub gateway: Option<GatewayStatus>,
 }
 
-/// A link.
+/// A link that is up.
 #[derive(Clone, Debug, Serialize)]
 pub struct LinkStatus {
-    /// Its number.
+    /// The number of the link, counted since the node started.
     pub id: u32,
-    /// Node id of the peer.
+    /// The node id of the peer.
     pub peer: String,
-    /// Until when the certificate that it showed holds, RFC 3339.
+    /// The end of the certificate that the peer showed, RFC 3339.
     pub peer_until: String,
-    /// Its address.
+    /// The address of the peer.
     pub remote: String,
-    /// The URL dialled, if this node dialled.
+    /// The URL that this node dialled; null if the peer dialled.
     pub url: Option<String>,
-    /// How its keys were agreed on, as TLS names it.
+    /// The key exchange, as TLS names it.
     pub kex: &'static str,
-    /// Smoothed round-trip time, microseconds.
+    /// The smoothed round-trip time, microseconds.
     pub rtt_us: u64,
-    /// What the link costs where ways are weighed, microseconds of round trip.
+    /// The cost of the link in routing, microseconds of round trip.
     pub cost: u32,
-    /// True while nothing comes over it although something should.
+    /// `true` while the peer does not answer.
     pub silent: bool,
-    /// After how long without anything from the peer it is asked whether it is there, milliseconds.
+    /// The time without a sign of life after which the node asks the peer for one, milliseconds.
     pub keep_alive_ms: u64,
-    /// Bytes sent.
+    /// Bytes sent over the link.
     pub sent_bytes: u64,
-    /// Bytes received.
+    /// Bytes received over the link.
     pub received_bytes: u64,
-    /// Connections beside it that carry one name each.
+    /// The number of connections beside the link that carry one name each.
     pub lanes: usize,
-    /// Names that this node sends packets of under labels.
+    /// The number of names for which this node sends labels.
     pub labels_sent: u32,
-    /// Names that the peer may send packets of under labels.
+    /// The number of names for which the peer may send labels.
     pub labels_received: u32,
-    /// Packets of the peer, over whichever link, that waited since it sends more than `peer_rate`.
+    /// Packets of the peer, over all its links, that waited because it exceeded `peer_rate`.
     pub peer_slowed: u64,
-    /// Those that were dropped for it.
+    /// Packets of the peer, over all its links, that were dropped because it exceeded `peer_rate`.
     pub peer_dropped: u64,
 }
 
@@ -89,23 +90,23 @@ pub struct LinkStatus {
 pub struct RouteLine {
     /// `"share"` or `"use"`.
     pub direction: &'static str,
-    /// ROS topic.
+    /// The name on the local ROS 2 network.
     pub topic: String,
-    /// ROS type, once known.
+    /// The ROS type; null until it is known.
     #[serde(rename = "type")]
     pub type_name: Option<String>,
-    /// Name, once known.
+    /// The 256-bit name; null until it is known.
     pub name: Option<String>,
-    /// Owner's node name.
+    /// The name of the owner's node.
     pub owner: String,
-    /// What it is doing, or waiting for.
+    /// The state, in words.
     pub state: String,
-    /// Messages published or delivered.
+    /// The number of messages that were published or delivered.
     pub messages: u64,
-    /// Signatures made for what its present publishers published; less than messages under load, since one covers a
-    /// batch. 0 in the `group` suites.
+    /// The number of signatures for messages of the present publishers. Under load it is smaller than `messages`, because
+    /// one signature covers a batch. 0 in the `group` suites.
     pub signatures: u64,
-    /// Of a topic that is compressed here: bytes of payload before, and after.
+    /// Bytes of payload before and after compression, of a topic that this node compresses.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub compressed: Option<(u64, u64)>,
 }
@@ -131,16 +132,16 @@ impl RouteLine {
     }
 }
 
-/// Traffic of a name.
+/// The traffic of a name at this node.
 #[derive(Clone, Debug, Serialize)]
 pub struct NameStatus {
-    /// The name.
+    /// The 256-bit name.
     pub name: String,
-    /// Packets taken in.
+    /// Packets that the node took in.
     pub packets: u64,
-    /// Bytes of their payloads.
+    /// Bytes of the payloads of these packets.
     pub bytes: u64,
-    /// Packets dropped.
+    /// Packets that the node dropped.
     pub dropped: u64,
 }
 
@@ -155,15 +156,15 @@ impl NameStatus {
     }
 }
 
-/// How much the router knows.
+/// The size of the routing state.
 #[derive(Clone, Debug, Serialize)]
 pub struct RouterLine {
-    /// Nodes that described their links.
+    /// Nodes whose link states are known.
     pub nodes: usize,
-    /// Names in any state.
+    /// All known names.
     pub names: usize,
-    /// Names with a route.
+    /// Names to whose owner a route leads.
     pub routed_names: usize,
-    /// Branches.
+    /// Branches of trees.
     pub branches: usize,
 }

@@ -11,24 +11,24 @@ use tokio::time::Instant;
 use super::{Aim, Passed};
 use crate::stats::Drops;
 
-/// A router that this node looks for, or looks for routers at.
+/// A router that the node looks for, or a place where it looks for routers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RouterStatus {
-    /// As the user wrote it: `quic://…`, `srv://…`, `mdns://…`.
+    /// The URL as the user wrote it: `quic://…`, `srv://…`, `mdns://…`.
     pub router: String,
-    /// `"static"`, `"token"`, `"srv"` or `"mdns"`.
+    /// The origin of the URL: `"static"`, `"token"`, `"srv"` or `"mdns"`.
     pub found_by: &'static str,
-    /// What is dialled, or was last.
+    /// The URL that the node dials, or dialled last.
     pub at: Option<String>,
-    /// What is going on: `"connecting"`, `"linked"`, `"trying again"`, `"standing back"`, `"looking up"`, `"looking"`.
+    /// The state of the search: `"connecting"`, `"linked"`, `"trying again"`, `"standing back"`, `"looking up"`, `"looking"`.
     pub state: &'static str,
-    /// Node id of the router that is linked.
+    /// The node id of the linked router.
     pub peer: Option<String>,
-    /// Failures in a row.
+    /// The number of failures in a row.
     pub failures: u32,
-    /// Why the link does not take the first of several ways, if it does not.
+    /// The reason why the link uses another URL than the first of several.
     pub why_not_first: Option<String>,
-    /// What went wrong last, if anything did.
+    /// The last failure.
     pub last_failure: Option<String>,
     /// Seconds until the next attempt.
     pub again_in_s: Option<u64>,
