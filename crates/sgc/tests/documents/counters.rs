@@ -1,14 +1,19 @@
 //! Counters that documents cite are in the table by which `sgc why` and `sgc status` explain them, every counter of the
 //! table is in a document, and the code counts under no other.
+//!
+//! `docs/reference/drop-reasons.md` is made of that table.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
 
 use sgc::COUNTERS;
 
+use crate::generated::{self, cell, wrapped};
 use crate::markdown::{Document, Paragraph, Span};
 use crate::report::Report;
 use crate::repository::{REPOSITORY, Repository};
 
+const PAGE: &str = "docs/reference/drop-reasons.md";
 const SPECIFICATION: &str = "spec/routing.md";
 /// Rows of the specification whose counters are in another table than the first, and which one.
 const PLACES: [(&str, usize); 3] = [("data path", 1), ("sink", 2), ("links refused", 3)];
@@ -28,12 +33,15 @@ fn every_cited_counter_exists_and_each_is_documented() {
     let mut cited = BTreeSet::new();
     for document in REPOSITORY.documents() {
         check(&document, &mut report);
-        let spans = document.paragraphs().into_iter().flat_map(|paragraph| paragraph.spans());
-        cited.extend(spans.map(|span| span.text));
+        if document.path != PAGE {
+            let spans = document.paragraphs().into_iter().flat_map(|paragraph| paragraph.spans());
+            cited.extend(spans.map(|span| span.text));
+        }
     }
     report.finish(150, "these counters are not among those that `sgc why` explains:");
+    // Reasons in words, of the gateway, stand in the generated page alone.
     let missing: Vec<_> = keys().into_iter().filter(|key| is_key(key) && !cited.contains(*key)).collect();
-    assert!(missing.is_empty(), "no document names these counters: {missing:?}");
+    assert!(missing.is_empty(), "no document but {PAGE} names these counters: {missing:?}");
 }
 
 #[test]
@@ -59,6 +67,11 @@ fn the_specification_lists_the_counters_of_each_place_and_no_others() {
         let keys = table.counters.iter().map(|counter| counter.key).filter(|key| is_key(key));
         assert_eq!(specified, keys.map(str::to_owned).collect(), "{}", table.title);
     }
+}
+
+#[test]
+fn the_page_of_drop_reasons_is_what_the_table_says() {
+    generated::check(PAGE, &page());
 }
 
 /// Returns the names of all counters.
@@ -149,6 +162,38 @@ fn counted_in(repository: &Repository) -> BTreeSet<String> {
         }
     }
     counted
+}
+
+/// Returns the page of all counters.
+fn page() -> String {
+    let mut page = generated::note("the counters' explanations");
+    page.push_str("# Drop reasons\n\n");
+    page.push_str(&wrapped(
+        "A node counts everything that it drops or refuses under one of these names. `sgc status` shows the counts with \
+         their meanings. Where one link or peer is the cause, a further row names it, such as `limit from link 3`.",
+        0,
+    ));
+    page.push('\n');
+    page.push_str(&wrapped(
+        "A counter in bold points at a fault, an attack or a task for an operator: `sgc why` names it whatever topic it is \
+         asked about. The other counters also grow where nothing is wrong.",
+        0,
+    ));
+    for table in &COUNTERS {
+        let _ = write!(
+            page,
+            "\n## {}\n\n{}\n| counter | meaning | remedy |\n|---|---|---|\n",
+            table.title,
+            wrapped(table.place, 0)
+        );
+        for counter in table.counters {
+            let mark = if counter.is_named { "**" } else { "" };
+            let fix = if counter.fix.is_empty() { "–" } else { counter.fix };
+            let _ =
+                writeln!(page, "| {mark}`{}`{mark} | {} | {} |", counter.key, cell(counter.means), cell(fix));
+        }
+    }
+    page
 }
 
 #[test]

@@ -120,4 +120,9 @@ impl Repository {
     pub(crate) fn has_ending(&self, ending: &str) -> bool {
         self.endings.contains(ending)
     }
+
+    /// Returns where a generated file is written.
+    pub(crate) fn at(&self, path: &str) -> PathBuf {
+        self.root.join(path)
+    }
 }
