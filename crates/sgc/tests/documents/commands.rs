@@ -3,6 +3,9 @@
 //! A line of a code block must be a whole command. A code span may leave arguments out: it may name no more than a command,
 //! and an `…` in it stands for anything.
 
+use std::collections::BTreeSet;
+use std::sync::LazyLock;
+
 use clap::Command;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 
@@ -14,6 +17,18 @@ use crate::shell;
 /// The last word of strings that keys are derived with and signatures are made over, such as "sgc join v1". They are no
 /// command lines.
 const OF_CRYPTOGRAPHY: &str = "v1";
+
+/// The flags that sources name, of whatever program.
+static FLAGS: LazyLock<BTreeSet<String>> = LazyLock::new(|| {
+    let mut flags = BTreeSet::new();
+    for path in REPOSITORY.sources() {
+        let text = REPOSITORY.read(path);
+        let names =
+            text.split("--").skip(1).map(|rest| rest.split(|c: char| !c.is_ascii_lowercase() && c != '-'));
+        flags.extend(names.filter_map(|mut name| Some(format!("--{}", name.next()?))));
+    }
+    flags
+});
 
 #[test]
 fn every_cited_command_line_parses() {
@@ -42,7 +57,7 @@ fn check(document: &Document, report: &mut Report) {
             );
         }
     }
-    check_flags_of_commands(document, report);
+    check_flags_alone(document, report);
 }
 
 /// Parses a command line as the program does.
@@ -67,13 +82,20 @@ fn parse(words: &[String], is_whole: bool) -> Result<(), String> {
     if is_fine { Ok(()) } else { Err(error.to_string().lines().next().unwrap_or_default().to_owned()) }
 }
 
+/// Returns the definition with the flags that every command has.
+fn program() -> Command {
+    let mut program = sgc::command_line();
+    program.build();
+    program
+}
+
 fn is_placeholder(word: &str) -> bool {
     word.len() > 1 && word.chars().all(|c| c.is_ascii_uppercase())
 }
 
 /// Looks for the command that words begin with, and for their flags there or in a command below it.
 fn check_flags(words: &[String]) -> Result<(), String> {
-    let program = sgc::command_line();
+    let program = program();
     let mut command = &program;
     for word in words.iter().skip(1).take_while(|word| is_command(word)) {
         let Some(found) = command.find_subcommand(word) else {
@@ -104,21 +126,31 @@ fn has_flag(command: &Command, flag: &str) -> bool {
     is_own || command.get_subcommands().any(|below| has_flag(below, flag))
 }
 
-/// A flag that is said to be one "of" a command is.
-fn check_flags_of_commands(document: &Document, report: &mut Report) {
+/// A flag that is said to be one "of" a command is, and a flag beside a command is known to some program here.
+fn check_flags_alone(document: &Document, report: &mut Report) {
     for paragraph in document.paragraphs() {
         let spans = paragraph.spans();
-        for (flag, command) in spans.iter().zip(spans.iter().skip(1)) {
-            let is_of = paragraph.text[flag.place.end..command.place.start].trim() == "of";
-            if is_of && flag.text.starts_with("--") && command.text.starts_with("sgc ") {
-                let flag_word = flag.text.split([' ', '=']).next().unwrap_or_default();
-                let words: Vec<_> =
-                    command.text.split_whitespace().chain([flag_word]).map(str::to_owned).collect();
-                let outcome = check_flags(&words);
-                report.check(&document.path, flag.line, outcome);
-            }
+        let is_beside = spans.iter().any(|span| span.text.starts_with("sgc "));
+        for (at, flag) in spans.iter().enumerate().filter(|(_, span)| is_beside && is_flag(&span.text)) {
+            let name = flag.text.split([' ', '=']).next().unwrap_or_default();
+            let next = spans.get(at + 1).filter(|next| next.text.starts_with("sgc "));
+            let of = next.filter(|next| paragraph.text[flag.place.end..next.place.start].trim() == "of");
+            let outcome = match of {
+                Some(command) => {
+                    let words = command.text.split_whitespace().chain([name]).map(str::to_owned);
+                    check_flags(&words.collect::<Vec<_>>())
+                }
+                None if has_flag(&program(), name) || FLAGS.contains(name) => Ok(()),
+                None => Err(format!("no command has {name}")),
+            };
+            report.check(&document.path, flag.line, outcome);
         }
     }
+}
+
+/// Returns `true` for a flag by its long name.
+fn is_flag(text: &str) -> bool {
+    text.strip_prefix("--").is_some_and(|name| name.starts_with(|c: char| c.is_ascii_lowercase()))
 }
 
 #[test]
@@ -130,7 +162,7 @@ fn a_wrong_command_line_is_found_in_each_form() {
     };
     for right in [
         "`sgc`, `sgc why`, `sgc fleet`, `sgc fleet revoke`, `sgc why --name HEX`, `sgc fleet … --at`, `sgc run --identity`, `sgc use …`",
-        "`sgc run --help`, `sgc COMMAND --help`, `/usr/bin/sgc why`, `--at NODE` of `sgc fleet revoke`, `sgc join v1`, `sgc audit --since TIME`",
+        "`sgc run --help`, `sgc COMMAND --help`, `/usr/bin/sgc why`, `--at NODE` of `sgc fleet revoke`, `sgc fleet … --allow-core-dumps`, `--force`, `--nocapture`, `sgc join v1`, `sgc audit --since TIME`",
         "```sh\nlab$ sgc fleet create lab  # one\nsgc run --identity a.identity --router quic://a:1 \\\n  --use 'b:/**' > log\n```",
         "```\nsgc nothing\nsgc: an error\n```\n\n```toml\n# sgc nothing\n```",
     ] {

@@ -2,9 +2,9 @@
 //!
 //! Each module with a rule walks all Markdown files of the repository and compares what they cite with the code: paths and
 //! links ([`paths`]), tests and long names ([`test_names`]), keys of the configuration ([`configuration`]), counters
-//! ([`counters`]), command lines of `sgc` ([`commands`]), `make` and `cargo test` ([`build_commands`]). Placeholders, such
-//! as `…` and words in capitals, are passed over. Three reference pages are made of the code and compared with what is
-//! committed ([`generated`]).
+//! ([`counters`]), command lines of `sgc` ([`commands`]), `make` and `cargo test` ([`build_commands`]), pages of the book
+//! ([`summary`]). Placeholders, such as `…` and words in capitals, are passed over. Three reference pages are made of the
+//! code and compared with what is committed ([`generated`]).
 
 #![allow(clippy::unwrap_used)]
 
@@ -20,4 +20,5 @@ mod report;
 mod repository;
 mod shell;
 mod status_page;
+mod summary;
 mod test_names;

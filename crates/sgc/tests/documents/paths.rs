@@ -1,4 +1,4 @@
-//! Links lead to files and headings, and paths in code spans to files and folders.
+//! Links lead to files and headings, and paths in code spans to files and folders. Documents that the code cites exist, too.
 //!
 //! A path may be cited without its first folders, as `router.rs` or `sgc-router/src/router.rs`. Files of users, such as
 //! `node.toml`, are not looked for.
@@ -36,6 +36,15 @@ fn every_cited_path_exists() {
     report.finish(100, &advice);
 }
 
+#[test]
+fn every_document_that_the_code_cites_exists() {
+    let mut report = Report::default();
+    for path in REPOSITORY.sources() {
+        check_source(&REPOSITORY, path, &REPOSITORY.read(path), &mut report);
+    }
+    report.finish(30, "the code cites documents that do not exist:");
+}
+
 fn check_links(repository: &Repository, document: &Document, report: &mut Report) {
     for link in document.links() {
         let (file, heading) =
@@ -43,16 +52,44 @@ fn check_links(repository: &Repository, document: &Document, report: &mut Report
         let path = if file.is_empty() { Some(document.path.clone()) } else { resolve(&document.path, file) };
         let fault = match path.filter(|path| *path == document.path || repository.has(path)) {
             None => Some(format!("{} leads nowhere", link.target)),
-            Some(path) => heading.filter(|_| path.ends_with(".md")).and_then(|heading| {
-                let anchors = match path == document.path {
-                    true => document.anchors(),
-                    false => Document::new(&path, &repository.read(&path)).anchors(),
-                };
-                let is_there = anchors.iter().any(|anchor| anchor == heading);
-                (!is_there).then(|| format!("{path} has no heading #{heading}"))
-            }),
+            Some(path) if path == document.path => heading.and_then(|heading| fault_of(document, heading)),
+            Some(path) => heading.and_then(|heading| fault_of(&page(repository, &path), heading)),
         };
         report.check(&document.path, link.line, fault.map_or(Ok(()), Err));
+    }
+}
+
+fn page(repository: &Repository, path: &str) -> Document {
+    Document::new(path, &repository.read(path))
+}
+
+/// Returns the fault of a citation of a heading that a page does not have. Other files have no headings.
+fn fault_of(page: &Document, heading: &str) -> Option<String> {
+    let is_there = !page.path.ends_with(".md") || page.anchors().iter().any(|anchor| anchor == heading);
+    (!is_there).then(|| format!("{} has no heading #{heading}", page.path))
+}
+
+/// Looks for the pages below `docs/` that a source names.
+fn check_source(repository: &Repository, path: &str, text: &str, report: &mut Report) {
+    for (at, line) in text.lines().enumerate() {
+        for (place, _) in line.match_indices("docs/") {
+            let end = |text: &str, more: &str| {
+                text.find(|c: char| !c.is_ascii_alphanumeric() && !more.contains(c)).unwrap_or(text.len())
+            };
+            let cited = &line[place..][..end(&line[place..], "/_.-")];
+            let Some(cited) =
+                cited.trim_end_matches('.').strip_suffix(".md").map(|name| format!("{name}.md"))
+            else {
+                continue;
+            };
+            let heading = line[place + cited.len()..].strip_prefix('#');
+            let heading = heading.map(|text| &text[..end(text, "_-")]);
+            let fault = match repository.has(&cited) {
+                true => heading.and_then(|heading| fault_of(&page(repository, &cited), heading)),
+                false => Some(format!("there is no {cited}")),
+            };
+            report.check(path, at + 1, fault.map_or(Ok(()), Err));
+        }
     }
 }
 
@@ -141,6 +178,18 @@ fn a_wrong_link_is_found() {
         report.faults(),
         "docs/page.md:2: spec/nothing.md leads nowhere; docs/page.md:2: docs/page.md has no heading #none; \
          docs/page.md:3: ../../outside.md leads nowhere; docs/page.md:3: docs/spec/wire.md has no heading #none"
+    );
+}
+
+#[test]
+fn a_wrong_document_in_the_code_is_found() {
+    let source = "//! See `docs/spec/wire.md`, docs/spec/wire.md#labels.\nconst A: &str = \"../../docs/gone.md\";\n\
+                  // (docs/spec/wire.md#gone), docs/NAME, mydocs/\n";
+    let mut report = Report::default();
+    check_source(&own(), "x.rs", source, &mut report);
+    assert_eq!(
+        report.faults(),
+        "x.rs:2: there is no docs/gone.md; x.rs:3: docs/spec/wire.md has no heading #gone"
     );
 }
 

@@ -16,6 +16,12 @@ const CHANGES: &str = "CHANGELOG.md";
 /// A decision stands as it was taken. Only its links are checked.
 const DECISIONS: &str = "docs/adr/";
 
+/// Endings of files with code.
+const SOURCES: [&str; 11] =
+    [".rs", ".py", ".sh", ".js", ".proto", ".c", ".cpp", ".hpp", ".toml", ".txt", "Makefile"];
+/// The rules' own tests, which cite what does not exist.
+const OWN: &str = "crates/sgc/tests/documents/";
+
 /// This repository, walked once.
 pub(crate) static REPOSITORY: LazyLock<Repository> =
     LazyLock::new(|| Repository::walk(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")));
@@ -72,6 +78,12 @@ impl Repository {
     pub(crate) fn documents(&self) -> Vec<Document> {
         let is_checked = |path: &&String| *path != CHANGES && !path.starts_with(DECISIONS);
         self.pages().filter(is_checked).map(|path| self.document(path)).collect()
+    }
+
+    /// Returns the paths of all files with code.
+    pub(crate) fn sources(&self) -> impl Iterator<Item = &str> {
+        let is_source = |path: &&str| SOURCES.iter().any(|end| path.ends_with(end)) && !path.starts_with(OWN);
+        self.files().filter(is_source)
     }
 
     /// Returns the documents whose links are checked.

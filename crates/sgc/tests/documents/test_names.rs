@@ -2,7 +2,8 @@
 //!
 //! A test is cited as `NAME: test`, where NAME is in a table of names that a document has, the name of one file, or a
 //! path below `crates/`;
-//! further tests of the same file follow without NAME, and `…end` stands for a test whose name ends so. In tables whose
+//! further tests of the same file follow without NAME, and `…end` stands for a test whose name ends so, and
+//! `module::` for all tests of a module. In tables whose
 //! last column is headed "shown by" each code span of that column must be a citation.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -19,18 +20,10 @@ const SHOWN_BY: &str = "shown by";
 const NAMES_HEAD: &str = "| name | file |";
 /// A name of so many words is one of a test, or of something else in the code.
 const WORDS_MIN: usize = 4;
-/// Endings of files with code.
-const SOURCES: [&str; 11] =
-    [".rs", ".py", ".sh", ".js", ".proto", ".c", ".cpp", ".hpp", ".toml", ".txt", "Makefile"];
-
-/// The rules' own tests, which cite names that do not exist.
-const HERE: &str = "crates/sgc/tests/documents/";
-
 /// The names in the code that have several words.
 static NAMES: LazyLock<BTreeSet<String>> = LazyLock::new(|| {
-    let is_source = |path: &&str| SOURCES.iter().any(|end| path.ends_with(end)) && !path.starts_with(HERE);
     let mut names = BTreeSet::new();
-    for path in REPOSITORY.files().filter(is_source) {
+    for path in REPOSITORY.sources() {
         names.extend(words(&REPOSITORY.read(path)).filter(|word| word.contains('_')).map(str::to_owned));
     }
     names
@@ -142,6 +135,13 @@ impl<'r> Citations<'r> {
                 self.report.check(&document.path, span.line, outcome);
                 continue;
             }
+            if let Some(module) = span.text.strip_suffix("::").filter(|module| is_snake(module)) {
+                let is_there =
+                    self.repository.has_ending(&format!("{module}.rs")) || self.repository.has_ending(module);
+                let fault = (!is_there && !cites_others).then(|| format!("no file is a module {module}"));
+                self.report.check(&document.path, span.line, fault.map_or(Ok(()), Err));
+                continue;
+            }
             let name = span.text.split(['=', '(', ' ']).next().unwrap_or_default();
             let end = name.trim_start_matches('…');
             if is_checked(end) && (span.text.len() == name.len() || end.starts_with("SGC_")) {
@@ -249,7 +249,7 @@ fn likeness(a: &str, b: &str) -> usize {
 
 #[test]
 fn a_wrong_citation_is_found_in_each_form() {
-    let source = "#[test]\nfn one_is_refused() {}\n#[tokio::test(flavor = \"multi_thread\")]\n\
+    let source = "#[test]\n#[ignore = \"slow\"]\nfn one_is_refused() {}\n#[tokio::test(flavor = \"multi_thread\")]\n\
                   async fn two_is_refused() {}\nfn no_test() {}\n\
                   each!(\n    three_is_refused\n);\nasync fn three_is_refused(scheme: &str) {}\n";
     let repository = Repository::make(&[
@@ -275,7 +275,7 @@ fn a_wrong_citation_is_found_in_each_form() {
         "no test",
         "–",
         "|\n\n`SGC_GENERATE=1 x`, `…_bit_of_a_list_is_accepted`, `no_flipped_bit_of_a_list_is_accepted`, `SGC_…`",
-        "|\n\n`frame: base_link`, `/a/b_c_d_e`, `A_B_MAX…`",
+        "|\n\n`frame: base_link`, `empty::`, `a::`, `/a/b_c_d_e`, `A_B_MAX…`",
     ] {
         assert_eq!(faults(right), "", "{right}");
     }
@@ -291,6 +291,7 @@ fn a_wrong_citation_is_found_in_each_form() {
         ("|\n\nIn a text: `x: no_such_test`.", "page.md:10: `x` has no test no_such_test"),
         ("|\n\nIn a text: `z: no_such_test_at_all`.", "page.md:10: `z` stands for no file"),
         ("|\n\nThe test `a_name_that_no_test_`\n`has` and `SGC_NO_SUCH=1 x`", "named SGC_NO_SUCH"),
+        ("|\n\n`no_module::`", "no file is a module no_module"),
         ("|\n\n`a_name_that_no_source_has`", "nothing in the code is named a_name_that_no_source_has"),
         ("|\n\n`NOTHING_LIKE_IT_MAX`", "nothing in the code is named NOTHING_LIKE_IT_MAX"),
     ] {
