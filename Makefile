@@ -5,13 +5,16 @@ CARGO ?= cargo
 ARGS ?=
 # What release builds have. Tests have it, too, so that Cyclone DDS is built once.
 FEATURES := --features sgc/sros2
+# Suites of tests with programs that are not ours (`test = false` in their Cargo.toml), and those with some such tests, which are ignored.
+INTEROP := $(addprefix --test ,browser fidelity gateway gateway_soak graph looking peers ring ros2 transports vendors)
+CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 
 .PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
-	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit (ARGS goes to cargo test), docs, deny'
+	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       book (the documents as a book, target/book/index.html; builds mdbook once)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
@@ -44,6 +47,7 @@ test: deps-test
 	$(MAKE) clippy
 	$(MAKE) peers-check
 	$(MAKE) unit
+	$(MAKE) interop
 	$(MAKE) docs
 
 deps-build:
@@ -72,10 +76,16 @@ fmt:
 
 clippy:
 	$(CARGO) clippy --workspace --all-targets $(FEATURES) --locked -- -D warnings
+	$(CARGO) clippy --workspace $(INTEROP) $(FEATURES) --locked -- -D warnings
 
-# Includes the tests against the peers, so they must have been built.
-unit: peers
+# Needs nothing but what the build needs. `cargo test` runs the same without SROS2.
+unit:
 	$(CARGO) test --workspace $(FEATURES) --locked $(ARGS)
+
+# The tests with programs that are not ours: ROS 2, other DDS vendors, clients of the gateway, Chromium.
+interop: peers
+	$(CARGO) test --workspace $(CLIENTS) $(FEATURES) --locked -- --ignored
+	$(CARGO) test --workspace $(INTEROP) $(FEATURES) --locked $(ARGS)
 
 docs:
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked

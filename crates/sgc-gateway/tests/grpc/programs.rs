@@ -137,6 +137,7 @@ async fn wheel(dir: &Path) -> PathBuf {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn python_does_all_that_there_is() {
     let scene = Scene::new().await;
     let dir = tempfile::tempdir().unwrap();
@@ -153,6 +154,7 @@ async fn python_does_all_that_there_is() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn node_needs_nothing_but_the_proto() {
     let scene = Scene::new().await;
     let mut node = Command::new("node");
@@ -163,6 +165,7 @@ async fn node_needs_nothing_but_the_proto() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn python_comes_over_tls_with_the_certificate_of_a_node_or_a_token() {
     let scene = Scene::new().await;
     let dir = tempfile::tempdir().unwrap();

@@ -146,6 +146,7 @@ fn repository(file: &str) -> PathBuf {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn roslib_of_npm_does_all_that_it_can() {
     let scene = Scene::new().await;
     let url = format!("ws://127.0.0.1:{}/", scene.port);
@@ -162,11 +163,13 @@ async fn roslibpy(transport: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn roslibpy_does_all_that_it_can() {
     roslibpy("twisted").await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn roslibpy_does_so_by_its_other_transport_too() {
     roslibpy("asyncio").await;
 }
@@ -194,11 +197,13 @@ async fn own_tests_of_roslibpy(transport: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn roslibpy_passes_its_own_tests() {
     own_tests_of_roslibpy("twisted").await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
 async fn roslibpy_passes_them_by_its_other_transport_too() {
     own_tests_of_roslibpy("asyncio").await;
 }
