@@ -15,7 +15,8 @@ help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), docs, deny'
-	@echo 'not in it:       book (the documents as a book, target/book/index.html; builds mdbook once)'
+	@echo 'not in it:       msrv (checks with the oldest Rust that is supported), minimal (checks without optional features)'
+	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
 	@echo '                 churn (200 restarts at random; SGC_CHURN_SEED, SGC_CHURN_STEPS), stall (ten minutes of images to who stands still)'
@@ -86,6 +87,19 @@ unit:
 interop: peers
 	$(CARGO) test --workspace $(CLIENTS) $(FEATURES) --locked -- --ignored
 	$(CARGO) test --workspace $(INTEROP) $(FEATURES) --locked $(ARGS)
+
+# The oldest Rust that Cargo.toml promises, which rustup must have.
+MSRV = $(shell sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)
+
+print-msrv:
+	@echo $(MSRV)
+
+msrv:
+	$(CARGO) +$(MSRV) check --workspace $(FEATURES) --locked
+
+# The program without its optional features.
+minimal:
+	$(CARGO) check -p sgc --no-default-features --locked
 
 docs:
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked
