@@ -11,7 +11,7 @@ use crate::definition::{DUMMY_MEMBER, Primitive, Shape};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound, fits_one_more, short};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{Number, fit, little};
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// `uint8`, as a typed array.
 const TAG_OCTETS: u64 = 64;
@@ -51,7 +51,7 @@ impl Value {
                 let bytes: Vec<u8> = units.iter().flat_map(|unit| unit.to_le_bytes()).collect();
                 write_bytes(out, &bytes);
             }
-            Self::Packed(packed) => match tag_of(packed.primitive()) {
+            Self::PackedArray(packed) => match tag_of(packed.primitive()) {
                 Some(tag) => {
                     head(out, Header::Tag(tag));
                     write_bytes(out, packed.octets());
@@ -109,7 +109,7 @@ fn tag_of(primitive: Primitive) -> Option<u64> {
 }
 
 /// What a typed array of a tag has in it, and whether the least byte comes first.
-fn of_tag(tag: u64) -> Option<(Primitive, bool)> {
+fn from_tag(tag: u64) -> Option<(Primitive, bool)> {
     Some(match tag {
         // 68 is for graphics: what is out of range is the next that is not.
         TAG_OCTETS | 68 => (Primitive::Uint8, true),
@@ -272,7 +272,7 @@ impl Reader<'_> {
             }
             (Header::Tag(tag), Some(primitive)) => {
                 let no_tag = || is_no(Header::Tag(tag), "an array");
-                let source = of_tag(tag).ok_or_else(no_tag)?;
+                let source = from_tag(tag).ok_or_else(no_tag)?;
                 let length = match self.header()? {
                     Header::Bytes(length) => length,
                     other => return Err(is_no(other, "the bytes of a typed array").into()),
@@ -363,14 +363,14 @@ impl Reader<'_> {
                     other => return Err(is_no(other, "string").into()),
                 };
                 fits_bound(bound, bytes.len())?;
-                match (first, Value::of_bytes(bytes)) {
+                match (first, Value::from_bytes(bytes)) {
                     (Header::Text(_), Value::Raw(_)) => return Err(no_utf8().into()),
                     (_, value) => value,
                 }
             }
             Element::WString { bound } => {
                 let units: Vec<u16> = match first {
-                    Header::Text(length) => match Value::of_bytes(self.content(length, true)?) {
+                    Header::Text(length) => match Value::from_bytes(self.content(length, true)?) {
                         Value::Text(text) => {
                             fits_bound(bound, text.encode_utf16().count())?;
                             return Ok(Value::Text(text));
@@ -387,7 +387,7 @@ impl Reader<'_> {
                     other => return Err(is_no(other, "wstring").into()),
                 };
                 fits_bound(bound, units.len())?;
-                Value::of_units(units)
+                Value::from_units(units)
             }
             Element::Struct(_) => Value::Record(Vec::new()),
         })
@@ -414,7 +414,7 @@ impl Reader<'_> {
 
 /// Elements of an array or a sequence of primitives. They fit: what they are was looked at.
 fn packed(primitive: Primitive, octets: Bytes) -> Value {
-    Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed)
+    PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
 }
 
 fn ended() -> ValueProblem {
@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn what_rosbridge_writes_is_written() {
+    fn cbor_is_written_as_rosbridge_writes_it() {
         let json = r#"{"o": "AQI=", "f": [1.5], "i": [-2], "b": [true], "t": {"a": 1}, "s": "x", "n": -1, "d": 0.1}"#;
         let layout =
             layout("uint8[] o\nfloat32[] f\nint16[] i\nbool[] b\nTwo t\nstring s\nint64 n\nfloat64 d");
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn what_clients_write_is_understood() {
+    fn cbor_of_clients_is_understood() {
         for (text, item, found) in [
             ("int64 a", &b"\x3b\x7f\xff\xff\xff\xff\xff\xff\xff"[..], r#"{"a":-9223372036854775808}"#),
             ("uint64 a", b"\x1b\xff\xff\xff\xff\xff\xff\xff\xff", r#"{"a":18446744073709551615}"#),

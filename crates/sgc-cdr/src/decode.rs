@@ -6,7 +6,7 @@ use crate::definition::{Primitive, Shape};
 use crate::encoding::{ENCAPSULATION_BYTES, Encoding, PADDING_BYTES_MAX, Padding, WideUnit};
 use crate::layout::{Element, Layout, Member};
 use crate::path;
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// Most values in one message; an array or a sequence of primitives is one.
 pub const VALUES_MAX: usize = 4 << 20;
@@ -101,7 +101,7 @@ impl Layout {
             return Err(short);
         };
         let id = u16::from_be_bytes([head[0], head[1]]);
-        let plain = Encoding::of(id).ok_or(DecodeError::Representation { id })?;
+        let plain = Encoding::from_id(id).ok_or(DecodeError::Representation { id })?;
         let said = head[3] & PADDING_BYTES_MAX as u8 != 0;
         let body = payload.slice_ref(body);
         let decode = |wide| -> Result<_, DecodeError> {
@@ -255,8 +255,8 @@ impl Decoder<'_> {
             turned.chunks_exact_mut(size).for_each(<[u8]>::reverse);
             octets = turned.into();
         }
-        if let Some(packed) = Packed::new(primitive, octets.clone()) {
-            return Ok(Value::Packed(packed));
+        if let Some(packed) = PackedArray::new(primitive, octets.clone()) {
+            return Ok(Value::PackedArray(packed));
         }
         // Whole they are: it is a `bool` that is none.
         let wrong = octets.iter().enumerate().find(|(_, octet)| **octet > 1);
@@ -297,7 +297,7 @@ impl Decoder<'_> {
             text.truncate(text.len() - 1);
         }
         within(text.len(), bound)?;
-        Ok(Value::of_bytes(text))
+        Ok(Value::from_bytes(text))
     }
 
     fn wide_string(&mut self, bound: Option<u32>) -> Result<Value, Stop> {
@@ -319,7 +319,7 @@ impl Decoder<'_> {
             text.pop();
         }
         within(text.len(), bound)?;
-        Ok(Value::of_units(text))
+        Ok(Value::from_units(text))
     }
 
     fn length(&mut self) -> Result<u32, Stop> {
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn what_says_its_size_may_be_older_or_newer() {
+    fn sized_structures_may_be_older_or_newer() {
         // DHEADER 4: `a` and `b` of the struct; then what an older publisher does not have.
         let older = b"\0\x09\0\0\x08\0\0\0\x04\0\0\0\x01\0\x02\0";
         assert_eq!(decode("Two x\nuint8 added", older).unwrap(), r#"{"x":{"a":1,"b":2}}"#);
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_said() {
+    fn values_that_do_not_fit_are_reported() {
         let member = || "a".to_owned();
         for (text, payload, error) in [
             ("uint8 a", &b"\0\x01"[..], DecodeError::TooShort { bytes: 2 }),

@@ -8,7 +8,7 @@ use crate::definition::{Base, FieldType, Primitive, Shape};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{Number, little};
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// A default of a definition.
 #[derive(Clone, Debug)]
@@ -62,7 +62,9 @@ impl Layout {
             let bytes = count.checked_mul(primitive.bytes()).ok_or(ValueProblem::TooLarge)?;
             budget.bytes(bytes)?;
             let octets = Bytes::from(vec![0; bytes]);
-            return Ok(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed));
+            return Ok(
+                PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
+            );
         }
         (0..count).map(|_| self.zero_element(member, budget)).collect::<Result<_, _>>().map(Value::List)
     }
@@ -92,7 +94,7 @@ fn content_bytes(value: &Value) -> usize {
     match value {
         Value::Text(text) => text.len(),
         Value::Octets(octets) => octets.len(),
-        Value::Packed(packed) => packed.octets().len(),
+        Value::PackedArray(packed) => packed.octets().len(),
         Value::List(all) => all.iter().map(|value| size_of::<Value>() + content_bytes(value)).sum(),
         _ => 0,
     }
@@ -113,7 +115,7 @@ fn literal(field_type: &FieldType, text: &str) -> Option<Value> {
     let Base::Primitive(primitive) = field_type.base else { return Some(Value::List(all)) };
     let octets: Bytes =
         all.iter().flat_map(|value| little(value).into_iter().take(primitive.bytes())).collect();
-    Some(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed))
+    Some(PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray))
 }
 
 /// What is between commas, but for those in quotes.

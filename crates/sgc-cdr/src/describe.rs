@@ -210,7 +210,7 @@ fn field_type(value: &Value) -> Result<FieldType, DescriptionError> {
         18 => Base::WString { bound: None },
         21 if string_capacity > 0 => Base::String { bound: Some(string_capacity) },
         22 if string_capacity > 0 => Base::WString { bound: Some(string_capacity) },
-        _ => Base::Primitive(Primitive::of_id(id).ok_or_else(no_id)?),
+        _ => Base::Primitive(Primitive::from_id(id).ok_or_else(no_id)?),
     };
     Ok(FieldType { base, shape })
 }
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_description_is_said() {
+    fn malformed_descriptions_are_reported() {
         let hash = layout("p/msg/M", "int8 a").type_hash();
         let of = |json: &str| {
             let bytes = description().unwrap().from_json(json.as_bytes()).unwrap();

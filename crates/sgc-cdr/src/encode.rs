@@ -7,7 +7,7 @@ use crate::encoding::{ENCAPSULATION_BYTES, Encoding, Padding};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{fit, little};
-use crate::value::{Packed, Value};
+use crate::value::{PackedArray, Value};
 
 impl Layout {
     /// Serialises a message as ROS 2 does today: CDR of version 1, little endian, with its encapsulation header.
@@ -91,7 +91,7 @@ impl Encoder<'_> {
         let count = match value {
             Value::List(all) => all.len(),
             Value::Octets(octets) => octets.len(),
-            Value::Packed(packed) => packed.len(),
+            Value::PackedArray(packed) => packed.len(),
             _ => return Err(is_no(value, "a sequence").into()),
         };
         fits(member.shape, count)?;
@@ -104,7 +104,9 @@ impl Encoder<'_> {
             (Element::Primitive(Primitive::Byte | Primitive::Uint8), Value::Octets(octets)) => {
                 self.out.extend_from_slice(octets);
             }
-            (Element::Primitive(primitive), Value::Packed(packed)) if packed.primitive() == primitive => {
+            (Element::Primitive(primitive), Value::PackedArray(packed))
+                if packed.primitive() == primitive =>
+            {
                 self.packed(packed);
             }
             (_, Value::List(all)) => {
@@ -112,7 +114,7 @@ impl Encoder<'_> {
                     self.element(member, value).map_err(|error| error.at(index))?;
                 }
             }
-            (_, Value::Packed(packed)) => {
+            (_, Value::PackedArray(packed)) => {
                 for (index, value) in packed.iter().enumerate() {
                     self.element(member, &value).map_err(|error| error.at(index))?;
                 }
@@ -129,7 +131,7 @@ impl Encoder<'_> {
         self.end_sized(size)
     }
 
-    fn packed(&mut self, packed: &Packed) {
+    fn packed(&mut self, packed: &PackedArray) {
         if packed.is_empty() {
             return;
         }
@@ -259,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_decoded_is_encoded_as_it_was() {
+    fn decoded_messages_encode_to_the_same_bytes() {
         let text = "uint8 a\nuint64 b\nstring c\nuint16[] d";
         let nested = "Two[] x\nstring[] y\nwstring z";
         for (text, payload) in [

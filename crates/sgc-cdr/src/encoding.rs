@@ -64,7 +64,7 @@ pub enum Padding {
 
 impl Encoding {
     /// By the id of a representation; `None` for those that ROS 2 does not use.
-    pub(crate) fn of(id: u16) -> Option<Self> {
+    pub(crate) fn from_id(id: u16) -> Option<Self> {
         let version = match id {
             0x0000 | 0x0001 => CdrVersion::One,
             0x0006 | 0x0007 => CdrVersion::Two,

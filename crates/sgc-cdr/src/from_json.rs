@@ -18,7 +18,7 @@ use crate::json::ESCAPED_BYTE;
 use crate::layout::{Element, Layout, Member, Struct};
 use crate::number::{Number, little};
 use crate::path;
-use crate::value::{Packed, Value};
+use crate::value::{PackedArray, Value};
 
 /// Base64 with or without the signs that fill it up.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
@@ -126,7 +126,7 @@ impl<'de> Visitor<'de> for Record<'_, '_> {
             if given.is_some() {
                 return Err(reader.fail(ValueProblem::Twice(member.name.to_string())));
             }
-            let value = map.next_value_seed(OfMember { reader, member });
+            let value = map.next_value_seed(MemberSeed { reader, member });
             *given = Some(reader.under(&member.name, value)?);
             next = index + 1;
         }
@@ -184,18 +184,18 @@ impl Visitor<'_> for Key<'_, '_> {
 
 /// A member: one element, or all of them.
 #[derive(Clone, Copy)]
-struct OfMember<'r, 'a> {
+struct MemberSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     member: &'a Member,
 }
 
-impl<'de> DeserializeSeed<'de> for OfMember<'_, '_> {
+impl<'de> DeserializeSeed<'de> for MemberSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
         let Self { reader, member } = self;
         if member.shape == Shape::One {
-            return OfElement { reader, member }.deserialize(deserializer);
+            return ElementSeed { reader, member }.deserialize(deserializer);
         }
         reader.value()?;
         match member.element {
@@ -205,7 +205,7 @@ impl<'de> DeserializeSeed<'de> for OfMember<'_, '_> {
     }
 }
 
-impl<'de> Visitor<'de> for OfMember<'_, '_> {
+impl<'de> Visitor<'de> for MemberSeed<'_, '_> {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -227,13 +227,13 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<Value, A::Error> {
         let Self { reader, member } = self;
-        let element = OfElement { reader, member };
+        let element = ElementSeed { reader, member };
         let mut count = 0;
         if let Element::Primitive(primitive) = member.element {
             let size = primitive.bytes();
             let mut octets = Vec::new();
             while let Some(value) =
-                reader.at(count, all.next_element_seed(OfPrimitive { reader, primitive }))?
+                reader.at(count, all.next_element_seed(PrimitiveSeed { reader, primitive }))?
             {
                 reader.check(fits_one_more(member.shape, count))?;
                 reader.bytes(size)?;
@@ -242,7 +242,9 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
             }
             reader.check(fits(member.shape, count))?;
             let octets = Bytes::from(octets);
-            return Ok(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed));
+            return Ok(
+                PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
+            );
         }
         let mut values = Vec::with_capacity(all.size_hint().unwrap_or(0).min(RESERVE_MAX));
         while let Some(value) = reader.at(count, all.next_element_seed(element))? {
@@ -257,12 +259,12 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
 
 /// One element.
 #[derive(Clone, Copy)]
-struct OfElement<'r, 'a> {
+struct ElementSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     member: &'a Member,
 }
 
-impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
+impl<'de> DeserializeSeed<'de> for ElementSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
@@ -271,7 +273,7 @@ impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
             Element::Struct(place) => Record { reader, place }.deserialize(deserializer),
             Element::Primitive(primitive) => {
                 reader.value()?;
-                OfPrimitive { reader, primitive }.deserialize(deserializer)
+                PrimitiveSeed { reader, primitive }.deserialize(deserializer)
             }
             Element::String { bound } => Text { reader, bound, wide: false }.deserialize(deserializer),
             Element::WString { bound } => Text { reader, bound, wide: true }.deserialize(deserializer),
@@ -281,18 +283,18 @@ impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
 
 /// A primitive, as a value that fits it.
 #[derive(Clone, Copy)]
-struct OfPrimitive<'r, 'a> {
+struct PrimitiveSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     primitive: Primitive,
 }
 
-impl OfPrimitive<'_, '_> {
+impl PrimitiveSeed<'_, '_> {
     fn number<E: Error>(self, number: Number) -> Result<Value, E> {
         self.reader.check(number.fit(self.primitive))
     }
 }
 
-impl<'de> DeserializeSeed<'de> for OfPrimitive<'_, '_> {
+impl<'de> DeserializeSeed<'de> for PrimitiveSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
@@ -305,7 +307,7 @@ impl<'de> DeserializeSeed<'de> for OfPrimitive<'_, '_> {
     }
 }
 
-impl Visitor<'_> for OfPrimitive<'_, '_> {
+impl Visitor<'_> for PrimitiveSeed<'_, '_> {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -409,7 +411,7 @@ impl Visitor<'_> for Text<'_, '_> {
         let units = units(text);
         if wide {
             reader.check(fits_bound(bound, units.len()))?;
-            return Ok(Value::of_units(units));
+            return Ok(Value::from_units(units));
         }
         let mut bytes = Vec::with_capacity(text.len());
         for c in char::decode_utf16(units) {
@@ -423,7 +425,7 @@ impl Visitor<'_> for Text<'_, '_> {
             }
         }
         reader.check(fits_bound(bound, bytes.len()))?;
-        Ok(Value::of_bytes(bytes.into()))
+        Ok(Value::from_bytes(bytes.into()))
     }
 }
 
@@ -456,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn what_clients_write_is_understood() {
+    fn json_of_clients_is_understood() {
         for (text, json, found) in [
             ("int64 a", r#"{"a": -9223372036854775808}"#, r#"{"a":-9223372036854775808}"#),
             ("uint64 a", r#"{"a": "18446744073709551615"}"#, r#"{"a":18446744073709551615}"#),

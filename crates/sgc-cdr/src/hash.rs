@@ -95,7 +95,7 @@ impl Primitive {
         PRIMITIVES.iter().find(|(_, primitive)| *primitive == self).map_or(0, |(id, _)| *id)
     }
 
-    pub(crate) fn of_id(id: u8) -> Option<Self> {
+    pub(crate) fn from_id(id: u8) -> Option<Self> {
         PRIMITIVES.iter().find(|(known, _)| *known == id).map(|(_, primitive)| *primitive)
     }
 }

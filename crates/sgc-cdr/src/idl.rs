@@ -87,7 +87,7 @@ impl<'a> Parser<'a> {
     }
 
     fn constant(&mut self) -> Result<(), ParseProblem> {
-        let FieldType { base, shape } = self.of_type()?;
+        let FieldType { base, shape } = self.field_type()?;
         let name = self.name()?;
         self.sign("=")?;
         let value = self.tokens.until(&[";"])?;
@@ -111,7 +111,7 @@ impl<'a> Parser<'a> {
     }
 
     fn type_name(&mut self) -> Result<(), ParseProblem> {
-        let field_type = self.of_type()?;
+        let field_type = self.field_type()?;
         let name = self.name()?;
         let field_type = self.declared(field_type)?;
         self.sign(";")?;
@@ -140,7 +140,7 @@ impl<'a> Parser<'a> {
                 default = self.annotation()?.or(default);
                 continue;
             }
-            let plain = self.of_type()?;
+            let plain = self.field_type()?;
             loop {
                 let name = self.name()?;
                 let field_type = self.declared(plain.clone())?;
@@ -181,7 +181,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn of_type(&mut self) -> Result<FieldType, ParseProblem> {
+    fn field_type(&mut self) -> Result<FieldType, ParseProblem> {
         let one = |base| FieldType { base, shape: Shape::One };
         match self.word()? {
             "sequence" => {
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ships_is_the_same_as_idl() {
+    fn shipped_types_are_the_same_as_idl() {
         let (mut ours, mut theirs) = (Library::empty(), Library::empty());
         for file in Library::shipped_files() {
             let definitions = parse(&file, &Library::shipped(&file).unwrap()).unwrap();
@@ -534,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_by_hand_is_understood() {
+    fn handwritten_idl_is_understood() {
         let text = "const unsigned long SIZE = 3; typedef sequence<string<SIZE>, 2> Names;\n\
                     module M_Constants { const string NAME = \"a; b\"; const long LOW = -1; };\n\
                     /* why */ @extensibility(FINAL) struct M { @key long a, b[SIZE]; Names names; // so\n\

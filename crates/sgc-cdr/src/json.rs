@@ -45,7 +45,7 @@ impl Value {
                 }
             }),
             Self::Octets(octets) => quoted(out, |out| STANDARD.encode_string(octets, out)),
-            Self::Packed(packed) => list(out, packed.iter(), |out, value| value.write_json(out)),
+            Self::PackedArray(packed) => list(out, packed.iter(), |out, value| value.write_json(out)),
             Self::List(all) => list(out, all, |out, value| value.write_json(out)),
             Self::Record(members) => {
                 out.push('{');
@@ -128,7 +128,7 @@ mod tests {
 
     use super::*;
     use crate::definition::Primitive;
-    use crate::value::Packed;
+    use crate::value::PackedArray;
 
     #[test]
     fn numbers_are_exact_and_short() {
@@ -148,19 +148,19 @@ mod tests {
 
     #[test]
     fn members_keep_their_order() {
-        let packed = Packed::new(Primitive::Int16, Bytes::from_static(&[1, 0, 2, 0])).unwrap();
+        let packed = PackedArray::new(Primitive::Int16, Bytes::from_static(&[1, 0, 2, 0])).unwrap();
         let members = vec![
             (Arc::from("z"), Value::Text("\"\n".into())),
             (Arc::from("a"), Value::Octets(Bytes::from_static(&[1, 2]))),
             (Arc::from("m"), Value::List(vec![Value::Bool(true), Value::Record(Vec::new())])),
-            (Arc::from("p"), Value::Packed(packed)),
+            (Arc::from("p"), Value::PackedArray(packed)),
             (Arc::from(DUMMY_MEMBER), Value::Uint(0)),
         ];
         assert_eq!(Value::Record(members).to_json(), r#"{"z":"\"\n","a":"AQI=","m":[true,{}],"p":[1,2]}"#);
     }
 
     #[test]
-    fn what_is_no_unicode_is_kept() {
+    fn text_that_is_no_unicode_is_kept() {
         let raw = Value::Raw(Bytes::from_static(b"a\xff\x01\xc3\xbc\xc3"));
         assert_eq!(raw.to_json(), "\"a\\udcff\\u0001\u{fc}\\udcc3\"");
         let wide = Value::Wide(vec![0x61, 0xd83d, 0xde00, 0xd800, 0xdc]);

@@ -44,5 +44,5 @@ pub use idl::parse_idl;
 pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};
 pub use library::{Library, LookUp, TypeError};
 pub use parse::{DEFINITION_BYTES_MAX, ParseError, ParseProblem, parse};
-pub use value::{Packed, Value};
+pub use value::{PackedArray, Value};
 pub use yaml::YamlStyle;

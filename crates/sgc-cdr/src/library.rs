@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_comes_before_what_ships() {
+    fn given_definitions_come_before_shipped_ones() {
         let name = "std_msgs/msg/String".parse().unwrap();
         let layout = Library::empty().layout(&name, &mut |_| Some("int8 a\nint8 b\n".into())).unwrap();
         assert_eq!(layout.structs[0].members.len(), 2);
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_laid_out_is_said() {
+    fn types_without_a_layout_are_reported() {
         let name = |text: &str| text.parse::<TypeName>().unwrap();
         let mut texts = |file: &TypeName| match file.name() {
             "A" => Some("B b".to_owned()),

@@ -16,7 +16,7 @@ pub(crate) enum Number {
 }
 
 impl Number {
-    pub(crate) fn of(value: &Value) -> Option<Self> {
+    pub(crate) fn from_value(value: &Value) -> Option<Self> {
         Some(match value {
             Value::Int(value) => Self::Integer(i128::from(*value)),
             Value::Uint(value) => Self::Integer(i128::from(*value)),
@@ -106,7 +106,7 @@ impl Number {
 pub(crate) fn fit(value: &Value, primitive: Primitive) -> Result<Value, ValueProblem> {
     match (primitive, value) {
         (Primitive::Bool, Value::Bool(value)) => Ok(Value::Bool(*value)),
-        _ => match Number::of(value) {
+        _ => match Number::from_value(value) {
             Some(number) => number.fit(primitive),
             None => Err(ValueProblem::Kind { found: value.kind().to_owned(), expected: primitive.name() }),
         },

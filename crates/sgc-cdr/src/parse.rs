@@ -118,8 +118,8 @@ pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
         let mut definition = Definition { name: named(suffix)?, fields: Vec::new(), constants: Vec::new() };
         for (name, field) in fields {
             let base = match field {
-                Made::Known(base) => base,
-                Made::Part(suffix) => Base::Message(named(suffix)?),
+                FieldSource::Known(base) => base,
+                FieldSource::Part(suffix) => Base::Message(named(suffix)?),
             };
             let field_type = FieldType { base, shape: Shape::One };
             definition.fields.push(Field { name: name.to_owned(), field_type, default: None });
@@ -129,15 +129,16 @@ pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
     Some(all)
 }
 
-enum Made {
+enum FieldSource {
     Known(Base),
     Part(&'static str),
 }
 
 /// The messages of an action's services and topics (the ROS 2 design article "Actions").
-fn action_messages() -> Vec<(&'static str, Vec<(&'static str, Made)>)> {
-    let known =
-        |package, name| TypeName::new(package, "msg", name).map(|name| Made::Known(Base::Message(name)));
+fn action_messages() -> Vec<(&'static str, Vec<(&'static str, FieldSource)>)> {
+    let known = |package, name| {
+        TypeName::new(package, "msg", name).map(|name| FieldSource::Known(Base::Message(name)))
+    };
     let (Some(id), Some(result_id), Some(feedback_id), Some(stamp)) = (
         known("unique_identifier_msgs", "UUID"),
         known("unique_identifier_msgs", "UUID"),
@@ -146,16 +147,16 @@ fn action_messages() -> Vec<(&'static str, Vec<(&'static str, Made)>)> {
     ) else {
         return Vec::new();
     };
-    let primitive = |primitive| Made::Known(Base::Primitive(primitive));
+    let primitive = |primitive| FieldSource::Known(Base::Primitive(primitive));
     vec![
-        ("_SendGoal_Request", vec![("goal_id", id), ("goal", Made::Part("_Goal"))]),
+        ("_SendGoal_Request", vec![("goal_id", id), ("goal", FieldSource::Part("_Goal"))]),
         ("_SendGoal_Response", vec![("accepted", primitive(Primitive::Bool)), ("stamp", stamp)]),
         ("_GetResult_Request", vec![("goal_id", result_id)]),
         (
             "_GetResult_Response",
-            vec![("status", primitive(Primitive::Int8)), ("result", Made::Part("_Result"))],
+            vec![("status", primitive(Primitive::Int8)), ("result", FieldSource::Part("_Result"))],
         ),
-        ("_FeedbackMessage", vec![("goal_id", feedback_id), ("feedback", Made::Part("_Feedback"))]),
+        ("_FeedbackMessage", vec![("goal_id", feedback_id), ("feedback", FieldSource::Part("_Feedback"))]),
     ]
 }
 

@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_described_is_written_as_well() {
+    fn described_types_are_written_as_well() {
         let of = layout("int8 LOW=-1\nTwo[2] two\nstring<=7 s");
         let described = Layout::from_description(&of.describe().unwrap().into(), &of.type_hash()).unwrap();
         assert_eq!(described.to_ros2msg(), of.to_ros2msg().replace("int8 LOW=-1\n", ""));

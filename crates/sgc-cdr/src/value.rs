@@ -28,7 +28,7 @@ pub enum Value {
     /// Arrays and sequences of `byte`, `char` and `uint8`.
     Octets(Bytes),
     /// Arrays and sequences of other primitives.
-    Packed(Packed),
+    PackedArray(PackedArray),
     /// Other arrays and sequences.
     List(Vec<Value>),
     /// A message: its members in order.
@@ -38,26 +38,28 @@ pub enum Value {
 impl Value {
     /// A member by its path: `pose.position.x`, with `[2]` for an element of a sequence: `transforms[0].header`.
     pub fn at(&self, path: &str) -> Option<Value> {
-        enum Here<'a> {
+        enum Cursor<'a> {
             Within(&'a Value),
             /// Of a sequence of primitives, which has no values in it.
             Made(Value),
         }
-        let mut here = Here::Within(self);
+        let mut here = Cursor::Within(self);
         for part in path.split('.') {
             let (name, mut rest) = match part.find('[') {
                 Some(bracket) => part.split_at(bracket),
                 None => (part, ""),
             };
-            let Here::Within(Self::Record(members)) = here else { return None };
-            here = Here::Within(&members.iter().find(|(n, _)| &**n == name)?.1);
+            let Cursor::Within(Self::Record(members)) = here else { return None };
+            here = Cursor::Within(&members.iter().find(|(n, _)| &**n == name)?.1);
             while let Some(inner) = rest.strip_prefix('[') {
                 let (index, after) = inner.split_once(']')?;
                 let index: usize = index.parse().ok()?;
                 here = match here {
-                    Here::Within(Self::List(all)) => Here::Within(all.get(index)?),
-                    Here::Within(Self::Octets(all)) => Here::Made(Self::Uint(u64::from(*all.get(index)?))),
-                    Here::Within(Self::Packed(all)) => Here::Made(all.at(index)?),
+                    Cursor::Within(Self::List(all)) => Cursor::Within(all.get(index)?),
+                    Cursor::Within(Self::Octets(all)) => {
+                        Cursor::Made(Self::Uint(u64::from(*all.get(index)?)))
+                    }
+                    Cursor::Within(Self::PackedArray(all)) => Cursor::Made(all.at(index)?),
                     _ => return None,
                 };
                 rest = after;
@@ -67,8 +69,8 @@ impl Value {
             }
         }
         Some(match here {
-            Here::Within(value) => value.clone(),
-            Here::Made(value) => value,
+            Cursor::Within(value) => value.clone(),
+            Cursor::Made(value) => value,
         })
     }
 
@@ -81,13 +83,13 @@ impl Value {
             Self::Text(_) => "a text",
             Self::Raw(_) => "a text that is not UTF-8",
             Self::Wide(_) => "a text that is not UTF-16",
-            Self::Octets(_) | Self::Packed(_) | Self::List(_) => "a sequence",
+            Self::Octets(_) | Self::PackedArray(_) | Self::List(_) => "a sequence",
             Self::Record(_) => "a message",
         }
     }
 
     /// A text of UTF-8 or what looks like it.
-    pub(crate) fn of_bytes(bytes: Bytes) -> Self {
+    pub(crate) fn from_bytes(bytes: Bytes) -> Self {
         match std::str::from_utf8(&bytes) {
             Ok(text) => Self::Text(text.to_owned()),
             Err(_) => Self::Raw(bytes),
@@ -95,7 +97,7 @@ impl Value {
     }
 
     /// A text of UTF-16 or what looks like it.
-    pub(crate) fn of_units(units: Vec<u16>) -> Self {
+    pub(crate) fn from_units(units: Vec<u16>) -> Self {
         match String::from_utf16(&units) {
             Ok(text) => Self::Text(text),
             Err(_) => Self::Wide(units),
@@ -106,12 +108,12 @@ impl Value {
 /// Elements of an array or a sequence of primitives, as they are in little endian CDR: an element takes no more than its
 /// bytes, and those of a payload are shared with it. Two are equal if all bits are: NaN is equal to itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Packed {
+pub struct PackedArray {
     primitive: Primitive,
     octets: Bytes,
 }
 
-impl Packed {
+impl PackedArray {
     /// Elements of these bytes, the least of each first. `None` if the last one is not whole, if a `bool` is neither 0 nor
     /// 1, and for `byte` and `uint8`, which are [`Value::Octets`].
     pub fn new(primitive: Primitive, octets: Bytes) -> Option<Self> {
@@ -188,12 +190,12 @@ mod tests {
             Value::Record(members.into_iter().map(|(name, value)| (Arc::from(name), value)).collect())
         };
         let stamp = record(vec![("sec", Value::Int(2)), ("nanosec", Value::Uint(5))]);
-        let ranges = Packed::new(Primitive::Int16, Bytes::from_static(&[1, 0, 0xff, 0xff])).unwrap();
+        let ranges = PackedArray::new(Primitive::Int16, Bytes::from_static(&[1, 0, 0xff, 0xff])).unwrap();
         let message = record(vec![
             ("header", record(vec![("stamp", stamp)])),
             ("list", Value::List(vec![record(vec![("x", Value::Bool(true))])])),
             ("data", Value::Octets(Bytes::from_static(&[7, 8]))),
-            ("ranges", Value::Packed(ranges)),
+            ("ranges", Value::PackedArray(ranges)),
         ]);
         assert_eq!(message.at("list[0].x"), Some(Value::Bool(true)));
         assert_eq!(message.at("data[1]"), Some(Value::Uint(8)));
@@ -215,7 +217,8 @@ mod tests {
 
     #[test]
     fn packed_elements_are_whole() {
-        let packed = |primitive, octets: &'static [u8]| Packed::new(primitive, Bytes::from_static(octets));
+        let packed =
+            |primitive, octets: &'static [u8]| PackedArray::new(primitive, Bytes::from_static(octets));
         assert_eq!(packed(Primitive::Int16, &[1]), None);
         assert_eq!(packed(Primitive::Bool, &[2]), None);
         assert_eq!(packed(Primitive::Uint8, &[2]), None);

@@ -24,7 +24,7 @@ impl Value {
         let mut out = String::new();
         match self {
             Self::Record(members) if !members.is_empty() => block(&mut out, self, 0, style, false),
-            Self::List(_) | Self::Octets(_) | Self::Packed(_) => {
+            Self::List(_) | Self::Octets(_) | Self::PackedArray(_) => {
                 block(&mut out, self, 0, style, false);
                 if !out.ends_with('\n') {
                     out.push('\n');
@@ -56,7 +56,7 @@ fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun:
                         out.push('\n');
                         block(out, member, depth + 1, style, false);
                     }
-                    Value::List(_) | Value::Octets(_) | Value::Packed(_) if !is_empty(member) => {
+                    Value::List(_) | Value::Octets(_) | Value::PackedArray(_) if !is_empty(member) => {
                         out.push('\n');
                         block(out, member, depth, style, false);
                     }
@@ -90,7 +90,7 @@ fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun:
             }
             ellipsis(out, shown < octets.len(), indent);
         }
-        Value::Packed(packed) => {
+        Value::PackedArray(packed) => {
             let shown = style.elements.unwrap_or(packed.len()).min(packed.len());
             for element in packed.iter().take(shown) {
                 indent(out, false);
@@ -116,7 +116,7 @@ fn is_empty(value: &Value) -> bool {
     match value {
         Value::List(all) => all.is_empty(),
         Value::Octets(octets) => octets.is_empty(),
-        Value::Packed(packed) => packed.is_empty(),
+        Value::PackedArray(packed) => packed.is_empty(),
         _ => false,
     }
 }
@@ -132,7 +132,7 @@ fn scalar(value: &Value, style: YamlStyle) -> String {
         // YAML has no sign for what is no Unicode.
         Value::Raw(bytes) => shown(&String::from_utf8_lossy(bytes), style),
         Value::Wide(units) => shown(&String::from_utf16_lossy(units), style),
-        Value::List(_) | Value::Octets(_) | Value::Packed(_) => "[]".to_owned(),
+        Value::List(_) | Value::Octets(_) | Value::PackedArray(_) => "[]".to_owned(),
         Value::Record(_) => "{}".to_owned(),
     }
 }

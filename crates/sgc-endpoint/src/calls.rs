@@ -67,7 +67,7 @@ pub struct CallStats {
 /// The reason for which a call is not answered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum CallLoss {
-    /// Too many calls were open where it was made ([`CallRefused`]): it was not taken.
+    /// Too many calls were open where it was made ([`CallRefusal`]): it was not taken.
     Refused,
     /// Too many calls of its node were under way at the owner: it was not taken.
     OwnerFull,
@@ -166,7 +166,7 @@ pub struct LostCall<W> {
 
 /// Why a local call is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum CallRefused {
+pub enum CallRefusal {
     /// Too many of this client wait for their answers.
     #[error("a client has {max} calls without an answer")]
     Client {
@@ -193,7 +193,7 @@ struct Open<L> {
     client: [u8; 16],
     local: L,
     payload: Bytes,
-    /// True if it was published: it may have arrived.
+    /// Whether it was published: it may have arrived.
     published: bool,
     ask_at: Instant,
     ask_after: Duration,
@@ -249,15 +249,15 @@ impl<L: Copy> Caller<L> {
         client: [u8; 16],
         local: L,
         payload: Bytes,
-    ) -> Result<Option<u64>, CallRefused> {
+    ) -> Result<Option<u64>, CallRefusal> {
         let limits = &self.limits;
         let of_client = self.open.values().filter(|open| open.client == client).count();
         let refused = if of_client >= limits.open_per_client_max {
-            Some(CallRefused::Client { max: limits.open_per_client_max })
+            Some(CallRefusal::Client { max: limits.open_per_client_max })
         } else if self.open.len() >= limits.open_max {
-            Some(CallRefused::Calls { max: limits.open_max })
+            Some(CallRefusal::Calls { max: limits.open_max })
         } else if self.bytes + payload.len() > limits.open_bytes_max {
-            Some(CallRefused::Bytes { max: limits.open_bytes_max })
+            Some(CallRefusal::Bytes { max: limits.open_bytes_max })
         } else {
             None
         };
@@ -391,7 +391,7 @@ impl<L: Copy> Caller<L> {
 
 /// A call that is remembered.
 #[derive(Debug)]
-enum Known<L> {
+enum CallState<L> {
     /// It is on its way to the local server.
     Asking,
     /// The local server was asked under this id.
@@ -401,7 +401,7 @@ enum Known<L> {
     Over(CallLoss),
 }
 
-impl<L> Known<L> {
+impl<L> CallState<L> {
     fn is_open(&self) -> bool {
         matches!(self, Self::Asking | Self::Asked(_))
     }
@@ -419,8 +419,8 @@ pub enum Answering {
 }
 
 #[derive(Debug)]
-struct Remembered<L> {
-    calls: BTreeMap<u64, Known<L>>,
+struct SourceCalls<L> {
+    calls: BTreeMap<u64, CallState<L>>,
     /// What is lower and not in `calls` is over.
     from: u64,
     /// Larger is later.
@@ -429,7 +429,7 @@ struct Remembered<L> {
 
 /// A call that local servers were asked.
 #[derive(Debug)]
-struct Asked<S> {
+struct ForwardedCall<S> {
     source: SourceId,
     number: u64,
     /// Those of them that are still there; one set for all calls that have the same.
@@ -440,8 +440,8 @@ struct Asked<S> {
 #[derive(Debug)]
 pub struct Answerer<L, S> {
     limits: CallLimits,
-    sources: BTreeMap<SourceId, Remembered<L>>,
-    local: BTreeMap<L, Asked<S>>,
+    sources: BTreeMap<SourceId, SourceCalls<L>>,
+    local: BTreeMap<L, ForwardedCall<S>>,
     /// The servers that were asked last.
     servers: Arc<BTreeSet<S>>,
     /// Answers, oldest first, some of which are here no more.
@@ -484,19 +484,21 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
 
     /// These local servers were asked under this id. An answer that came before is given to [`Self::answered`] after this.
     pub fn asked(&mut self, source: SourceId, number: u64, local: L, servers: BTreeSet<S>) {
-        if let Some(known) = self.known(&source, number).filter(|known| matches!(known, Known::Asking)) {
-            *known = Known::Asked(local);
+        if let Some(known) = self.known(&source, number).filter(|known| matches!(known, CallState::Asking)) {
+            *known = CallState::Asked(local);
             if *self.servers != servers {
                 self.servers = Arc::new(servers);
             }
-            self.local.insert(local, Asked { source, number, servers: self.servers.clone() });
+            self.local.insert(local, ForwardedCall { source, number, servers: self.servers.clone() });
         }
     }
 
     /// The local server could not be asked: who called may ask again.
     pub fn not_asked(&mut self, source: SourceId, number: u64) {
         let remembered = self.sources.get_mut(&source);
-        if let Some(remembered) = remembered.filter(|r| matches!(r.calls.get(&number), Some(Known::Asking))) {
+        if let Some(remembered) =
+            remembered.filter(|r| matches!(r.calls.get(&number), Some(CallState::Asking)))
+        {
             remembered.calls.remove(&number);
             self.stats.calls -= 1;
         }
@@ -504,10 +506,10 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
 
     /// The local server answered: whom to tell, and of which call.
     pub fn answered(&mut self, local: &L, payload: &Bytes) -> Option<(SourceId, u64)> {
-        let Asked { source, number, .. } = self.local.remove(local)?;
+        let ForwardedCall { source, number, .. } = self.local.remove(local)?;
         self.stats.answered += 1;
         if let Some(known) = self.known(&source, number) {
-            *known = Known::Answered(payload.clone());
+            *known = CallState::Answered(payload.clone());
             self.answers.push_back((source, number));
             self.answer_bytes += payload.len();
         }
@@ -553,7 +555,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     pub fn too_large(&mut self, source: SourceId, number: u64) -> Bytes {
         self.drop_answer(&source, number);
         if let Some(known) = self.known(&source, number) {
-            *known = Known::Over(CallLoss::TooLarge);
+            *known = CallState::Over(CallLoss::TooLarge);
             self.stats.answered -= 1;
             self.lost.push(LostCall { loss: CallLoss::TooLarge, of: source });
         }
@@ -568,14 +570,14 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     fn lose_asked(
         &mut self,
         loss: CallLoss,
-        is_lost: impl Fn(&Asked<S>) -> bool,
+        is_lost: impl Fn(&ForwardedCall<S>) -> bool,
     ) -> Vec<(SourceId, u64, Bytes)> {
         let lost: Vec<_> = self.local.iter().filter(|(_, asked)| is_lost(asked)).map(|(id, _)| *id).collect();
         let lost: Vec<_> = lost.iter().filter_map(|id| self.local.remove(id)).collect();
         for asked in &lost {
             self.lost.push(LostCall { loss, of: asked.source });
             if let Some(known) = self.known(&asked.source, asked.number) {
-                *known = Known::Over(loss);
+                *known = CallState::Over(loss);
             }
         }
         lost.into_iter().map(|asked| (asked.source, asked.number, loss.payload())).collect()
@@ -595,13 +597,15 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         let max = self.limits.remembered_per_source_max;
         self.make_room(&source);
         self.heard += 1;
-        let remembered = Remembered { calls: BTreeMap::new(), from: 0, heard: 0 };
+        let remembered = SourceCalls { calls: BTreeMap::new(), from: 0, heard: 0 };
         let remembered = self.sources.entry(source).or_insert(remembered);
         remembered.heard = self.heard;
         match remembered.calls.get(&number) {
-            Some(Known::Asking | Known::Asked(_)) => return Answering::Nothing,
-            Some(Known::Answered(payload)) => return Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over(why)) => return gone(*why),
+            Some(CallState::Asking | CallState::Asked(_)) => return Answering::Nothing,
+            Some(CallState::Answered(payload)) => {
+                return Answering::Tell(MessageKind::Reply, payload.clone());
+            }
+            Some(CallState::Over(why)) => return gone(*why),
             None if number < remembered.from => return gone(CallLoss::Forgotten),
             None => {}
         }
@@ -617,7 +621,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
             }
         }
         if let Some(remembered) = self.sources.get_mut(&source) {
-            remembered.calls.insert(number, Known::Asking);
+            remembered.calls.insert(number, CallState::Asking);
         }
         self.stats.calls += 1;
         Answering::Ask
@@ -626,9 +630,9 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     fn what_became(&self, source: SourceId, number: u64) -> Answering {
         let remembered = self.sources.get(&source);
         match remembered.and_then(|r| r.calls.get(&number)) {
-            Some(Known::Asking | Known::Asked(_)) => Answering::Nothing,
-            Some(Known::Answered(payload)) => Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over(why)) => gone(*why),
+            Some(CallState::Asking | CallState::Asked(_)) => Answering::Nothing,
+            Some(CallState::Answered(payload)) => Answering::Tell(MessageKind::Reply, payload.clone()),
+            Some(CallState::Over(why)) => gone(*why),
             None if remembered.is_some_and(|r| number < r.from) => gone(CallLoss::Forgotten),
             None => Answering::Tell(MessageKind::Unknown, Bytes::new()),
         }
@@ -641,22 +645,22 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         if !known.is_open() {
             return;
         }
-        if let Known::Asked(local) = std::mem::replace(known, Known::Over(CallLoss::ClientGone)) {
+        if let CallState::Asked(local) = std::mem::replace(known, CallState::Over(CallLoss::ClientGone)) {
             self.local.remove(&local);
         }
         self.lost.push(LostCall { loss: CallLoss::ClientGone, of: source });
     }
 
-    fn known(&mut self, source: &SourceId, number: u64) -> Option<&mut Known<L>> {
+    fn known(&mut self, source: &SourceId, number: u64) -> Option<&mut CallState<L>> {
         self.sources.get_mut(source)?.calls.get_mut(&number)
     }
 
     fn drop_answer(&mut self, source: &SourceId, number: u64) {
         if let Some(known) = self.known(source, number)
-            && let Known::Answered(payload) = known
+            && let CallState::Answered(payload) = known
         {
             let bytes = payload.len();
-            *known = Known::Over(CallLoss::Forgotten);
+            *known = CallState::Over(CallLoss::Forgotten);
             self.answer_bytes -= bytes;
         }
         // What is not there any more must not gather.
@@ -664,7 +668,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
             let sources = &self.sources;
             let is_there = |(source, number): &(SourceId, u64)| {
                 let known = sources.get(source).and_then(|r| r.calls.get(number));
-                matches!(known, Some(Known::Answered(_)))
+                matches!(known, Some(CallState::Answered(_)))
             };
             self.answers.retain(is_there);
         }
@@ -752,12 +756,12 @@ mod tests {
         for n in 0..2 {
             caller.call(now, [1; 16], n, payload("x")).unwrap();
         }
-        assert_eq!(caller.call(now, [1; 16], 2, payload("x")), Err(CallRefused::Client { max: 2 }));
+        assert_eq!(caller.call(now, [1; 16], 2, payload("x")), Err(CallRefusal::Client { max: 2 }));
         caller.call(now, [2; 16], 3, payload("x")).unwrap();
-        assert_eq!(caller.call(now, [2; 16], 4, payload("x")), Err(CallRefused::Calls { max: 3 }));
+        assert_eq!(caller.call(now, [2; 16], 4, payload("x")), Err(CallRefusal::Calls { max: 3 }));
         assert_eq!(caller.client_gone(|local| *local == 0), [1]);
         let large = Bytes::from(vec![0; CallLimits::default().open_bytes_max]);
-        assert!(matches!(caller.call(now, [3; 16], 5, large), Err(CallRefused::Bytes { .. })));
+        assert!(matches!(caller.call(now, [3; 16], 5, large), Err(CallRefusal::Bytes { .. })));
         assert_eq!(caller.stats(), CallStats { calls: 3, open: 2, answered: 0 });
         let [refused, gone] = [CallLoss::Refused, CallLoss::ClientGone];
         let all = [(refused, 2), (refused, 4), (gone, 0), (refused, 5)].map(|(loss, of)| lost(loss, of));
@@ -786,7 +790,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_twice_is_carried_out_once() {
+    fn a_call_asked_twice_is_carried_out_once() {
         let mut answerer = answerer();
         let request = MessageKind::Request;
         assert_eq!(answerer.handle(A, request, 1), Answering::Ask);
@@ -811,7 +815,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_reached_a_server_may_be_asked_again_and_what_died_with_it_may_not() {
+    fn a_call_may_be_asked_again_only_if_no_server_got_it() {
         let mut answerer = answerer();
         assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
         answerer.not_asked(A, 1);

@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shrinks_comes_back_and_what_does_not_goes_as_it_is() {
+    fn compressible_payloads_round_trip_and_others_go_unchanged() {
         for encoding in BOTH {
             let (mut compressor, mut decompressor) = (Compressor::default(), Decompressor::default());
             for bytes in [1 << 20, 256, 300, 70_000, 5 << 20, 257] {

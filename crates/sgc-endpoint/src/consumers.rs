@@ -12,7 +12,7 @@ use sgc_wire::{
 
 use crate::Endpoint;
 use crate::endpoint::Event;
-use crate::joins::{LostReason, Wish};
+use crate::joins::{JoinKind, LostReason};
 use crate::owner::{OLDER_REQUEST, is_older, place};
 use crate::shares::GrantedSink;
 
@@ -131,7 +131,7 @@ impl Endpoint {
     /// a version that cannot, does not advertise the name that it is asked at: then nothing happens.
     pub fn ask_consumers(&mut self, now: Now, peer: NodeId) {
         let (name, _) = consumers_name(&peer);
-        self.join(now, name, peer, Wish::Consumers);
+        self.join(now, name, peer, JoinKind::Consumers);
     }
 
     /// Asks a node no longer.

@@ -22,7 +22,7 @@ use crate::advert_pace::AdvertPace;
 use crate::consumers::{ConsumerAsker, consumers_name};
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
-use crate::types::{TypeAsker, types_name};
+use crate::type_exchange::{TypeAsker, types_name};
 
 /// How often it is looked for certificates that have ended, which happens without anything else.
 const ENFORCE_EVERY: Duration = Duration::from_secs(20);
@@ -66,9 +66,9 @@ impl Default for Limits {
 pub struct EndpointConfig {
     /// Who this node is.
     pub identity: Arc<Identity>,
-    /// True if this node gives members their certificates.
+    /// Whether this node gives members their certificates.
     pub authority: bool,
-    /// True if this authority carries operations out for operators.
+    /// Whether this authority carries operations out for operators.
     pub operations: bool,
     /// Bounds and timers.
     pub limits: Limits,
@@ -82,7 +82,7 @@ pub enum Output {
     /// Something happened that concerns the user of this endpoint.
     Event(Event),
     /// Something was refused; count it and, where it matters, say it.
-    Dropped(Dropped),
+    Dropped(EndpointDrop),
     /// Nothing more to do until then, or until something happens.
     Timeout(Option<Instant>),
 }
@@ -118,7 +118,7 @@ pub enum Event {
         sink: SinkId,
         /// Whose it was.
         peer: NodeId,
-        /// Why.
+        /// The reason.
         reason: RefuseReason,
     },
     /// An epoch of a share begins: its sources publish under this key from now on.
@@ -213,7 +213,7 @@ pub enum Event {
     Lost {
         /// The name.
         name: Name,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
     /// What an owner says that types of its interfaces look like, of those that were asked for; not verified yet.
@@ -235,7 +235,7 @@ pub enum Event {
     ConsumersLost {
         /// The node.
         peer: NodeId,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
     /// A followed owner's catalogue, whenever it changes.
@@ -249,7 +249,7 @@ pub enum Event {
     OwnerLost {
         /// The owner.
         owner: NodeId,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
     /// A followed owner does not answer with a catalogue.
@@ -263,7 +263,7 @@ pub enum Event {
 
 /// Why something was refused.
 #[derive(Clone, Debug, thiserror::Error)]
-pub enum Dropped {
+pub enum EndpointDrop {
     /// A signed body that does not verify.
     #[error("{what} not believed: {why}")]
     NotVerified {
@@ -289,7 +289,7 @@ pub enum Dropped {
     },
 }
 
-impl Dropped {
+impl EndpointDrop {
     /// Returns `true` if an operator should hear of it. Answers cross with requests that are made anew, so a frame that concerns nothing
     /// here is ordinary while nodes start.
     pub fn is_suspicious(&self) -> bool {
@@ -587,12 +587,12 @@ impl Endpoint {
         }
     }
 
-    pub(crate) fn drop_frame(&mut self, why: Dropped) {
+    pub(crate) fn drop_frame(&mut self, why: EndpointDrop) {
         self.outputs.push_back(Output::Dropped(why));
     }
 
     pub(crate) fn unexpected(&mut self, what: &'static str) {
-        self.drop_frame(Dropped::Unexpected { what });
+        self.drop_frame(EndpointDrop::Unexpected { what });
     }
 
     pub(crate) fn event(&mut self, event: Event) {

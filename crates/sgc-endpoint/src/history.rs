@@ -37,13 +37,13 @@ impl Default for RecoveryLimits {
 }
 
 /// A message as it was published.
-pub(crate) struct Kept {
+pub(crate) struct HistoryEntry {
     pub(crate) seq: u64,
     pub(crate) head: MessageHead,
     pub(crate) payload: Bytes,
 }
 
-impl Kept {
+impl HistoryEntry {
     pub(crate) fn is_mark(&self) -> bool {
         self.head.kind == MessageKind::Mark
     }
@@ -63,13 +63,13 @@ struct Tail {
 }
 
 impl Tail {
-    fn add(&mut self, kept: &Kept) {
+    fn add(&mut self, kept: &HistoryEntry) {
         self.numbers += 1;
         self.messages += usize::from(!kept.is_mark());
         self.bytes += kept.bytes();
     }
 
-    fn drop_first(&mut self, first: &Kept) {
+    fn drop_first(&mut self, first: &HistoryEntry) {
         self.from = first.seq + 1;
         self.numbers -= 1;
         self.messages -= usize::from(!first.is_mark());
@@ -82,7 +82,7 @@ pub(crate) struct History {
     bytes_max: usize,
     recovery: RecoveryLimits,
     /// Consecutive numbers, up to the last published.
-    kept: VecDeque<Kept>,
+    kept: VecDeque<HistoryEntry>,
     /// What late joiners get.
     late: Tail,
     /// What is there to be recovered.
@@ -97,7 +97,7 @@ impl History {
     }
 
     /// Takes the next message.
-    pub(crate) fn push(&mut self, message: Kept) {
+    pub(crate) fn push(&mut self, message: HistoryEntry) {
         let next = message.seq + 1;
         self.late.add(&message);
         self.recent.add(&message);
@@ -182,11 +182,11 @@ impl History {
     }
 
     /// The number published last, if it is here.
-    pub(crate) fn newest(&self) -> Option<&Kept> {
+    pub(crate) fn newest(&self) -> Option<&HistoryEntry> {
         self.kept.back()
     }
 
-    pub(crate) fn newest_mut(&mut self) -> Option<&mut Kept> {
+    pub(crate) fn newest_mut(&mut self) -> Option<&mut HistoryEntry> {
         self.kept.back_mut()
     }
 
@@ -210,7 +210,7 @@ mod tests {
     fn push(history: &mut History, kind: MessageKind, bytes: usize) {
         let seq = history.newest().map_or(history.oldest(), |m| m.seq + 1);
         let head = MessageHead::new(kind, 0);
-        history.push(Kept { seq, head, payload: vec![0; bytes].into() });
+        history.push(HistoryEntry { seq, head, payload: vec![0; bytes].into() });
     }
 
     fn seqs(history: &History, from: u64) -> Vec<u64> {
@@ -234,7 +234,7 @@ mod tests {
         let mut history = history(100, 10_000, 2, 10_000);
         for n in 1..=9_i64 {
             let head = MessageHead::new(if n == 7 { MessageKind::Mark } else { MessageKind::Write }, n * 10);
-            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+            history.push(HistoryEntry { seq: n as u64, head, payload: vec![0; 8].into() });
         }
         history.set_depth(3);
         assert_eq!((history.late_from(), seqs(&history, 0)), (6, vec![6, 7, 8, 9]));
@@ -278,12 +278,12 @@ mod tests {
     }
 
     #[test]
-    fn what_has_expired_goes_and_what_came_after_it_stays() {
+    fn expired_messages_go_and_later_ones_stay() {
         let mut history = history(3, 10_000, 5, 10_000);
         for n in 1..=6_i64 {
             let kind = if n == 2 { MessageKind::Mark } else { MessageKind::Write };
             let head = MessageHead::new(kind, if n == 2 { 0 } else { n * 10 });
-            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+            history.push(HistoryEntry { seq: n as u64, head, payload: vec![0; 8].into() });
         }
         assert_eq!((history.late_from(), history.oldest()), (4, 2));
         history.expire(35);
@@ -293,7 +293,7 @@ mod tests {
         history.expire(i64::MAX);
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (7, 7, 0));
         let head = MessageHead::new(MessageKind::Write, 70);
-        history.push(Kept { seq: 7, head, payload: vec![0; 8].into() });
+        history.push(HistoryEntry { seq: 7, head, payload: vec![0; 8].into() });
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (7, 7, vec![7]));
     }
 
@@ -301,7 +301,7 @@ mod tests {
     fn without_a_purpose_nothing_is_kept() {
         let mut history = history(0, 1000, 0, 0);
         for n in 1..4 {
-            history.push(Kept {
+            history.push(HistoryEntry {
                 seq: n,
                 head: MessageHead::new(MessageKind::Write, 0),
                 payload: Bytes::from_static(b"x"),

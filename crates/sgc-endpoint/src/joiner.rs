@@ -10,11 +10,11 @@ use sgc_trust::{
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode, DescribedType, Encode as _, GrantContent, JoinBody, Metadata, Name,
-    NodeId, Now, OperationRequest, Recover, RefuseReason, RejectReason, Signed, SinkId, SourceId,
+    NodeId, Now, OperationRequest, Recover, RefuseReason, RejectReason, SignedBody, SinkId, SourceId,
 };
 
-use crate::endpoint::{Dropped, Endpoint, Event, Output};
-use crate::joins::{Join, JoinState, LostReason, RefusedBy, Rerouting, Wish};
+use crate::endpoint::{Endpoint, EndpointDrop, Event, Output};
+use crate::joins::{Join, JoinKind, JoinState, LostReason, RefusedBy, Rerouting};
 
 impl Endpoint {
     /// Follows a fleet member's catalogue; false if this identity holds no fleet secret to find it with.
@@ -51,7 +51,7 @@ impl Endpoint {
         }
         for (name, owner) in wanted {
             self.followed.insert(name, owner);
-            self.join(self.now, name, owner, Wish::Follow);
+            self.join(self.now, name, owner, JoinKind::Follow);
         }
     }
 
@@ -61,7 +61,7 @@ impl Endpoint {
         let Some(authority) = identity.authority() else { return false };
         let name = name_of(&authority, &renewal_blind(&identity.as_peer().ca));
         self.leave(now, &name);
-        self.join(now, name, authority, Wish::Renew(csr));
+        self.join(now, name, authority, JoinKind::Renew(csr));
         true
     }
 
@@ -70,17 +70,17 @@ impl Endpoint {
     pub fn operate(&mut self, now: Now, authority: NodeId, request: &OperationRequest) -> Name {
         let name = name_of(&authority, &operations_blind(&self.config.identity.as_peer().ca));
         self.leave(now, &name);
-        self.join(now, name, authority, Wish::Operate(request.to_bytes()));
+        self.join(now, name, authority, JoinKind::Operate(request.to_bytes()));
         name
     }
 
     /// Joins a name of `owner`; waits for it if need be, and joins again whenever it must.
-    pub fn join(&mut self, now: Now, name: Name, owner: NodeId, wish: Wish) {
+    pub fn join(&mut self, now: Now, name: Name, owner: NodeId, kind: JoinKind) {
         self.now = now;
         if self.joins.contains_key(&name) {
             return;
         }
-        self.joins.insert(name, Join::new(owner, wish));
+        self.joins.insert(name, Join::new(owner, kind));
         self.send(Control::Interest { names: vec![name] });
     }
 
@@ -115,8 +115,8 @@ impl Endpoint {
             .joins
             .iter()
             .filter_map(|(name, join)| match &join.state {
-                JoinState::Granted { sink, reply_key, .. } if !join.wish.is_question() => {
-                    Some(self.join_frame(&identity, *name, *sink, &join.wish, reply_key.public().clone()))
+                JoinState::Granted { sink, reply_key, .. } if !join.kind.is_question() => {
+                    Some(self.join_frame(&identity, *name, *sink, &join.kind, reply_key.public().clone()))
                 }
                 _ => None,
             })
@@ -129,13 +129,13 @@ impl Endpoint {
         identity: &Arc<Identity>,
         name: Name,
         sink: SinkId,
-        wish: &Wish,
+        kind: &JoinKind,
         reply_key: Bytes,
     ) -> Control {
         let body = JoinBody {
             name,
             sink,
-            request: wish.request(),
+            request: kind.request(),
             issued_at: self.now.unix,
             chain: identity.chain_bytes(),
             reply_key,
@@ -173,7 +173,7 @@ impl Endpoint {
             return self.unexpected("reroute");
         };
         let asks = matches!((&join.state, &join.rerouting), (JoinState::Granted { .. }, Rerouting::No));
-        if asks && !join.wish.is_question() {
+        if asks && !join.kind.is_question() {
             self.ask_beside(name);
         }
     }
@@ -183,8 +183,8 @@ impl Endpoint {
         let Some(join) = self.joins.get_mut(&name) else { return };
         let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
         let (sink, reply_key) = join.ask_beside(self.now.instant, reply_key, &mut self.rng);
-        let wish = join.wish.clone();
-        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        let kind = join.kind.clone();
+        let frame = self.join_frame(&identity, name, sink, &kind, reply_key);
         self.send(frame);
     }
 
@@ -210,10 +210,10 @@ impl Endpoint {
         }
     }
 
-    pub(crate) fn handle_advert(&mut self, signed: &Signed) {
+    pub(crate) fn handle_advert(&mut self, signed: &SignedBody) {
         let advert = match verify_advert(&self.anchors, signed, self.now.unix) {
             Ok(advert) => advert,
-            Err(why) => return self.drop_frame(Dropped::NotVerified { what: "advertisement", why }),
+            Err(why) => return self.drop_frame(EndpointDrop::NotVerified { what: "advertisement", why }),
         };
         if advert.owner.node_id == self.config.identity.node_id() {
             return self.overtake(advert.body.seq);
@@ -253,10 +253,10 @@ impl Endpoint {
     }
 
     fn lost(&mut self, name: Name, reason: LostReason) {
-        match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
+        match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.kind)) {
             (Some(owner), _) => self.owner_lost(*owner, reason),
-            (None, Some(Wish::Consumers)) => self.consumers_lost(name, reason),
-            (None, Some(Wish::Renew(_) | Wish::Operate(_) | Wish::Types(_))) => {}
+            (None, Some(JoinKind::Consumers)) => self.consumers_lost(name, reason),
+            (None, Some(JoinKind::Renew(_) | JoinKind::Operate(_) | JoinKind::Types(_))) => {}
             (None, _) => self.event(Event::Lost { name, reason }),
         }
     }
@@ -273,13 +273,13 @@ impl Endpoint {
     }
 
     fn refused(&mut self, name: Name, by: RefusedBy) {
-        match (self.followed.get(&name).copied(), self.joins.get(&name).map(|j| &j.wish)) {
+        match (self.followed.get(&name).copied(), self.joins.get(&name).map(|j| &j.kind)) {
             (Some(owner), _) if self.hears(&owner) => {}
             (Some(owner), _) => self.event(Event::OwnerRefused { owner, by }),
-            (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
-            (None, Some(Wish::Operate(_))) => self.event(Event::OperationDenied { name, by }),
+            (None, Some(JoinKind::Renew(_))) => self.event(Event::RenewRefused { by }),
+            (None, Some(JoinKind::Operate(_))) => self.event(Event::OperationDenied { name, by }),
             // What is not described is not known; that is seen where it is needed.
-            (None, Some(Wish::Types(_) | Wish::Consumers)) => {}
+            (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
             (None, _) => self.event(Event::Refused { name, by }),
         }
     }
@@ -293,15 +293,15 @@ impl Endpoint {
             return;
         }
         // An authority may require post-quantum keys before this node's identity says so.
-        let of_authority = matches!(join.wish, Wish::Renew(_) | Wish::Operate(_));
+        let of_authority = matches!(join.kind, JoinKind::Renew(_) | JoinKind::Operate(_));
         let reply_key = ReplyKey::generate(Kem::for_fleet(of_authority || identity.post_quantum()));
         let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
-        let wish = join.wish.clone();
-        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        let kind = join.kind.clone();
+        let frame = self.join_frame(&identity, name, sink, &kind, reply_key);
         self.send(frame);
     }
 
-    pub(crate) fn handle_answer(&mut self, signed: &Signed) {
+    pub(crate) fn handle_answer(&mut self, signed: &SignedBody) {
         let Ok(claimed) = AnswerBody::from_slice(&signed.body) else {
             return self.unexpected("answer");
         };
@@ -310,7 +310,7 @@ impl Endpoint {
         };
         match verify_answer(&owner, signed) {
             Ok(body) => self.handle_verified_answer(&owner, body),
-            Err(why) => self.drop_frame(Dropped::NotVerified { what: "answer", why }),
+            Err(why) => self.drop_frame(EndpointDrop::NotVerified { what: "answer", why }),
         }
     }
 
@@ -405,30 +405,30 @@ impl Endpoint {
         serial: u64,
         content: GrantContent,
     ) {
-        let wish = self.joins.get(&name).map(|j| &j.wish);
-        match (content, wish) {
-            (GrantContent::Catalogue(catalogue), Some(Wish::Follow)) => {
+        let kind = self.joins.get(&name).map(|j| &j.kind);
+        match (content, kind) {
+            (GrantContent::Catalogue(catalogue), Some(JoinKind::Follow)) => {
                 self.event(Event::Catalogue { owner, catalogue });
             }
-            (GrantContent::Topic(grant), Some(Wish::Subscribe { .. } | Wish::Publish(_))) => {
+            (GrantContent::Topic(grant), Some(JoinKind::Subscribe { .. } | JoinKind::Publish(_))) => {
                 self.event(Event::Granted { name, sink, grant });
                 if serial > 1 {
                     // A new epoch waits for it.
                     self.send(Control::Ack { name, sink, serial });
                 }
             }
-            (GrantContent::Credentials(credentials), Some(Wish::Renew(_))) => {
+            (GrantContent::Credentials(credentials), Some(JoinKind::Renew(_))) => {
                 self.event(Event::Renewed { credentials });
             }
-            (GrantContent::Operation(answer), Some(Wish::Operate(_))) => {
+            (GrantContent::Operation(answer), Some(JoinKind::Operate(_))) => {
                 self.event(Event::OperationAnswered { name, answer });
             }
-            (GrantContent::Types(types), Some(Wish::Types(names))) => {
+            (GrantContent::Types(types), Some(JoinKind::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);
                 let types: Vec<_> = types.into_iter().filter(asked).collect();
                 self.event(Event::Types { owner, types });
             }
-            (GrantContent::Consumers(consumers), Some(Wish::Consumers)) => {
+            (GrantContent::Consumers(consumers), Some(JoinKind::Consumers)) => {
                 self.event(Event::Consumers { peer: owner, consumers });
             }
             _ => self.unexpected("kind of grant"),

@@ -66,10 +66,10 @@ pub enum LostReason {
 
 /// What a join is for.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Wish {
+pub enum JoinKind {
     /// To receive what is published under a name; `describe` if its owner's catalogue cannot be seen.
     Subscribe {
-        /// True if the grant is to say what the name stands for.
+        /// Whether the grant is to say what the name stands for.
         describe: bool,
     },
     /// To publish under a name.
@@ -86,7 +86,7 @@ pub enum Wish {
     Consumers,
 }
 
-impl Wish {
+impl JoinKind {
     pub(crate) fn request(&self) -> Request {
         match self {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
@@ -149,7 +149,7 @@ pub(crate) enum Rerouting {
 pub(crate) struct Join {
     /// Whose it must be.
     pub(crate) owner: NodeId,
-    pub(crate) wish: Wish,
+    pub(crate) kind: JoinKind,
     /// The owner as its last advertisement proved it; `None` while there is none.
     pub(crate) reachable: Option<VerifiedPeer>,
     pub(crate) state: JoinState,
@@ -159,9 +159,9 @@ pub(crate) struct Join {
 }
 
 impl Join {
-    pub(crate) fn new(owner: NodeId, wish: Wish) -> Self {
+    pub(crate) fn new(owner: NodeId, kind: JoinKind) -> Self {
         let (state, rerouting) = (JoinState::ExpectAdvert, Rerouting::No);
-        Self { owner, wish, reachable: None, state, rerouting, attempts: 0 }
+        Self { owner, kind, reachable: None, state, rerouting, attempts: 0 }
     }
 
     pub(crate) fn status(&self) -> JoinStatus {

@@ -6,15 +6,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
+use sgc_trust::{DenialReason, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Control,
     Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, OperationAnswer, Qos,
-    Recover, RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
+    Recover, RefuseReason, Request, Role, SEALED_BYTES_MAX, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
-use crate::endpoint::{Dropped, Endpoint, Event, Limits};
+use crate::endpoint::{Endpoint, EndpointDrop, Event, Limits};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 use crate::{SinkProgress, SourceProgress};
 
@@ -150,7 +150,7 @@ impl Endpoint {
         self.shares.shares.get(name).map(|s| s.grant(&s.epoch, None))
     }
 
-    /// True if the type of a share has a key, so that each of its instances has a history.
+    /// Returns `true` if the type of a share has a key, so that each of its instances has a history.
     pub fn is_keyed(&self, name: &Name) -> bool {
         self.shares.shares.get(name).is_some_and(|s| !s.spec.keyless)
     }
@@ -466,7 +466,7 @@ impl Endpoint {
             return;
         }
         if left_out > 0 {
-            self.drop_frame(Dropped::CatalogueTooLarge { left_out });
+            self.drop_frame(EndpointDrop::CatalogueTooLarge { left_out });
         }
         let Some(follower) = self.shares.followers.get_mut(&(name, sink)) else { return };
         follower.serial += 1;
@@ -521,7 +521,7 @@ impl Endpoint {
         self.operations_name.is_some_and(|(n, _)| n == *name)
     }
 
-    pub(crate) fn handle_join(&mut self, signed: &Signed) {
+    pub(crate) fn handle_join(&mut self, signed: &SignedBody) {
         let join = match verify_join(&self.anchors, signed, self.now.unix) {
             Ok(join) => join,
             Err(why) => {
@@ -537,7 +537,7 @@ impl Endpoint {
                 {
                     self.refuse(name, sink, 1, why.refuse_reason());
                 }
-                self.drop_frame(Dropped::NotVerified { what: "join", why });
+                self.drop_frame(EndpointDrop::NotVerified { what: "join", why });
                 return;
             }
         };
@@ -810,7 +810,7 @@ pub(crate) fn place<'a, K: Copy + 'a>(
     if all >= limits.sinks_per_name_max { Err(RefuseReason::Limit) } else { Ok(None) }
 }
 
-/// True if another node has the place of this sink.
+/// Returns `true` if another node has the place of this sink.
 fn is_of_another(granted: &BTreeMap<SinkId, GrantedSink>, sink: &SinkId, peer: &NodeId) -> bool {
     granted.get(sink).is_some_and(|known| known.peer.node_id != *peer)
 }
@@ -837,10 +837,10 @@ fn take_older(
     Ok(other)
 }
 
-fn refusal(denied: Denied) -> RefuseReason {
+fn refusal(denied: DenialReason) -> RefuseReason {
     match denied {
-        Denied::NotListed => RefuseReason::NotPermitted,
-        Denied::Role => RefuseReason::RoleNotOffered,
+        DenialReason::NotListed => RefuseReason::NotPermitted,
+        DenialReason::Role => RefuseReason::RoleNotOffered,
     }
 }
 

@@ -16,12 +16,12 @@ pub const PARKED_LOOKS_MAX: u8 = 64;
 const PAST_EPOCH_LOOKS: u8 = PARKED_LOOKS_MAX / 4;
 
 /// A packet and how often it was looked at in vain.
-pub(crate) struct Parked {
+pub(crate) struct ParkedPacket {
     pub(crate) packet: Packet,
     looks: u8,
 }
 
-impl Parked {
+impl ParkedPacket {
     pub(crate) fn new(packet: &Packet) -> Self {
         // A copy, so that the bound holds: the payload may be a small piece of a large buffer of the
         // transport.
@@ -41,13 +41,13 @@ impl Parked {
 /// The parked packets of a sink, in the order in which they came.
 #[derive(Default)]
 pub(crate) struct Parking {
-    packets: VecDeque<Parked>,
+    packets: VecDeque<ParkedPacket>,
     bytes: usize,
 }
 
 impl Parking {
     /// Parks a packet; the number of those that had to make room for it, oldest first.
-    pub(crate) fn push(&mut self, parked: Parked) -> usize {
+    pub(crate) fn push(&mut self, parked: ParkedPacket) -> usize {
         self.bytes += parked.packet.encoded_bytes();
         self.packets.push_back(parked);
         let before = self.packets.len();
@@ -73,7 +73,7 @@ impl Parking {
     }
 
     /// Takes all out.
-    pub(crate) fn take(&mut self) -> VecDeque<Parked> {
+    pub(crate) fn take(&mut self) -> VecDeque<ParkedPacket> {
         self.bytes = 0;
         std::mem::take(&mut self.packets)
     }

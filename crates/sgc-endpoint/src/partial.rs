@@ -35,7 +35,7 @@ impl Partials {
         partial.message.get_mut(start..start + header.fragment_bytes())
     }
 
-    /// True if a fragment of the message is here.
+    /// Returns `true` if a fragment of the message is here.
     pub(crate) fn has_begun(&self, seq: u64) -> bool {
         self.0.iter().any(|p| p.seq == seq)
     }

@@ -26,7 +26,7 @@ pub struct ShareSpec {
     pub suite: Suite,
     /// Class of its traffic.
     pub class: Class,
-    /// True if the DDS type has no key.
+    /// Whether the DDS type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash, if known.
     pub type_hash: Option<String>,
@@ -95,13 +95,13 @@ pub(crate) struct Rotation {
     pub(crate) waiting: BTreeMap<SinkId, u64>,
     /// When the epoch begins even if some have not.
     pub(crate) deadline: Instant,
-    /// True if another is to follow at once.
+    /// Whether another is to follow at once.
     pub(crate) again: bool,
 }
 
 /// Since when a node may receive a share: nothing older is sent to it again, on whatever way it asks.
 #[derive(Debug)]
-pub(crate) struct Since {
+pub(crate) struct ReceiveStart {
     pub(crate) peer: VerifiedPeer,
     /// By source; of one that came later, all.
     floors: BTreeMap<SourceId, u64>,
@@ -124,7 +124,7 @@ pub(crate) struct Share {
     /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
     pub(crate) told_own: bool,
     /// Who receives it, or did, and what it may have sent to it again.
-    pub(crate) since: BTreeMap<NodeId, Since>,
+    pub(crate) since: BTreeMap<NodeId, ReceiveStart>,
     /// Who left and still has the newest key. If one of them loses its right, that key has to go.
     pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
     /// What its type looks like, if that is known.
@@ -168,7 +168,7 @@ impl Share {
         }
     }
 
-    /// True if those who publish on it call a service.
+    /// Returns `true` if those who publish on it call a service.
     pub(crate) fn is_service(&self) -> bool {
         self.spec.metadata.kind == Kind::Service
     }
@@ -188,7 +188,7 @@ impl Share {
             }
         }
         let floors = self.own.iter().map(|s| s.announce()).map(|a| (a.source, a.oldest)).collect();
-        self.since.insert(peer.node_id, Since { peer: peer.clone(), floors });
+        self.since.insert(peer.node_id, ReceiveStart { peer: peer.clone(), floors });
     }
 
     /// The first message of a source that a node may have sent to it again.
@@ -207,7 +207,7 @@ impl Share {
         self.rotation.as_ref().map_or(&self.epoch, |r| &r.epoch)
     }
 
-    /// True if `source` publishes here already, other than by the request of `sink`.
+    /// Returns `true` if `source` publishes here already, other than by the request of `sink`.
     pub(crate) fn has_source(&self, source: &SourceId, sink: &SinkId) -> bool {
         let offered =
             |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);

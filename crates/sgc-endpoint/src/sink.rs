@@ -17,7 +17,7 @@ use sgc_wire::{
     SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::parking::{Parked, Parking};
+use crate::parking::{ParkedPacket, Parking};
 use crate::partial::Partials;
 use crate::source::without_lists;
 
@@ -55,7 +55,7 @@ pub struct Message {
     pub seq: u64,
     /// What it is and when it was published.
     pub head: MessageHead,
-    /// True if its publisher waits for who cannot take it; otherwise newer ones replace it.
+    /// Whether its publisher waits for who cannot take it; otherwise newer ones replace it.
     pub reliable: bool,
     /// The payload, as it was published.
     pub payload: Bytes,
@@ -179,7 +179,7 @@ pub enum AskAgain {
 }
 
 /// What the next grant may explain.
-enum Unexplained {
+enum MissingGrant {
     Epoch,
     Source,
 }
@@ -200,7 +200,7 @@ struct SourceState {
     next: u64,
     /// Packets to this sink below it are none that this sink asked for.
     oldest: u64,
-    /// True if what is lost can be asked for: then its messages are delivered in the order of their numbers.
+    /// Whether what is lost can be asked for: then its messages are delivered in the order of their numbers.
     recovers: bool,
     /// The next number: of such a source all below it are done with, of another it is one more than the newest.
     expected: u64,
@@ -209,11 +209,11 @@ struct SourceState {
     synced: bool,
     /// True once it was asked for.
     asked: bool,
-    /// True if the history is to begin wherever it does.
+    /// Whether the history is to begin wherever it does.
     anew: bool,
-    /// True if something of the answer came since somebody looked.
+    /// Whether something of the answer came since somebody looked.
     heard: bool,
-    /// True if the answer has a hole, so that it must be asked for once more.
+    /// Whether the answer has a hole, so that it must be asked for once more.
     torn: bool,
     /// The last epoch in which it is believed, if the newest grant no longer announces it.
     last_epoch: Option<u32>,
@@ -304,8 +304,8 @@ impl Sink {
             let result = match self.handle(&parked.packet) {
                 Ok(Ok(delivery)) => Ok(delivery),
                 Ok(Err(unexplained)) if parked.looked_in_vain(latest) => Err(match unexplained {
-                    Unexplained::Epoch => SinkDrop::UnknownEpoch,
-                    Unexplained::Source => SinkDrop::UnknownSource,
+                    MissingGrant::Epoch => SinkDrop::UnknownEpoch,
+                    MissingGrant::Source => SinkDrop::UnknownSource,
                 }),
                 Ok(Err(_)) => {
                     // It was here before, so there is room.
@@ -354,7 +354,7 @@ impl Sink {
         }
     }
 
-    /// True if the messages of a source can be asked for again, so that none need be taken that can go nowhere.
+    /// Returns `true` if the messages of a source can be asked for again, so that none need be taken that can go nowhere.
     pub fn recovers(&self, source: &SourceId) -> bool {
         self.sources.get(source).is_some_and(|s| s.recovers)
     }
@@ -391,7 +391,7 @@ impl Sink {
         debug_assert_eq!(packet.header.name, self.name);
         match self.handle(packet)? {
             Ok(delivery) => Ok(delivery),
-            Err(_) if self.parking.push(Parked::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
+            Err(_) if self.parking.push(ParkedPacket::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
             Err(_) => Ok(Delivery::Parked),
         }
     }
@@ -486,14 +486,14 @@ impl Sink {
 
     /// What a packet comes to, if a grant explained it. In this order: what costs nothing (addressee, epoch,
     /// suite, replay); the seal, which only holders of the topic's key pass; the signature.
-    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, Unexplained>, SinkDrop> {
+    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, MissingGrant>, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {
             return Err(SinkDrop::NotForUs);
         }
         let Some(grant) = self.epochs.iter().find(|known| known.epoch == header.epoch) else {
             if header.epoch > self.newest_epoch() {
-                return Ok(Err(Unexplained::Epoch));
+                return Ok(Err(MissingGrant::Epoch));
             }
             return Err(OpenError::Epoch { found: header.epoch }.into());
         };
@@ -514,7 +514,7 @@ impl Sink {
             // Who does not hold the topic's key takes no room.
             let mut text = vec![0; opened_bytes(header)];
             derive(grant, &self.name, header)?.open(header, payload, &mut text)?;
-            return Ok(Err(Unexplained::Source));
+            return Ok(Err(MissingGrant::Source));
         };
         source.check_freshness(header)?;
         source.derive_key(grant, &self.name, header)?;
@@ -529,19 +529,19 @@ impl Sink {
         let mut opened = if header.fragments() == 1 {
             let mut text = self.slab.room(text_bytes);
             text.resize(text_bytes, 0);
-            Opened::Whole(text)
+            OpenBuffer::Whole(text)
         } else if partials.place(header).is_some() {
-            Opened::InPlace
+            OpenBuffer::InPlace
         } else {
             let mut scratch = std::mem::take(&mut self.scratch);
             scratch.clear();
             scratch.resize(text_bytes, 0);
-            Opened::Aside(scratch)
+            OpenBuffer::Aside(scratch)
         };
         let out = match &mut opened {
-            Opened::Whole(text) => &mut text[..],
-            Opened::Aside(text) => &mut text[..],
-            Opened::InPlace => partials.place(header).unwrap_or_default(),
+            OpenBuffer::Whole(text) => &mut text[..],
+            OpenBuffer::Aside(text) => &mut text[..],
+            OpenBuffer::InPlace => partials.place(header).unwrap_or_default(),
         };
         let mut result = key.open(header, payload, out);
         if result.is_ok() && suite.is_signed() {
@@ -551,7 +551,7 @@ impl Sink {
             Ok(()) => self.accept(header, &mut opened),
             Err(error) => Err(error.into()),
         };
-        if let Opened::Aside(scratch) = opened {
+        if let OpenBuffer::Aside(scratch) = opened {
             self.scratch = scratch;
         }
         delivery.map(Ok)
@@ -589,7 +589,7 @@ impl Sink {
     /// publishers are none of its business.
     fn asserted(&self, by: &SourceId, publisher: [u8; 8]) -> Delivery {
         let Some(SourceState { announced_key, .. }) = self.sources.get(by) else { return Delivery::Mark };
-        let [first, last] = [0, 0xff].map(|byte| SourceId::of_publisher(publisher, [byte; 8]));
+        let [first, last] = [0, 0xff].map(|byte| SourceId::from_publisher(publisher, [byte; 8]));
         let is_it = |(id, state): &(&SourceId, &SourceState)| {
             *id != by && state.last_epoch.is_none() && state.announced_key == *announced_key
         };
@@ -598,9 +598,9 @@ impl Sink {
     }
 
     /// Takes what a packet opened to: fragment, and behind the first one the head.
-    fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
+    fn accept(&mut self, header: &PacketHeader, opened: &mut OpenBuffer) -> Result<Delivery, SinkDrop> {
         let head = match opened {
-            Opened::Whole(_) | Opened::Aside(_) if header.index == 0 => {
+            OpenBuffer::Whole(_) | OpenBuffer::Aside(_) if header.index == 0 => {
                 let at = opened.text().len() - MESSAGE_HEAD_BYTES;
                 let head = MessageHead::from_slice(&opened.text()[at..]).map_err(|_| SinkDrop::Head)?;
                 opened.truncate(at);
@@ -651,13 +651,13 @@ impl Sink {
             return source.await_history(header.source);
         }
         let complete = match (opened, head) {
-            (Opened::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
+            (OpenBuffer::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
             (opened, head) => {
                 if begins {
                     self.make_partial_room(header)?;
                 }
                 let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
-                let fragment = (!matches!(opened, Opened::InPlace)).then(|| opened.text());
+                let fragment = (!matches!(opened, OpenBuffer::InPlace)).then(|| opened.text());
                 let max = self.limits.partials_per_source_max;
                 let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
                 self.incomplete += given_up;
@@ -677,7 +677,7 @@ impl Sink {
 }
 
 /// Where a packet was opened to.
-enum Opened {
+enum OpenBuffer {
     /// Memory of its own, which becomes the message.
     Whole(BytesMut),
     /// Its place in the message.
@@ -686,7 +686,7 @@ enum Opened {
     Aside(Vec<u8>),
 }
 
-impl Opened {
+impl OpenBuffer {
     /// What it was opened to, if that is here.
     fn text(&self) -> &[u8] {
         match self {

@@ -14,7 +14,7 @@ use sgc_wire::{
     SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::history::{History, Kept, RecoveryLimits};
+use crate::history::{History, HistoryEntry, RecoveryLimits};
 
 /// Bytes of message in one packet.
 pub const FRAGMENT_BYTES: u16 = 16 * 1024;
@@ -62,7 +62,7 @@ pub enum PublishError {
 pub struct SourceProgress {
     source: SourceId,
     key: Bytes,
-    /// True if what is lost can be asked for.
+    /// Whether what is lost can be asked for.
     recovers: bool,
     next: AtomicU64,
     oldest: AtomicU64,
@@ -93,7 +93,7 @@ impl SourceProgress {
         &self.key
     }
 
-    /// True if what sinks lose can be sent to them again.
+    /// Returns `true` if what sinks lose can be sent to them again.
     pub fn recovers(&self) -> bool {
         self.recovers
     }
@@ -226,7 +226,7 @@ impl Source {
         let Some(key) = key else { return Ok(()) };
         let seq = self.next_number(&payload)?;
         self.seal_fragments(Some(&key), seq, head, &payload, &mut emit);
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         self.flush(emit);
         Ok(())
     }
@@ -249,7 +249,7 @@ impl Source {
     /// source will ask for it.
     pub fn record(&mut self, head: &MessageHead, payload: Bytes) -> Result<(), PublishError> {
         let seq = self.next_number(&payload)?;
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         Ok(())
     }
 
@@ -279,9 +279,9 @@ impl Source {
         }
         let seq = self.next_number(&Bytes::new())?;
         let (head, payload) =
-            (MessageHead::of_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
+            (MessageHead::for_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
         self.seal_fragments(None, seq, &head, &payload, &mut emit);
-        self.keep(Kept { seq, head, payload });
+        self.keep(HistoryEntry { seq, head, payload });
         self.flush(emit);
         Ok(())
     }
@@ -363,7 +363,7 @@ impl Source {
     ) -> Result<(), PublishError> {
         let seq = self.next_number(&payload)?;
         self.seal_fragments(None, seq, head, &payload, emit);
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         Ok(())
     }
 
@@ -372,7 +372,7 @@ impl Source {
         self.seq += 1;
         let head = MessageHead::new(MessageKind::Mark, 0);
         // Its own place in the history may be that of the oldest: what it says is what is left then.
-        self.keep(Kept { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
+        self.keep(HistoryEntry { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
         let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());
         if let Some(mark) = self.history.newest_mut() {
             mark.payload = payload.clone();
@@ -391,7 +391,7 @@ impl Source {
         Ok(self.seq)
     }
 
-    fn keep(&mut self, message: Kept) {
+    fn keep(&mut self, message: HistoryEntry) {
         let (seq, is_mark) = (message.seq, message.is_mark());
         self.history.push(message);
         // What is announced as past can be asked for by now, so the order matters.

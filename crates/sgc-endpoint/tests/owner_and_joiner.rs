@@ -5,8 +5,8 @@ use std::sync::Arc;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    ADVERT_INTERVAL, ADVERTS_BURST, Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason,
-    Output, ShareError, ShareSpec, Wish,
+    ADVERT_INTERVAL, ADVERTS_BURST, Endpoint, EndpointConfig, EndpointDrop, Event, JoinKind, JoinStatus,
+    Limits, LostReason, Output, ShareError, ShareSpec,
 };
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
@@ -22,7 +22,7 @@ struct Bench {
     identity: Arc<Identity>,
     sent: Vec<Control>,
     events: Vec<Event>,
-    dropped: Vec<Dropped>,
+    dropped: Vec<EndpointDrop>,
     timeout: Option<std::time::Instant>,
 }
 
@@ -227,7 +227,11 @@ fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
     let (frame, _) = join(&bench, &stranger, name, 1);
     bench.frame(frame);
     assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotVerified))]);
-    assert!(matches!(bench.dropped[..], [Dropped::NotVerified { what: "join", .. }]), "{:?}", bench.dropped);
+    assert!(
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "join", .. }]),
+        "{:?}",
+        bench.dropped
+    );
     assert_eq!(bench.endpoint.granted(&name), []);
 }
 
@@ -383,7 +387,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let metadata = Metadata::topic("arm-1", "/a", "p/msg/T");
     let blind = sgc_trust::TopicSecret::derive(secret, &metadata).blind();
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, arm.node_id(), Wish::Subscribe { describe: false });
+    bench.endpoint.join(bench.clock.now(), name, arm.node_id(), JoinKind::Subscribe { describe: false });
     bench.drain();
     assert!(matches!(&bench.sent[..], [Control::Interest { names }] if *names == [name]), "{:?}", bench.sent);
     advertise(&mut bench, &arm, blind);
@@ -421,7 +425,7 @@ fn answers_are_taken_in_their_order_and_each_once() {
     );
     for old in [second, third] {
         bench.frame(old);
-        assert!(bench.events.is_empty() && matches!(bench.dropped[..], [Dropped::Unexpected { .. }]));
+        assert!(bench.events.is_empty() && matches!(bench.dropped[..], [EndpointDrop::Unexpected { .. }]));
         assert_eq!(bench.endpoint.join_status(&name), Some(JoinStatus::Granted));
     }
 }
@@ -432,12 +436,12 @@ fn an_answer_that_the_owner_did_not_sign_or_seal_changes_nothing() {
     let other = identity(&Member::new("mallory"));
     bench.frame(grant(&other, name, sink, &reply_key, 2, 8));
     assert!(
-        matches!(bench.dropped[..], [Dropped::NotVerified { what: "answer", .. }]),
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "answer", .. }]),
         "{:?}",
         bench.dropped
     );
     bench.frame(grant(&arm, name, SinkId([0; 16]), &reply_key, 2, 8));
-    assert!(matches!(bench.dropped[..], [Dropped::Unexpected { .. }]), "{:?}", bench.dropped);
+    assert!(matches!(bench.dropped[..], [EndpointDrop::Unexpected { .. }]), "{:?}", bench.dropped);
     assert_eq!((bench.events.len(), bench.endpoint.join_status(&name)), (0, Some(JoinStatus::Granted)));
 }
 
@@ -458,7 +462,7 @@ fn a_name_of_another_owner_than_expected_is_not_asked_for() {
     let (arm, other) = (identity(&Member::new("arm-1")), identity(&Member::new("mallory")));
     let blind = sgc_wire::Blind([5; 32]);
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, other.node_id(), Wish::Subscribe { describe: false });
+    bench.endpoint.join(bench.clock.now(), name, other.node_id(), JoinKind::Subscribe { describe: false });
     bench.drain();
     advertise(&mut bench, &arm, blind);
     assert!(bench.sent.is_empty());

@@ -26,7 +26,7 @@ pub struct Tree {
 }
 
 impl FibEntry {
-    /// True if data of this name may come in over `link`.
+    /// Returns `true` if data of this name may come in over `link`.
     pub fn accepts_from(&self, link: LinkId) -> bool {
         self.trees.iter().any(|t| t.up == link || t.publishers.contains(&link))
     }
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_for_one_sink_comes_from_the_owners_side() {
+    fn packets_for_one_sink_come_from_the_owners_side() {
         let sink = SinkId([7; 16]);
         let entry = FibEntry { trees: [tree(1, &[], &[2, 3])].into(), sinks: vec![(sink, LinkId(2))] };
         assert_eq!(entry.egress_to(LinkId(1), &sink), Some(LinkId(2)));

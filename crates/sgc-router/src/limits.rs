@@ -106,9 +106,9 @@ pub(crate) struct Allowance {
     stale: Budget,
     forgeries: Budget,
     /// Names that all are asked for, for the first time.
-    first: Turns,
+    first: TurnBudget,
     /// The same, again.
-    again: Turns,
+    again: TurnBudget,
     /// Branches that it has here.
     pub(crate) branches: usize,
 }
@@ -121,8 +121,8 @@ impl Allowance {
             announcements: Budget::new(limits.announcements_burst, limits.announcements_burst / 8),
             stale: Budget::new(limits.stale_burst, limits.stale_burst / 8),
             forgeries: Budget::new(limits.forgeries_max, 1),
-            first: Turns::new(limits.unknown_per_peer_max),
-            again: Turns::new(limits.unknown_per_peer_max),
+            first: TurnBudget::new(limits.unknown_per_peer_max),
+            again: TurnBudget::new(limits.unknown_per_peer_max),
             branches: 0,
         }
     }
@@ -139,7 +139,7 @@ impl Allowance {
     }
 
     /// The turns of names that all are asked for on its behalf.
-    pub(crate) fn turns(&mut self, again: bool) -> &mut Turns {
+    pub(crate) fn turns(&mut self, again: bool) -> &mut TurnBudget {
         if again { &mut self.again } else { &mut self.first }
     }
 
@@ -163,7 +163,7 @@ impl Allowance {
         self.forgeries.take(now, 1, 1)
     }
 
-    /// True if nothing is used, so that forgetting it gives nothing back.
+    /// Returns `true` if nothing is used, so that forgetting it gives nothing back.
     pub(crate) fn is_whole(&self, now: Instant) -> bool {
         let budgets = [&self.joins, &self.queries, &self.announcements, &self.stale, &self.forgeries];
         let turns = [&self.first, &self.again];
@@ -175,13 +175,13 @@ impl Allowance {
 
 /// Turns that are given out in order: so many in each [`QUERY_EVERY`].
 #[derive(Debug)]
-pub(crate) struct Turns {
+pub(crate) struct TurnBudget {
     max: u32,
     /// Time at which all that were given out are paid for.
     next: Option<Instant>,
 }
 
-impl Turns {
+impl TurnBudget {
     fn new(max: u32) -> Self {
         Self { max: max.max(1), next: None }
     }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
-use sgc_wire::{Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
+use sgc_wire::{Hello, Name, NodeId, Now, PeerClock, SinkId, UnixMillis};
 
 use crate::names::RecordId;
-use crate::tell::Telling;
+use crate::tell::SyncProgress;
 
 /// What every link costs besides its round trip: among ways that are as quick, the one with fewer links is better.
 const COST_OF_LINK: u32 = 1000;
@@ -28,7 +28,7 @@ pub struct Neighbour {
     pub node: NodeId,
     /// Its certificate, and those between it and the CA.
     pub certs: Arc<[CertId]>,
-    /// True if its certificate lets it carry others' names.
+    /// Whether its certificate lets it carry others' names.
     pub may_route: bool,
     /// Last moment at which its certificate holds.
     pub not_after: UnixMillis,
@@ -44,7 +44,7 @@ impl From<&VerifiedPeer> for Neighbour {
 }
 
 /// What a link was told of a name that it asked for: the record's number, and the cost.
-pub(crate) type Told = Option<(RecordId, u32)>;
+pub(crate) type RecordCost = Option<(RecordId, u32)>;
 
 /// State of a link that is up.
 #[derive(Debug)]
@@ -64,15 +64,15 @@ pub(crate) struct LinkState {
     /// Branches that it is an end of.
     pub(crate) branches: BTreeSet<(Name, SinkId)>,
     /// Names that it wants to hear of, and what it heard.
-    pub(crate) interests: BTreeMap<Name, Told>,
+    pub(crate) interests: BTreeMap<Name, RecordCost>,
     /// Owners of names that its node asked for, and until when it is to be told of changes. Routers only.
     pub(crate) follows: BTreeMap<NodeId, Instant>,
     /// Names that are known over it.
     pub(crate) names: usize,
     /// Progress of telling it the state that was known when it greeted.
-    pub(crate) telling: Option<Telling>,
+    pub(crate) sync: Option<SyncProgress>,
     /// Its wall clock, as it told it.
-    pub(crate) told_clock: Option<ToldClock>,
+    pub(crate) told_clock: Option<PeerClock>,
     /// Time at which it was told everything once more because a clock was set.
     pub(crate) told_again: Option<Instant>,
 }
@@ -110,13 +110,13 @@ impl LinkState {
             interests: BTreeMap::new(),
             follows: BTreeMap::new(),
             names: 0,
-            telling: None,
+            sync: None,
             told_clock: None,
             told_again: None,
         }
     }
 
-    /// True once it said that it carries others' names, if its certificate lets it.
+    /// Returns `true` once it said that it carries others' names, if its certificate lets it.
     pub(crate) fn is_transit(&self) -> bool {
         self.may_route && self.hello.is_some_and(|h| h.transit)
     }
@@ -148,7 +148,7 @@ impl Cost {
         if self.suspect { cost.saturating_add(COST_SUSPECT) } else { cost }
     }
 
-    /// True while nothing at all comes over the link.
+    /// Returns `true` while nothing at all comes over the link.
     pub(crate) fn is_suspect(&self) -> bool {
         self.suspect
     }

@@ -18,11 +18,11 @@ pub enum MappingKind {
 
 /// What is known of a name that somebody waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Known {
+pub(crate) enum NameLocation {
     /// Nothing, or its owner is nowhere in reach.
-    No,
+    Unknown,
     /// Where it is, from one who tells everybody.
-    Told,
+    Flooded,
     /// Where it is, as an answer that came over this link.
     Answered(LinkId),
 }
@@ -38,15 +38,15 @@ pub(crate) enum Ask {
 
 /// How names spread.
 pub(crate) trait Mapping: std::fmt::Debug + Send + Sync {
-    /// True if routers are told of names that they did not ask for.
+    /// Returns `true` if routers are told of names that they did not ask for.
     fn tells_unasked(&self) -> bool;
 
     /// Whom to ask about a name that somebody here waits for.
-    fn ask(&self, known: Known) -> Ask {
+    fn ask(&self, known: NameLocation) -> Ask {
         match known {
-            Known::No => Ask::Everyone,
-            Known::Told => Ask::Nobody,
-            Known::Answered(link) => Ask::One(link),
+            NameLocation::Unknown => Ask::Everyone,
+            NameLocation::Flooded => Ask::Nobody,
+            NameLocation::Answered(link) => Ask::One(link),
         }
     }
 }

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
 use sgc_trust::CLOCK_SKEW_MAX;
-use sgc_wire::{NodeId, Signed};
+use sgc_wire::{NodeId, SignedBody};
 
 /// Digests remembered of one signer. Neighbours repeat the last few announcements of a node when paths differ in speed or a
 /// partition ends; they are recognised without verifying them again.
@@ -15,13 +15,13 @@ const DIGESTS_MAX: usize = 8;
 
 /// The memory of one signer.
 #[derive(Debug)]
-struct Past {
+struct SignerMemory {
     /// Announcements with lower numbers are void.
     floor: u64,
     /// The floor that the last link state of the signer named, which ended.
     run_floor: u64,
     /// The one with the greatest number that ended without a newer one; its signer has to exceed it.
-    newest: Option<(u64, Signed)>,
+    newest: Option<(u64, SignedBody)>,
     digests: VecDeque<[u8; 32]>,
     /// After that no announcement of before verifies any more.
     until: Instant,
@@ -30,7 +30,7 @@ struct Past {
 /// Announcements of all signers that are in force no longer.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
-    signers: BTreeMap<NodeId, Past>,
+    signers: BTreeMap<NodeId, SignerMemory>,
     digests: BTreeMap<[u8; 32], (NodeId, u64)>,
     forgets: BTreeSet<(Instant, NodeId)>,
 }
@@ -47,7 +47,7 @@ impl Memory {
     }
 
     /// Returns the announcement with the greatest number that ended, and the number.
-    pub(crate) fn newest(&self, signer: &NodeId) -> Option<(u64, &Signed)> {
+    pub(crate) fn newest(&self, signer: &NodeId) -> Option<(u64, &SignedBody)> {
         self.signers.get(signer)?.newest.as_ref().map(|(seq, signed)| (*seq, signed))
     }
 
@@ -82,7 +82,7 @@ impl Memory {
         signer: &NodeId,
         seq: u64,
         digest: [u8; 32],
-        signed: &Signed,
+        signed: &SignedBody,
         max: usize,
     ) {
         self.superseded(now, signer, seq, digest, max);
@@ -104,7 +104,7 @@ impl Memory {
     }
 
     /// Returns the memory of a signer, kept from now on for as long as anything of before may verify.
-    fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut Past {
+    fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut SignerMemory {
         if !self.signers.contains_key(signer)
             && self.signers.len() >= max
             && let Some((_, quietest)) = self.forgets.first().copied()
@@ -112,7 +112,7 @@ impl Memory {
             self.forget(&quietest);
         }
         let until = now + 2 * CLOCK_SKEW_MAX;
-        let empty = || Past { floor: 0, run_floor: 0, newest: None, digests: VecDeque::new(), until };
+        let empty = || SignerMemory { floor: 0, run_floor: 0, newest: None, digests: VecDeque::new(), until };
         let past = self.signers.entry(*signer).or_insert_with(empty);
         self.forgets.remove(&(past.until, *signer));
         self.forgets.insert((until, *signer));
@@ -154,7 +154,7 @@ mod tests {
     fn a_signer_displaces_only_what_is_remembered_of_itself() {
         #[allow(clippy::disallowed_methods)]
         let start = Instant::now();
-        let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::new() };
+        let signed = SignedBody { body: Bytes::from_static(b"body"), signature: Bytes::new() };
         let (quiet, busy) = (NodeId([1; 32]), NodeId([2; 32]));
         let mut memory = Memory::default();
         memory.ended(start, &quiet, 7, digest(0), &signed, 10);

@@ -9,12 +9,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
-use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed, UnixMillis};
+use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, SignedBody, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::limits::QUERY_EVERY;
 use crate::links::{COST_SUSPECT, LinkState};
-use crate::mapping::{Ask, Known};
+use crate::mapping::{Ask, NameLocation};
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::shares::Shares;
@@ -41,7 +41,7 @@ pub(crate) struct Record {
     pub(crate) seq: u64,
     withdraw: bool,
     names: Box<[Name]>,
-    signed: Signed,
+    signed: SignedBody,
     issued_at: UnixMillis,
     digest: [u8; 32],
     /// End of its lease; of a withdrawal, the time from which nothing that it withdrew verifies.
@@ -65,7 +65,7 @@ impl Record {
 
 /// Why a record counts no longer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Gone {
+enum RecordEnd {
     /// Newer ones speak for its names.
     Superseded,
     /// Its lease is over, it is not believed any more, or it had to make room.
@@ -76,7 +76,7 @@ enum Gone {
 
 /// The way to a name, at a node that goes by what it is told.
 #[derive(Debug, Default)]
-struct Heard {
+struct NameRoutes {
     /// Cost from the neighbour to the owner.
     over: SmallVec<[(LinkId, u32); 2]>,
     selected: Option<LinkId>,
@@ -84,7 +84,7 @@ struct Heard {
 
 /// The advertisements and withdrawals of one owner.
 #[derive(Debug, Default)]
-struct OfOwner {
+struct OwnerRecords {
     /// Its advertisements, by sequence number.
     records: BTreeSet<(u64, RecordId)>,
     /// Its withdrawals, by sequence number.
@@ -97,8 +97,8 @@ struct OfOwner {
     bytes: usize,
 }
 
-impl OfOwner {
-    fn of_kind(&mut self, withdraw: bool) -> (&mut BTreeSet<(u64, RecordId)>, &mut usize) {
+impl OwnerRecords {
+    fn records_of_kind(&mut self, withdraw: bool) -> (&mut BTreeSet<(u64, RecordId)>, &mut usize) {
         match withdraw {
             true => (&mut self.withdrawals, &mut self.withdrawn),
             false => (&mut self.records, &mut self.names),
@@ -134,7 +134,7 @@ pub(crate) struct Names {
     /// The middle of the lease of each advertisement.
     renewals: BTreeSet<(Instant, RecordId)>,
     seen: BTreeMap<[u8; 32], RecordId>,
-    owners: BTreeMap<NodeId, OfOwner>,
+    owners: BTreeMap<NodeId, OwnerRecords>,
     next_id: RecordId,
     /// Records that are in force no longer.
     memory: Memory,
@@ -143,7 +143,7 @@ pub(crate) struct Names {
     most_withdrawn: BTreeSet<(usize, NodeId)>,
     /// Records that wait for the allowance of their owner to be passed on.
     waiting: BTreeMap<NodeId, BTreeSet<RecordId>>,
-    heard: BTreeMap<Name, Heard>,
+    heard: BTreeMap<Name, NameRoutes>,
     /// Who wants to hear of a name: proxies, and this node's own endpoint.
     watchers: BTreeMap<Name, BTreeSet<LinkId>>,
     /// Names that are asked for, and when the next time is.
@@ -215,8 +215,8 @@ impl Names {
     }
 
     /// Returns the last message of an owner, in force or not, and its number.
-    fn newest(&self, owner: &NodeId) -> Option<(u64, &Signed)> {
-        let in_force = self.owners.get(owner).and_then(OfOwner::newest);
+    fn newest(&self, owner: &NodeId) -> Option<(u64, &SignedBody)> {
+        let in_force = self.owners.get(owner).and_then(OwnerRecords::newest);
         let in_force = in_force.and_then(|(seq, id)| Some((seq, &self.records.get(&id)?.signed)));
         in_force.into_iter().chain(self.memory.newest(owner)).max_by_key(|(seq, _)| *seq)
     }
@@ -312,12 +312,12 @@ impl Router {
         }
     }
 
-    /// True if `name` may be told over `link`: not back where it is, and others' names only by routers.
+    /// Returns `true` if `name` may be told over `link`: not back where it is, and others' names only by routers.
     fn may_tell(&self, way: LinkId, link: LinkId) -> bool {
         way != link && (way == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
     }
 
-    pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: Signed) {
+    pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: SignedBody) {
         let Some(state) = self.links.get(&link) else { return };
         let (neighbour, from_router, is_local) = (state.node, state.is_transit(), link == LinkId::LOCAL);
         let digest = signed_digest(&signed);
@@ -465,14 +465,14 @@ impl Router {
             && (of_owner.records.len() + of_owner.withdrawals.len() > most || of_owner.bytes > bytes_max)
             && let Some(oldest) = of_owner.oldest()
         {
-            gone.extend(self.forget_record(oldest, Gone::Ended));
+            gone.extend(self.forget_record(oldest, RecordEnd::Ended));
         }
         while self.names.withdrawn > tombstones_max
             && let Some((_, owner)) = self.names.most_withdrawn.last().copied()
             && let Some((_, oldest)) =
                 self.names.owners.get(&owner).and_then(|o| o.withdrawals.first()).copied()
         {
-            self.forget_record(oldest, Gone::Ended);
+            self.forget_record(oldest, RecordEnd::Ended);
         }
         gone
     }
@@ -486,7 +486,7 @@ impl Router {
             self.names.renewals.insert((record.renewal_due, id));
         }
         let of_owner = self.names.owners.entry(record.owner.node_id).or_default();
-        of_owner.of_kind(record.withdraw).0.insert((record.seq, id));
+        of_owner.records_of_kind(record.withdraw).0.insert((record.seq, id));
         of_owner.bytes += record.bytes();
         let withdraw = record.withdraw;
         self.names.records.insert(id, record);
@@ -497,7 +497,7 @@ impl Router {
                 question.open = false;
             }
             if let Some(old) = self.names.words.insert(*name, id) {
-                self.release(old, 1, Gone::Superseded);
+                self.release(old, 1, RecordEnd::Superseded);
             }
         }
         self.hold(id, names.len());
@@ -509,7 +509,7 @@ impl Router {
         record.live += names;
         let (owner, withdraw, from) = (record.owner.node_id, record.withdraw, record.from);
         self.count(&owner, withdraw, from, names, usize::saturating_add);
-        self.release(id, 0, Gone::Unwanted);
+        self.release(id, 0, RecordEnd::Unwanted);
     }
 
     /// Counts names that a record speaks for, more or fewer.
@@ -522,7 +522,7 @@ impl Router {
         change: fn(usize, usize) -> usize,
     ) {
         let Some(of_owner) = self.names.owners.get_mut(owner) else { return };
-        let (_, count) = of_owner.of_kind(withdraw);
+        let (_, count) = of_owner.records_of_kind(withdraw);
         let old = std::mem::replace(count, change(*count, names));
         let new = *count;
         if withdraw {
@@ -537,7 +537,7 @@ impl Router {
     }
 
     /// Names are not of this record any more; without any it is gone.
-    fn release(&mut self, id: RecordId, names: usize, gone: Gone) {
+    fn release(&mut self, id: RecordId, names: usize, gone: RecordEnd) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
         record.live = record.live.saturating_sub(names);
         let is_gone = record.live == 0;
@@ -552,7 +552,7 @@ impl Router {
         self.names.renewals.remove(&(record.renewal_due, id));
         self.names.waits_no_more(&owner, id);
         if let Some(of_owner) = self.names.owners.get_mut(&owner) {
-            of_owner.of_kind(withdraw).0.remove(&(record.seq, id));
+            of_owner.records_of_kind(withdraw).0.remove(&(record.seq, id));
             of_owner.bytes = of_owner.bytes.saturating_sub(record.bytes());
             if of_owner.records.is_empty() && of_owner.withdrawals.is_empty() {
                 self.names.owners.remove(&owner);
@@ -561,14 +561,14 @@ impl Router {
         let (now, max) = (self.now.instant, self.config.limits.nodes_max);
         let Record { seq, digest, signed, .. } = record;
         match gone {
-            Gone::Superseded => self.names.memory.superseded(now, &owner, seq, digest, max),
-            Gone::Ended => self.names.memory.ended(now, &owner, seq, digest, &signed, max),
-            Gone::Unwanted => {}
+            RecordEnd::Superseded => self.names.memory.superseded(now, &owner, seq, digest, max),
+            RecordEnd::Ended => self.names.memory.ended(now, &owner, seq, digest, &signed, max),
+            RecordEnd::Unwanted => {}
         }
     }
 
     /// Forgets all names that a record still speaks for.
-    fn forget_record(&mut self, id: RecordId, gone: Gone) -> Vec<Name> {
+    fn forget_record(&mut self, id: RecordId, gone: RecordEnd) -> Vec<Name> {
         let Some(record) = self.names.records.get(&id) else { return Vec::new() };
         let names: Vec<_> =
             record.names.iter().copied().filter(|n| self.names.words.get(n) == Some(&id)).collect();
@@ -584,7 +584,7 @@ impl Router {
     pub(crate) fn void_names(&mut self, owner: &NodeId, floor: u64) {
         let old = self.names.owners.get(owner).into_iter().flat_map(|o| o.records.range(..(floor, 0)));
         for id in old.map(|(_, id)| *id).collect::<Vec<_>>() {
-            let names = self.forget_record(id, Gone::Superseded);
+            let names = self.forget_record(id, RecordEnd::Superseded);
             self.routes_changed(&names);
         }
     }
@@ -617,7 +617,7 @@ impl Router {
             // It may have been without interest when the record came.
             if self.names.known_seq(name).is_none_or(|known| known < seq) {
                 if let Some(old) = self.names.words.insert(*name, id) {
-                    self.release(old, 1, Gone::Superseded);
+                    self.release(old, 1, RecordEnd::Superseded);
                 }
                 self.hold(id, 1);
             }
@@ -646,7 +646,7 @@ impl Router {
     }
 
     /// Nothing that was heard over a link counts any more.
-    pub(crate) fn unhear(&mut self, link: LinkId) {
+    pub(crate) fn forget_via(&mut self, link: LinkId) {
         let mut lost = Vec::new();
         for (name, heard) in &mut self.names.heard {
             if heard.over.iter().any(|(l, _)| *l == link) {
@@ -746,7 +746,7 @@ impl Router {
             self.names.heard.remove(name);
             if let Some(id) = self.names.id(name) {
                 self.names.words.remove(name);
-                self.release(id, 1, Gone::Unwanted);
+                self.release(id, 1, RecordEnd::Unwanted);
             }
         }
     }
@@ -1130,13 +1130,13 @@ impl Router {
         while let Some((at, name)) = self.names.ask_at.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.ask_at.remove(&(at, name));
             let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
-                None => Known::No,
+                None => NameLocation::Unknown,
                 // The first to answer, or one that told it unasked, may keep back a later one.
-                Some(record) if record.renewal_due <= now.instant => Known::No,
+                Some(record) if record.renewal_due <= now.instant => NameLocation::Unknown,
                 Some(record) => match record.asked {
-                    Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
-                    Some(_) => Known::No,
-                    None => Known::Told,
+                    Some(_) if self.links.contains_key(&record.from) => NameLocation::Answered(record.from),
+                    Some(_) => NameLocation::Unknown,
+                    None => NameLocation::Flooded,
                 },
             };
             match self.mapping.ask(known) {
@@ -1200,7 +1200,8 @@ impl Router {
             self.names.expiries.remove(&(at, id));
             let withdraw = self.names.records.get(&id).is_some_and(|record| record.withdraw);
             // Nothing verifies any more that a withdrawal which is over speaks against.
-            let names = self.forget_record(id, if withdraw { Gone::Superseded } else { Gone::Ended });
+            let names =
+                self.forget_record(id, if withdraw { RecordEnd::Superseded } else { RecordEnd::Ended });
             if !withdraw {
                 self.routes_changed(&names);
             }
@@ -1225,7 +1226,7 @@ impl Router {
         let gone: Vec<_> = self.names.records.iter().filter(untrusted).map(|(id, _)| *id).collect();
         for id in gone {
             // It counts again if its certificate does.
-            let names = self.forget_record(id, Gone::Unwanted);
+            let names = self.forget_record(id, RecordEnd::Unwanted);
             self.routes_changed(&names);
         }
     }

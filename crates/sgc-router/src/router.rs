@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, CaFingerprint, CrlError, Identity, SignedError, TrustAnchors};
-use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
+use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, PeerClock, SinkId, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::FibEntry;
@@ -56,7 +56,7 @@ pub struct RouterConfig {
     pub identity: Arc<Identity>,
     /// The same, by its id.
     pub node: NodeId,
-    /// True if it carries others' names.
+    /// Whether it carries others' names.
     pub transit: bool,
     /// Random number of this run.
     pub incarnation: u64,
@@ -91,7 +91,7 @@ pub enum Output {
     Close {
         /// Which.
         link: LinkId,
-        /// Why.
+        /// The reason.
         reason: LinkClose,
     },
     /// Other certificates are believed from here on: a newer revocation list came. To be kept, and told to whatever
@@ -104,7 +104,7 @@ pub enum Output {
         link: LinkId,
     },
     /// Something was refused; count it and, where it matters, say it.
-    Dropped(Dropped),
+    Dropped(RouterDrop),
     /// Nothing more to do until then, or until something happens.
     Timeout(Option<Instant>),
 }
@@ -117,7 +117,7 @@ pub enum LinkClose {
     Superseded {
         /// The link of the other run, if it is here; otherwise the other run is linked to another router.
         by: Option<LinkId>,
-        /// True if the run that is closed is known to live: it came back after it was superseded once. The process of
+        /// Whether the run that is closed is known to live: it came back after it was superseded once. The process of
         /// a run that just greeted anew is mostly gone.
         alive: bool,
     },
@@ -146,12 +146,12 @@ pub enum LinkClose {
 
 /// What was refused, and who sent it.
 #[derive(Clone, Debug)]
-pub struct Dropped {
+pub struct RouterDrop {
     /// The link it came over.
     pub link: LinkId,
     /// The node at its other end, if the link is known.
     pub peer: Option<NodeId>,
-    /// Why.
+    /// The reason.
     pub reason: DropReason,
 }
 
@@ -469,7 +469,7 @@ impl Router {
     /// The link has taken all frames that came before an [`Output::Flush`].
     pub fn handle_flushed(&mut self, now: Now, link: LinkId) {
         self.now = now;
-        self.go_on_telling(link);
+        self.continue_sync(link);
     }
 
     /// Time passed.
@@ -594,7 +594,7 @@ impl Router {
     /// Tells a neighbour what it is to know of this node, and of the network if it is a router.
     fn tell_all(&mut self, link: LinkId) {
         if self.links.get(&link).is_some_and(LinkState::is_transit) {
-            self.begin_telling(link);
+            self.begin_sync(link);
         }
         self.send_interests(link);
     }
@@ -607,7 +607,7 @@ impl Router {
 
     fn handle_clock(&mut self, now: Now, link: LinkId, time: UnixMillis) {
         let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return };
-        let told = ToldClock::new(time, now);
+        let told = PeerClock::new(time, now);
         let was_wrong = state.told_clock.replace(told).is_some_and(|old| clocks_differ(old.ahead_ms(now)));
         // One of the two refused what the other signed until now, and would hear of it with the next lease only.
         if was_wrong && !clocks_differ(told.ahead_ms(now)) {
@@ -653,7 +653,7 @@ impl Router {
         }
         self.names.forget_asks(link);
         self.cut_link(link, state.branches);
-        self.unhear(link);
+        self.forget_via(link);
         if state.hello.is_some() {
             self.links_changed(self.now.instant, &state.node);
         }
@@ -698,6 +698,6 @@ impl Router {
 
     pub(crate) fn drop_frame(&mut self, link: LinkId, reason: DropReason) {
         let peer = self.links.get(&link).map(|l| l.node);
-        self.outputs.push_back(Output::Dropped(Dropped { link, peer, reason }));
+        self.outputs.push_back(Output::Dropped(RouterDrop { link, peer, reason }));
     }
 }

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::ops::Bound;
 use std::time::Duration;
 
-use sgc_wire::{Control, NodeId, Now, Signed};
+use sgc_wire::{Control, NodeId, Now, SignedBody};
 
 use crate::names::RecordId;
 use crate::router::{LinkId, Output, Router};
@@ -21,7 +21,7 @@ const LATE_EVERY: Duration = Duration::from_millis(100);
 
 /// Progress of telling a neighbour the state that was known when it greeted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Telling {
+pub(crate) enum SyncProgress {
     /// Link states, in the order of their nodes.
     Nodes { after: Option<NodeId>, end: RecordId },
     /// Advertisements and withdrawals, in the order in which they came, up to the first after the greeting.
@@ -39,7 +39,7 @@ impl Room {
         self.frames > 0 && self.bytes > 0
     }
 
-    fn take(&mut self, signed: &Signed) {
+    fn take(&mut self, signed: &SignedBody) {
         self.frames = self.frames.saturating_sub(1);
         self.bytes = self.bytes.saturating_sub(signed.body.len() + signed.signature.len());
     }
@@ -47,7 +47,7 @@ impl Room {
 
 impl Router {
     /// Tells a router that just greeted what is known of the network and of names.
-    pub(crate) fn begin_telling(&mut self, link: LinkId) {
+    pub(crate) fn begin_sync(&mut self, link: LinkId) {
         // This node's own link state comes first: ways to it wait for that.
         if let Some(record) = self.topology.node(&self.config.node) {
             let signed = record.signed.clone();
@@ -55,28 +55,28 @@ impl Router {
         }
         let end = self.names.next_id();
         if let Some(state) = self.links.get_mut(&link) {
-            state.telling = Some(Telling::Nodes { after: None, end });
+            state.sync = Some(SyncProgress::Nodes { after: None, end });
         }
-        self.go_on_telling(link);
+        self.continue_sync(link);
     }
 
     /// Tells the next part, and asks to hear when the link has taken it if there is more.
-    pub(crate) fn go_on_telling(&mut self, link: LinkId) {
-        let Some(mut telling) = self.links.get_mut(&link).and_then(|state| state.telling.take()) else {
+    pub(crate) fn continue_sync(&mut self, link: LinkId) {
+        let Some(mut sync) = self.links.get_mut(&link).and_then(|state| state.sync.take()) else {
             return;
         };
         let mut room = Room { frames: TELL_FRAMES_MAX, bytes: TELL_BYTES_MAX };
         while room.is_left() {
-            let next = match telling {
-                Telling::Nodes { after, end } => match self.next_node(after) {
+            let next = match sync {
+                SyncProgress::Nodes { after, end } => match self.next_node(after) {
                     Some((node, signed)) => {
                         room.take(&signed);
                         self.send(link, Control::LinkState { signed });
-                        Telling::Nodes { after: Some(node), end }
+                        SyncProgress::Nodes { after: Some(node), end }
                     }
-                    None => Telling::Adverts { next: 0, end },
+                    None => SyncProgress::Adverts { next: 0, end },
                 },
-                Telling::Adverts { next, end } => match self.next_advert(next, end) {
+                SyncProgress::Adverts { next, end } => match self.next_advert(next, end) {
                     Some(id) => {
                         for frame in self.record_frames(id, 0) {
                             if let Control::Advert { signed, .. } = &frame {
@@ -84,21 +84,21 @@ impl Router {
                             }
                             self.send(link, frame);
                         }
-                        Telling::Adverts { next: id + 1, end }
+                        SyncProgress::Adverts { next: id + 1, end }
                     }
                     None => return,
                 },
             };
-            telling = next;
+            sync = next;
         }
         if let Some(state) = self.links.get_mut(&link) {
-            state.telling = Some(telling);
+            state.sync = Some(sync);
             self.outputs.push_back(Output::Flush { link });
         }
     }
 
     /// The next link state that a neighbour is told unasked.
-    fn next_node(&self, after: Option<NodeId>) -> Option<(NodeId, Signed)> {
+    fn next_node(&self, after: Option<NodeId>) -> Option<(NodeId, SignedBody)> {
         if !self.config.transit {
             return None;
         }

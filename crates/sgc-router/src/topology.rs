@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, next_seq, signed_digest, verify_link_state};
-use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed, UnixMillis};
+use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, SignedBody, UnixMillis};
 
 use crate::links::LinkState;
 use crate::memory::Memory;
@@ -49,7 +49,7 @@ pub(crate) struct NodeRecord {
     routers: Vec<Adjacency>,
     attached: Vec<NodeTag>,
     pub(crate) certs: Arc<[CertId]>,
-    pub(crate) signed: Signed,
+    pub(crate) signed: SignedBody,
     pub(crate) issued_at: UnixMillis,
     digest: [u8; 32],
     expires: Instant,
@@ -128,7 +128,7 @@ impl Topology {
     }
 
     /// The link state of that number.
-    fn newest(&self, node: &NodeId) -> Option<(u64, &Signed)> {
+    fn newest(&self, node: &NodeId) -> Option<(u64, &SignedBody)> {
         let in_force = self.nodes.get(node).map(|record| (record.seq, &record.signed));
         in_force.into_iter().chain(self.memory.newest(node)).max_by_key(|(seq, _)| *seq)
     }
@@ -301,7 +301,7 @@ impl Router {
         self.topology.link_changed(now, neighbour);
     }
 
-    pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: Signed) {
+    pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: SignedBody) {
         let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return };
         let (neighbour, from_router) = (state.node, state.is_transit());
         let digest = signed_digest(&signed);
@@ -535,7 +535,7 @@ impl Router {
     }
 }
 
-/// True if a neighbour that was told `old` should hear of `new`.
+/// Returns `true` if a neighbour that was told `old` should hear of `new`.
 pub(crate) fn cost_differs(old: u32, new: u32) -> bool {
     old.abs_diff(new) > old.min(new) / COST_PART
 }

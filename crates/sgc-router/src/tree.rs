@@ -9,8 +9,8 @@ use std::time::Instant;
 
 use sgc_trust::{CertId, SignedError, VerifiedPeer, verify_answer, verify_join};
 use sgc_wire::{
-    Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role, Signed,
-    SinkId,
+    Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role,
+    SignedBody, SinkId,
 };
 use smallvec::SmallVec;
 
@@ -92,7 +92,7 @@ impl Tree {
 }
 
 impl Router {
-    pub(crate) fn handle_join(&mut self, now: Now, link: LinkId, signed: Signed) {
+    pub(crate) fn handle_join(&mut self, now: Now, link: LinkId, signed: SignedBody) {
         // Verifying is what costs: who asks too often is refused before it.
         let Some(state) = self.links.get(&link) else { return };
         let (node, is_router) = (state.node, state.is_transit());
@@ -161,7 +161,7 @@ impl Router {
         }
     }
 
-    pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: Signed) {
+    pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: SignedBody) {
         // The name and sink are needed to find the keys that may have signed; they are believed only after.
         let body = match AnswerBody::from_slice(&signed.body) {
             Ok(body) => body,
@@ -196,7 +196,7 @@ impl Router {
 
     /// Returns `true` if the owner of a name signed an answer: with the key of its advertisement in force, or with the one that
     /// it had when the request was passed on. Answers and advertisements may cross when an owner has another certificate.
-    fn is_of_owner(&self, now: Now, name: &Name, branch: &Branch, signed: &Signed) -> bool {
+    fn is_of_owner(&self, now: Now, name: &Name, branch: &Branch, signed: &SignedBody) -> bool {
         let signs = |owner: &VerifiedPeer| verify_answer(owner, signed).is_ok();
         let newest = self.names.record(name).map(|record| &record.owner);
         if newest.is_some_and(|owner| signs(owner)) {
@@ -349,7 +349,7 @@ impl Router {
     }
 
     /// Refuses a request that was not verified, as well as can be: its body may at least say whom to answer.
-    fn reject_unverified(&mut self, link: LinkId, signed: &Signed, reason: RejectReason) {
+    fn reject_unverified(&mut self, link: LinkId, signed: &SignedBody, reason: RejectReason) {
         if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body) {
             self.send(link, Control::Reject { name, sink, reason });
         }

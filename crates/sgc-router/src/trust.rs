@@ -97,7 +97,7 @@ impl Router {
         }
     }
 
-    /// True if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.
+    /// Returns `true` if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.
     pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
         let anchors = &self.config.anchors;
         let other_ca = certs.first().is_some_and(|c| anchors.ca_spki(&c.ca).is_none());

@@ -50,11 +50,11 @@ struct Bench {
 
 impl Bench {
     fn with(mapping: MappingKind, limits: Limits) -> Self {
-        Self::of_kind(mapping, limits, true)
+        Self::with_kind(mapping, limits, true)
     }
 
     /// A router, or a proxy that is linked to the same routers.
-    fn of_kind(mapping: MappingKind, limits: Limits, transit: bool) -> Self {
+    fn with_kind(mapping: MappingKind, limits: Limits, transit: bool) -> Self {
         let router_identity = |name: &str| identity(&Member { router: true, ..Member::new(name) });
         let own = router_identity("cloud");
         let clock = Clock::default();
@@ -436,7 +436,7 @@ fn an_unknown_name_is_asked_for_once_and_all_who_asked_are_answered() {
 }
 
 #[test]
-fn who_waits_for_a_name_makes_the_router_ask_again_and_again() {
+fn a_waiting_sink_makes_the_router_ask_again_and_again() {
     for mapping in [MappingKind::Flood, MappingKind::Query] {
         let mut bench = Bench::with(mapping, Limits::default());
         bench.with_proxies();
@@ -553,7 +553,7 @@ fn questions_are_bounded() {
 }
 
 #[test]
-fn what_a_node_signs_for_all_is_bounded_and_so_are_interests() {
+fn flooded_announcements_and_interests_of_a_node_are_bounded() {
     let limits = Limits { announcements_burst: 8, queries_burst: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     bench.with_proxies();
@@ -696,7 +696,7 @@ fn an_owner_hears_which_number_it_has_to_exceed_after_its_lease() {
 }
 
 #[test]
-fn what_one_owner_withdraws_displaces_nothing_of_another() {
+fn a_withdrawal_displaces_no_record_of_another_owner() {
     let limits = Limits { tombstones_max: 64, adverts_per_owner_max: 40, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     bench.with_owner_behind(5000, 9000);
@@ -721,7 +721,7 @@ fn what_one_owner_withdraws_displaces_nothing_of_another() {
 }
 
 #[test]
-fn what_an_owner_advertises_is_bounded_in_records_and_bytes() {
+fn advertisements_of_an_owner_are_bounded_in_records_and_bytes() {
     // A record of 256 names of which one is left, again and again.
     let all: Vec<_> = (0..255).map(numbered).collect();
     let of_records = Limits { adverts_per_owner_max: 20, ..Limits::default() };
@@ -824,7 +824,7 @@ fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
 }
 
 #[test]
-fn what_an_owner_advertised_before_it_started_anew_is_void() {
+fn advertisements_from_before_an_owners_restart_are_void() {
     let mut bench = Bench::new();
     bench.with_owner_behind(5000, 9000);
     bench.owner_says(1, 11, &[(4, 500)]);
@@ -1020,7 +1020,7 @@ fn a_granted_branch_outlives_an_answer_that_nobody_known_signed_until_its_sink_a
 
 #[test]
 fn an_answer_is_verified_when_its_name_is_not_known_any_more() {
-    let mut bench = Bench::of_kind(MappingKind::Flood, Limits::default(), false);
+    let mut bench = Bench::with_kind(MappingKind::Flood, Limits::default(), false);
     let names = vec![bench.name(&A)];
     bench.frame(0, Control::Interest { names: names.clone() });
     bench.advert(1, 10, &[A]);
@@ -1147,7 +1147,7 @@ fn a_router_may_ask_again_for_what_it_asked_for_when_there_is_no_room_for_more()
 }
 
 #[test]
-fn one_routers_questions_leave_room_for_those_of_others() {
+fn questions_of_one_router_leave_room_for_those_of_others() {
     let limits = Limits { questions_max: 64, asks_max: 64, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
     let many = unknown_names(&bench, 0, 200);

@@ -14,7 +14,7 @@ use sgc_router::{Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterC
 use sgc_trust::{Identity, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Encode, Hello, JoinBody, Name, NodeId, Request,
-    Signed, SinkId, UnixMillis,
+    SignedBody, SinkId, UnixMillis,
 };
 
 use crate::cast::{Member, identity};
@@ -679,7 +679,7 @@ fn blinds(batch: usize) -> impl Iterator<Item = Blind> {
 
 /// Kind and length of a frame.
 fn weigh(frame: &Control) -> (&'static str, usize) {
-    let signed = |s: &Signed| SIGNED_OVERHEAD_BYTES + s.body.len() + s.signature.len();
+    let signed = |s: &SignedBody| SIGNED_OVERHEAD_BYTES + s.body.len() + s.signature.len();
     match frame {
         Control::LinkState { signed: s } => ("link state", signed(s)),
         Control::Advert { signed: s, .. } => ("advert", 4 + signed(s)),
@@ -698,7 +698,8 @@ mod tests {
 
     #[test]
     fn frames_weigh_what_their_encoding_is_long() {
-        let signed = Signed { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
+        let signed =
+            SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
         let names = vec![Name([3; 32]); 3];
         for frame in [
             Control::LinkState { signed: signed.clone() },

@@ -19,11 +19,11 @@ pub const RECEIVE_WINDOW_BYTES_MIN: u32 = 1 << 20;
 /// whatever comes and goes.
 #[derive(Clone, Debug)]
 pub struct ReceiveBudget {
-    shared: Arc<Shared>,
+    shared: Arc<BudgetState>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct BudgetState {
     budget_bytes: u64,
     links: AtomicU64,
     granted_bytes: AtomicU64,
@@ -39,7 +39,7 @@ impl ReceiveBudget {
     /// Creates a budget of so many bytes.
     pub fn new(budget_bytes: u64) -> Self {
         let (links, granted_bytes) = (AtomicU64::new(0), AtomicU64::new(0));
-        Self { shared: Arc::new(Shared { budget_bytes, links, granted_bytes }) }
+        Self { shared: Arc::new(BudgetState { budget_bytes, links, granted_bytes }) }
     }
 
     /// Returns how many bytes all links may have received and not read now.
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_comes_and_goes_the_sum_is_bounded() {
+    fn the_sum_of_windows_stays_bounded() {
         let mut rng = ChaCha20Rng::seed_from_u64(1);
         let budget = ReceiveBudget::default();
         let mut leases = Vec::new();

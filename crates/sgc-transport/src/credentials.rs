@@ -18,10 +18,10 @@ use crate::error::CloseReason;
 /// The certificate and key of this node and the CAs that it trusts. Clones share.
 #[derive(Clone)]
 pub struct CredentialStore {
-    shared: Arc<Shared>,
+    shared: Arc<CurrentCredentials>,
 }
 
-struct Shared {
+struct CurrentCredentials {
     identity: ArcSwap<Identity>,
     anchors: ArcSwap<TrustAnchors>,
     /// The CAs whose nodes may attach; all that are believed if there is nothing.
@@ -33,7 +33,7 @@ impl CredentialStore {
     pub fn new(identity: Arc<Identity>) -> Self {
         let anchors = ArcSwap::from_pointee(identity.anchors().clone());
         Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(CurrentCredentials {
                 identity: ArcSwap::new(identity),
                 anchors,
                 admitted: ArcSwapOption::empty(),

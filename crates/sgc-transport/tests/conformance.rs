@@ -26,7 +26,7 @@ each_transport! {
         control_frames_go_both_ways_in_order
         thirteen_megabytes_arrive_intact_and_in_order
         flows_do_not_wait_for_each_other
-        what_is_queued_leaves_together_and_in_order
+        queued_packets_leave_together_and_in_order
         a_flow_given_up_inside_of_a_packet_does_not_pass_for_finished
         either_end_can_end_a_flow
         datagrams_carry_small_packets
@@ -249,7 +249,7 @@ async fn flows_do_not_wait_for_each_other(scheme: &str) {
     assert!(count >= 2, "{count}");
 }
 
-async fn what_is_queued_leaves_together_and_in_order(scheme: &str) {
+async fn queued_packets_leave_together_and_in_order(scheme: &str) {
     let (near, far) = pair_on(scheme, LinkOptions::default()).await;
     let sizes = [0, 1, 100, 2048, 2049, 3, 16 << 10, 5];
     let of = |seq: usize| packet(seq as u64, Bytes::from(vec![seq as u8; sizes[seq % sizes.len()]]));

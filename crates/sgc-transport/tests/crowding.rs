@@ -24,7 +24,7 @@ const FLOOD: usize = 20;
 
 /// A handshake that its peer keeps open.
 #[allow(dead_code, reason = "they are held, not used")]
-enum Stalled {
+enum StalledHandshake {
     Tcp(TcpStream),
     Udp(UdpSocket),
     Quic(Endpoint, Option<quinn::Connection>),
@@ -36,7 +36,13 @@ fn attacker(host: u8) -> SocketAddr {
 }
 
 /// Begins a handshake from this address, as far as makes it count as engaged, and leaves it there.
-async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAddr, number: u32) -> Stalled {
+async fn stall(
+    scheme: &str,
+    server: &Server,
+    member: &Identity,
+    from: SocketAddr,
+    number: u32,
+) -> StalledHandshake {
     match scheme {
         "quic" | "udp" => {
             let alpn = if scheme == "udp" { "sgc-udp/1" } else { "sgc/1" };
@@ -46,12 +52,12 @@ async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAdd
             let connecting = endpoint.connect_with(config, server.addr, "x.invalid").unwrap();
             // A refusal is an answer, too.
             let connection = soon(connecting).await.ok();
-            Stalled::Quic(endpoint, connection)
+            StalledHandshake::Quic(endpoint, connection)
         }
         "dtls" => {
             let socket = UdpSocket::bind(from).unwrap();
             prove_and_stall(&socket, server.addr, number);
-            Stalled::Udp(socket)
+            StalledHandshake::Udp(socket)
         }
         _ => {
             let socket = TcpSocket::new_v4().unwrap();
@@ -60,7 +66,7 @@ async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAdd
             let start: &[u8] = if scheme == "ws" { b"GET /sgc" } else { &[22, 3, 1] };
             // It may be turned away already.
             let _ = tcp.write_all(start).await;
-            Stalled::Tcp(tcp)
+            StalledHandshake::Tcp(tcp)
         }
     }
 }
@@ -97,7 +103,7 @@ async fn wait_for_pending(server: &Server, least: u64) {
 }
 
 /// Whatever one host does, it holds its share of the places and no more, and others connect.
-async fn one_address_that_stalls_keeps_nobody_else_out(scheme: &str) {
+async fn a_stalling_address_keeps_nobody_else_out(scheme: &str) {
     let fleet = fleet(1);
     let arm = enroll(&fleet, "arm-1");
     let server = crowded_listener(scheme, &fleet);
@@ -198,7 +204,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
 each_transport! {
     [
         links_that_nobody_reads_share_one_budget
-        one_address_that_stalls_keeps_nobody_else_out
+        a_stalling_address_keeps_nobody_else_out
         a_few_addresses_that_take_all_places_make_room_for_another
     ]: quic dtls udp tls tcp ws wss
 }

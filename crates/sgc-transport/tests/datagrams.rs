@@ -22,7 +22,7 @@ each_transport! {
         large_messages_survive_loss_and_reordering
         links_are_made_through_loss
         a_path_of_1280_bytes_is_wide_enough
-        what_is_altered_on_the_way_is_dropped
+        altered_datagrams_are_dropped
         links_without_offloads_and_with_marks_work
     ]: quic udp dtls
 }
@@ -124,8 +124,8 @@ async fn moved(link: &AnyLink, before: SocketAddr) {
 async fn large_messages_survive_loss_and_reordering(scheme: &str) {
     let (_dialer, near, far, relay) = relayed(scheme, LinkOptions::default()).await;
     for (loss, reorder) in [(0, 0), (10, 20), (50, 50)] {
-        relay.weather.loss.store(loss, Relaxed);
-        relay.weather.reorder.store(reorder, Relaxed);
+        relay.impairment.loss.store(loss, Relaxed);
+        relay.impairment.reorder.store(reorder, Relaxed);
         flow_with(&near, &far, image(13_000_000), async || {}).await;
     }
 }
@@ -138,8 +138,8 @@ async fn links_are_made_through_loss(scheme: &str) {
     let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Default::default());
     for seed in 0..4 {
         let relay = Relay::start(server.addr, seed).await;
-        relay.weather.loss.store(150, Relaxed);
-        relay.weather.reorder.store(100, Relaxed);
+        relay.impairment.loss.store(150, Relaxed);
+        relay.impairment.reorder.store(100, Relaxed);
         let url = format!("{scheme}://{}", relay.addr).parse().unwrap();
         let near = soon(dialer.dial(&url)).await.unwrap();
         let far = server.link().await;
@@ -153,7 +153,7 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), LinkOptions::default());
     let relay = Relay::start(server.addr, 5).await;
     // What IPv6 and UDP leave of it.
-    relay.weather.longest.store(1232, Relaxed);
+    relay.impairment.longest.store(1232, Relaxed);
     let dialer = dialer(enroll(&fleet, "arm-1"));
     let url = format!("{scheme}://{}", relay.addr).parse().unwrap();
     let near = soon(dialer.dial(&url)).await.unwrap();
@@ -163,17 +163,17 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
     assert!(near.stats().mtu_bytes <= 1232 && far.stats().mtu_bytes <= 1232);
 }
 
-async fn what_is_altered_on_the_way_is_dropped(scheme: &str) {
+async fn altered_datagrams_are_dropped(scheme: &str) {
     // Nothing else that is as long is to be on the way.
     let options = LinkOptions { mtu_discovery: false, ..LinkOptions::default() };
     let (_dialer, near, far, relay) = relayed(scheme, options).await;
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.flip.store(true, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.flip.store(true, Relaxed);
     let payload = Bytes::from("visible on the wire ".repeat(40));
     let sent = packet(5, payload.clone());
     far.send_datagram(&sent).await.unwrap();
     soon(async {
-        while relay.weather.flipped.load(Relaxed) == 0 {
+        while relay.impairment.flipped.load(Relaxed) == 0 {
             tokio::time::sleep(std::time::Duration::from_millis(1)).await;
         }
     })
@@ -182,7 +182,7 @@ async fn what_is_altered_on_the_way_is_dropped(scheme: &str) {
     let second = packet(6, payload.clone());
     far.send_datagram(&second).await.unwrap();
     assert_eq!(soon(near.recv_datagram()).await.unwrap().unwrap().header.seq, 6);
-    let seen = relay.weather.seen.lock().unwrap();
+    let seen = relay.impairment.seen.lock().unwrap();
     let is_visible = seen.iter().any(|d| d.windows(40).any(|w| w == &payload[..40]));
     assert_eq!(is_visible, scheme == "udp");
 }

@@ -26,7 +26,7 @@ struct Files {
 }
 
 impl Files {
-    fn of(identity: &Identity, name: &str) -> Self {
+    fn write(identity: &Identity, name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("sgc-dtls-{}-{name}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         std::fs::write(
@@ -69,7 +69,7 @@ async fn openssl_connects_with_certificates_of_both_sides() {
     let fleet = fleet(1);
     let options = LinkOptions { handshake_timeout: Duration::from_millis(1500), ..LinkOptions::default() };
     let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
-    let files = Files::of(&enroll(&fleet, "arm-1"), "client");
+    let files = Files::write(&enroll(&fleet, "arm-1"), "client");
     let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
     let to = server.addr.to_string();
     let mut child = openssl(
@@ -111,7 +111,7 @@ async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused()
     let _nobody = openssl("s_client", &["-dtls1_2", "-connect", &to]);
     let refused = server.refusal().await;
     assert!(matches!(refused.reason, Refusal::Certificate(CertError::NoCertificate)), "{refused}");
-    let files = Files::of(&enroll(&theirs, "arm-1"), "foreign");
+    let files = Files::write(&enroll(&theirs, "arm-1"), "foreign");
     let (leaf, key) = (files.path("leaf.der"), files.path("key.pem"));
     let args = ["-dtls1_2", "-connect", &to, "-cert", &leaf, "-certform", "DER", "-key", &key];
     let _foreign = openssl("s_client", &args);
@@ -122,7 +122,7 @@ async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     let fleet = fleet(1);
-    let files = Files::of(&enroll(&fleet, "router"), "server");
+    let files = Files::write(&enroll(&fleet, "router"), "server");
     let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
     let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let accept = format!("127.0.0.1:{port}");
@@ -314,11 +314,19 @@ async fn datagrams_that_were_overheard_move_no_link() {
     let url = format!("dtls://{}", relay.addr).parse().unwrap();
     let near = dial(enroll(&fleet, "arm-1"), &url).await.unwrap();
     let far = server.link().await;
-    relay.weather.tap.store(true, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
     near.send_control(bytes::Bytes::from(vec![5; 3000])).await.unwrap();
     soon(far.recv_control()).await.unwrap();
     let overheard = |relay: &Relay| -> Vec<Vec<u8>> {
-        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1 && d.len() > 60).cloned().collect()
+        relay
+            .impairment
+            .seen
+            .lock()
+            .unwrap()
+            .iter()
+            .filter(|d| d[0] == 0xc1 && d.len() > 60)
+            .cloned()
+            .collect()
     };
     until_true(|| overheard(&relay).len() >= 2).await;
     let here = far.remote();
@@ -349,17 +357,17 @@ async fn a_node_that_is_another_inside_gets_no_link() {
     let fleet = fleet(1);
     let mut server = dtls_router(&fleet);
     let relay = Relay::start(server.addr, 3).await;
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.loss.store(1000, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.loss.store(1000, Relaxed);
     let store = CredentialStore::new(enroll(&fleet, "arm-1"));
     let dialing = {
         let (dialer, url) = (dialer(store.clone()), format!("dtls://{}", relay.addr).parse().unwrap());
         tokio::spawn(async move { dial_with(&dialer, &url).await })
     };
     // DTLS has begun as one node; QUIC is going to be another.
-    until_true(|| !relay.weather.seen.lock().unwrap().is_empty()).await;
+    until_true(|| !relay.impairment.seen.lock().unwrap().is_empty()).await;
     store.set_identity(enroll(&fleet, "arm-12"));
-    relay.weather.loss.store(0, Relaxed);
+    relay.impairment.loss.store(0, Relaxed);
     let refused = server.refusal().await;
     assert!(matches!(refused.reason, Refusal::Greeting(ProtocolError::OtherNode)), "{refused}");
     let error = soon(dialing).await.unwrap().unwrap_err();
@@ -447,12 +455,12 @@ async fn spoof(
     let near = dial(enroll(fleet, "thief"), &url).await.unwrap();
     let far = server.link().await;
     talk(&near, &far).await;
-    relay.weather.seen.lock().unwrap().clear();
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.loss.store(1000, Relaxed);
+    relay.impairment.seen.lock().unwrap().clear();
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.loss.store(1000, Relaxed);
     near.send_control(bytes::Bytes::from_static(b"spoofed")).await.unwrap();
     let held = |relay: &Relay| -> Vec<Vec<u8>> {
-        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1).cloned().collect()
+        relay.impairment.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1).cloned().collect()
     };
     until_true(|| !held(&relay).is_empty()).await;
     soon(async {

@@ -16,7 +16,7 @@ use openssl::{openssl, pem};
 use sgc_transport::*;
 use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX, Identity};
 use sgc_wire::CERT_BYTES_MAX;
-use stranger::{Encounter, FakeListener, LongCertificate, VERSIONS, visit};
+use stranger::{FakeListener, HandshakeLog, LongCertificate, VERSIONS, visit};
 use support::*;
 
 /// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot send
@@ -146,7 +146,7 @@ fn for_dtls(identity: &Identity) -> DtlsCertificate {
 }
 
 /// Nobody who shook hands was shown a certificate, and none was on the wire in the clear.
-fn saw_nothing(met: &[Encounter], leaf: &[u8]) {
+fn saw_nothing(met: &[HandshakeLog], leaf: &[u8]) {
     // The key and what follows it, which is in no other certificate.
     let secret = &leaf[leaf.len() / 2..leaf.len() / 2 + 24];
     assert!(!met.is_empty());

@@ -461,7 +461,7 @@ async fn a_path_that_falls_silent_ends_the_link_in_time() {
 }
 
 #[tokio::test]
-async fn what_is_in_the_clear_is_what_was_asked_for() {
+async fn only_requested_links_are_in_the_clear() {
     for (scheme, is_clear) in [("tcp", true), ("tls", false), ("ws", false), ("wss", false)] {
         let fleet = fleet(1);
         let mut server = Server::start_on(scheme, enroll(&fleet, "router"), LinkOptions::default());

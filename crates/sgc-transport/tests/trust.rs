@@ -463,7 +463,7 @@ async fn a_key_of_another_kind_is_named() {
 }
 
 #[tokio::test]
-async fn what_was_revoked_during_a_handshake_counts() {
+async fn a_revocation_during_a_handshake_counts() {
     let fleet = fleet(1);
     let arm = enroll(&fleet, "arm-1");
     let store = CredentialStore::new(enroll(&fleet, "router"));

@@ -27,7 +27,7 @@ const PLACE_BYTES: usize = 4;
 /// Nodes of a tree of 64 leaves; none of fewer has more, with those that stand on two levels counted twice.
 const NODES_MAX: usize = 127;
 /// A node and its sibling on each of 7 levels.
-const CLIMB_NODES_MAX: usize = 14;
+const WALK_NODES_MAX: usize = 14;
 
 type Hash = [u8; HASH_BYTES];
 
@@ -87,12 +87,12 @@ impl Batch {
         self.leaves.len()
     }
 
-    /// True if there are none.
+    /// Returns `true` if there are none.
     pub fn is_empty(&self) -> bool {
         self.leaves.is_empty()
     }
 
-    /// True if no more fit.
+    /// Returns `true` if no more fit.
     pub fn is_full(&self) -> bool {
         self.len() >= BATCH_PACKETS_MAX
     }
@@ -135,8 +135,8 @@ struct KnownBatch {
 }
 
 /// What was hashed on the way from a leaf to the first node that is known, or to the root.
-struct Climb {
-    found: [(usize, Hash); CLIMB_NODES_MAX],
+struct MerkleWalk {
+    found: [(usize, Hash); WALK_NODES_MAX],
     len: usize,
     /// The last that was computed: the root, unless a known node was met.
     root: Hash,
@@ -156,20 +156,20 @@ impl BatchVerifier {
         let leaf = leaf(header, sealed);
         let known = self.known.iter_mut().find(|b| b.count == count && b.signature == signature);
         if let Some(batch) = known {
-            let climb = batch.climb(leaf, index, path)?;
-            batch.learn(&climb);
+            let walk = batch.walk(leaf, index, path)?;
+            batch.learn(&walk);
             return Ok(());
         }
         let mut batch = KnownBatch { count, signature: Vec::new(), known: 0, nodes: Vec::new() };
-        let climb = batch.climb(leaf, index, path)?;
+        let walk = batch.walk(leaf, index, path)?;
         self.checked += 1;
-        if !self.key.verify(&signed_bytes(count, &climb.root), signature) {
+        if !self.key.verify(&signed_bytes(count, &walk.root), signature) {
             return Err(OpenError::Signature);
         }
         if count > 1 {
             batch.nodes = vec![[0; HASH_BYTES]; position(count.into(), height(count.into()), 0) + 1];
             batch.signature = signature.to_vec();
-            batch.learn(&climb);
+            batch.learn(&walk);
             if self.known.len() >= BATCHES_KNOWN_MAX {
                 self.known.pop_front();
             }
@@ -187,9 +187,9 @@ impl BatchVerifier {
 impl KnownBatch {
     /// Hashes upwards from a leaf to the first node that is known, or to the root; what lies above a known
     /// node must be known too, and as the path says.
-    fn climb(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<Climb, OpenError> {
+    fn walk(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<MerkleWalk, OpenError> {
         let (count, index) = (usize::from(self.count), usize::from(index));
-        let mut climb = Climb { found: [(0, leaf); CLIMB_NODES_MAX], len: 0, root: leaf };
+        let mut walk = MerkleWalk { found: [(0, leaf); WALK_NODES_MAX], len: 0, root: leaf };
         let (mut current, mut trusted) = (leaf, false);
         let mut siblings_left = siblings(index, count).zip(path.chunks_exact(HASH_BYTES)).peekable();
         for level in 0..=height(count) {
@@ -198,7 +198,7 @@ impl KnownBatch {
                 match self.node(at) {
                     Some(known) if *known != current => return Err(OpenError::Signature),
                     Some(_) => trusted = true,
-                    None => climb.add(at, current),
+                    None => walk.add(at, current),
                 }
             }
             if let Some(((_, place), sibling)) = siblings_left.next_if(|((l, _), _)| *l == level) {
@@ -207,7 +207,7 @@ impl KnownBatch {
                 match self.node(at) {
                     Some(known) if *known != sibling => return Err(OpenError::Signature),
                     Some(_) => {}
-                    None => climb.add(at, sibling),
+                    None => walk.add(at, sibling),
                 }
                 if !trusted {
                     current =
@@ -215,16 +215,16 @@ impl KnownBatch {
                 }
             }
         }
-        climb.root = current;
-        Ok(climb)
+        walk.root = current;
+        Ok(walk)
     }
 
     fn node(&self, at: usize) -> Option<&Hash> {
         if self.known & (1 << at) != 0 { self.nodes.get(at) } else { None }
     }
 
-    fn learn(&mut self, climb: &Climb) {
-        for (at, hash) in &climb.found[..climb.len] {
+    fn learn(&mut self, walk: &MerkleWalk) {
+        for (at, hash) in &walk.found[..walk.len] {
             if let Some(node) = self.nodes.get_mut(*at) {
                 *node = *hash;
                 self.known |= 1 << at;
@@ -233,7 +233,7 @@ impl KnownBatch {
     }
 }
 
-impl Climb {
+impl MerkleWalk {
     fn add(&mut self, at: usize, hash: Hash) {
         self.found[self.len] = (at, hash);
         self.len += 1;

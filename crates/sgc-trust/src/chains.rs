@@ -19,10 +19,10 @@ pub(crate) const CHAINS_KNOWN_MAX: usize = 16_384;
 
 /// Peers by the chains that they were verified with.
 #[derive(Default)]
-pub(crate) struct KnownChains(Mutex<Known>);
+pub(crate) struct KnownChains(Mutex<ChainTable>);
 
 #[derive(Default)]
-struct Known {
+struct ChainTable {
     peers: BTreeMap<ChainHash, KnownPeer>,
     /// In the order in which they came.
     order: VecDeque<ChainHash>,
@@ -39,7 +39,7 @@ struct KnownPeer {
 pub(crate) struct ChainHash([u8; 32]);
 
 impl ChainHash {
-    pub(crate) fn of(chain: &[CertificateDer<'_>]) -> Self {
+    pub(crate) fn from_chain(chain: &[CertificateDer<'_>]) -> Self {
         let mut context = digest::Context::new(&digest::SHA256);
         for certificate in chain {
             context.update(&(certificate.len() as u64).to_be_bytes());
@@ -62,7 +62,7 @@ impl KnownChains {
     /// Remembers a peer whose chain was verified.
     pub(crate) fn remember(&self, chain: ChainHash, peer: VerifiedPeer, validity: Validity) {
         let mut known = self.lock();
-        let Known { peers, order } = &mut *known;
+        let ChainTable { peers, order } = &mut *known;
         if peers.insert(chain, KnownPeer { peer, validity }).is_none() {
             order.push_back(chain);
         }
@@ -73,7 +73,7 @@ impl KnownChains {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, ChainTable> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -110,7 +110,7 @@ mod tests {
     }
 
     fn is_known(anchors: &TrustAnchors, chain: &[CertificateDer<'_>], now: UnixMillis) -> bool {
-        anchors.chains.find(&ChainHash::of(chain), now).is_some()
+        anchors.chains.find(&ChainHash::from_chain(chain), now).is_some()
     }
 
     #[test]
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_one_ca_vouched_for_is_not_known_under_another() {
+    fn a_chain_verified_under_one_ca_is_unknown_under_another() {
         let (ours, theirs) = (fleet(1), fleet(2));
         let arm = enroll(&ours, "arm-1");
         ours.anchors().verify(arm.chain(), NOW).unwrap();
@@ -239,12 +239,12 @@ mod tests {
         let peer = enroll(&fleet, "arm-1").as_peer().clone();
         let validity = Validity { not_before: peer.not_before, not_after: peer.not_after };
         let known = KnownChains::default();
-        let hash = |n: usize| ChainHash::of(&[CertificateDer::from(n.to_be_bytes().to_vec())]);
+        let hash = |n: usize| ChainHash::from_chain(&[CertificateDer::from(n.to_be_bytes().to_vec())]);
         for n in 0..CHAINS_KNOWN_MAX + 10 {
             known.remember(hash(n), peer.clone(), validity);
             known.remember(hash(n), peer.clone(), validity);
         }
-        let Known { peers, order } = &*known.lock();
+        let ChainTable { peers, order } = &*known.lock();
         assert_eq!((peers.len(), order.len()), (CHAINS_KNOWN_MAX, CHAINS_KNOWN_MAX));
         let is_there = |n: usize| peers.contains_key(&hash(n));
         assert!(!is_there(9) && is_there(10) && is_there(CHAINS_KNOWN_MAX + 9));

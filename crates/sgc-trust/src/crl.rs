@@ -73,13 +73,13 @@ impl TrustAnchors {
         (number.len() <= 8).then(|| number.iter().fold(0, |n, byte| (n << 8) | u64::from(*byte)))
     }
 
-    /// True if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
+    /// Returns `true` if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
     /// or that incarnation of the node.
     pub fn is_path_revoked(&self, path: &[CertId]) -> bool {
         self.path_revoked_at(path).is_some()
     }
 
-    /// True if a certificate on the path to this peer is revoked, or the peer itself.
+    /// Returns `true` if a certificate on the path to this peer is revoked, or the peer itself.
     pub fn is_peer_revoked(&self, peer: &VerifiedPeer) -> bool {
         self.is_path_revoked(&peer.path)
     }
@@ -90,7 +90,7 @@ impl TrustAnchors {
         self.ca_spki(&peer.ca).is_some() && !self.is_peer_revoked(peer)
     }
 
-    /// True if the key of the first CA made this signature, with any algorithm that it has.
+    /// Returns `true` if the key of the first CA made this signature, with any algorithm that it has.
     pub(crate) fn signed_by_first(&self, message: &[u8], signature: &[u8]) -> bool {
         let Some((key_algorithm, key)) = self.anchors.first().and_then(|a| split_spki(&a.spki)) else {
             return false;
@@ -117,8 +117,8 @@ impl TrustAnchors {
         }
         // Webpki checks the form as a whole: versions, critical extensions, that both algorithms are the same.
         let list = BorrowedCertRevocationList::from_der(der).map_err(CrlError::from_webpki)?;
-        let fields =
-            ListFields::of(der).ok_or_else(|| CrlError::Malformed("its fields cannot be read".into()))?;
+        let fields = ListFields::from_list(der)
+            .ok_or_else(|| CrlError::Malformed("its fields cannot be read".into()))?;
         if fields.is_scoped {
             return Err(CrlError::Partial);
         }
@@ -173,7 +173,7 @@ impl CrlNumber {
 }
 
 impl Anchor {
-    /// True if this CA's key made the signature of the list.
+    /// Returns `true` if this CA's key made the signature of the list.
     fn signed(&self, list: &ListFields<'_>) -> bool {
         let Some((key_algorithm, key)) = split_spki(&self.spki) else { return false };
         CHAIN_ALGORITHMS
@@ -256,7 +256,7 @@ pub enum CrlError {
 }
 
 impl CrlError {
-    /// True if an honest node never passes such a list on.
+    /// Returns `true` if an honest node never passes such a list on.
     pub fn is_forgery(&self) -> bool {
         match self {
             // A CA that is not trusted here may be trusted there, clocks differ, and there may be room elsewhere.

@@ -42,7 +42,7 @@ impl Fleet {
         request: &EnrollRequest,
         rng: &mut impl CryptoRng,
     ) -> Result<Membership, FleetError> {
-        self.enroll_key(&RequestedKey::of(csr)?, request, rng)
+        self.enroll_key(&RequestedKey::from_request(csr)?, request, rng)
     }
 
     /// Makes an identity of which the roster knows nothing, so that it cannot be revoked or renewed: for fleets that
@@ -104,7 +104,8 @@ impl Fleet {
         now: UnixMillis,
     ) -> Result<(), FleetError> {
         let leaf = chain.first().ok_or(FleetError::Adopt("there is no certificate"))?;
-        let begin = Validity::of(leaf).ok_or(FleetError::Adopt("it cannot be read"))?.not_before;
+        let begin =
+            Validity::from_certificate(leaf).ok_or(FleetError::Adopt("it cannot be read"))?.not_before;
         let peer = self
             .anchors
             .verify(chain, begin)
@@ -177,7 +178,7 @@ impl Fleet {
         };
         let member = self.member(key, request, incarnation, rng)?;
         let leaf = member.chain.first().ok_or(FleetError::CaName)?;
-        let made = Validity::of(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
+        let made = Validity::from_certificate(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
         let (Validity { not_after, .. }, serial) = made;
         let mut node = RosterNode {
             name: request.node.clone(),
@@ -267,7 +268,7 @@ pub struct EnrollRequest {
     pub router: bool,
     /// For a member whose certificate lets it carry others' names as well.
     pub may_route: bool,
-    /// True if a node that was revoked may be one again, in its next incarnation.
+    /// Whether a node that was revoked may be one again, in its next incarnation.
     pub again: bool,
     /// How long the certificate is to hold; never longer than the CA.
     pub valid: Duration,

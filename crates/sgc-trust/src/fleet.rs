@@ -91,7 +91,8 @@ impl Fleet {
         rng: &mut impl CryptoRng,
     ) -> Result<Self, FleetError> {
         let key = Key::from_pkcs8(key).ok_or(FleetError::Key)?;
-        let fields = CaFields::of(&certificate).ok_or(FleetError::NotACa("it cannot be read"))?;
+        let fields =
+            CaFields::from_certificate(&certificate).ok_or(FleetError::NotACa("it cannot be read"))?;
         if !fields.is_ca {
             return Err(FleetError::NotACa("its basic constraints do not say CA"));
         }
@@ -216,14 +217,14 @@ impl Fleet {
 
     /// Takes over what `other`, another copy of this fleet's file, knows: no revocation, enrolment or incarnation of
     /// either is lost. The order in which copies are merged does not matter.
-    pub fn merge(&mut self, other: &Self, now: UnixMillis) -> Result<Merged, FleetError> {
+    pub fn merge(&mut self, other: &Self, now: UnixMillis) -> Result<MergeReport, FleetError> {
         if self.key.subject_public_key_info() != other.key.subject_public_key_info()
             || self.secret.expose() != other.secret.expose()
         {
             return Err(FleetError::OtherFleet { name: other.name.clone() });
         }
         if !other.has_roster() {
-            return Ok(Merged::default());
+            return Ok(MergeReport::default());
         }
         self.begin_roster_if_none(now)?;
         let mut roster = self.roster.clone();
@@ -234,7 +235,7 @@ impl Fleet {
         if roster.revoked.len() > REVOKED_NODES_MAX {
             return Err(FleetError::TooManyRevoked);
         }
-        let merged = Merged::between(&self.roster, &roster, &self.secret);
+        let merged = MergeReport::between(&self.roster, &roster, &self.secret);
         let known: Vec<_> = self.naming.iter().chain(&other.naming).cloned().collect();
         let named = |g: &Generation| known.iter().find(|n| n.generation == g.number && hash(n) == g.hash);
         let naming: Option<Vec<_>> = roster.generations.iter().rev().map(|g| named(g).cloned()).collect();
@@ -250,9 +251,9 @@ impl Fleet {
 
     /// Takes over the nodes that this fleet's CA has revoked by name in lists which `anchors` has. Another copy of the
     /// fleet's file made a list that says more than this one.
-    pub fn absorb(&mut self, anchors: &TrustAnchors, now: UnixMillis) -> Result<Absorbed, FleetError> {
-        let Some(ca) = self.anchors.fingerprints().next() else { return Ok(Absorbed::default()) };
-        let mut absorbed = Absorbed::default();
+    pub fn absorb(&mut self, anchors: &TrustAnchors, now: UnixMillis) -> Result<CrlReport, FleetError> {
+        let Some(ca) = self.anchors.fingerprints().next() else { return Ok(CrlReport::default()) };
+        let mut absorbed = CrlReport::default();
         let mut revoked = self.roster.revoked.clone();
         for (node, revocation) in anchors.revoked_nodes(&ca) {
             if add_revocation(&mut revoked, node, revocation) {
@@ -443,7 +444,7 @@ impl Fleet {
         self.roster.settings.authority.as_ref()
     }
 
-    /// True if links and grants of the fleet resist quantum computers.
+    /// Returns `true` if links and grants of the fleet resist quantum computers.
     pub fn post_quantum(&self) -> bool {
         self.roster.settings.post_quantum
     }
@@ -558,7 +559,7 @@ impl Fleet {
         certificate: CertificateDer<'static>,
     ) -> Result<Self, FleetError> {
         let anchors = TrustAnchors::new([certificate.clone()]).map_err(FleetError::Certificate)?;
-        let validity = Validity::of(&certificate).ok_or(FleetError::KeyMismatch)?;
+        let validity = Validity::from_certificate(&certificate).ok_or(FleetError::KeyMismatch)?;
         let is_of_key = webpki::EndEntityCert::try_from(&certificate)
             .is_ok_and(|c| c.subject_public_key_info().as_ref() == key.subject_public_key_info());
         if !is_of_key {
@@ -572,7 +573,7 @@ impl Fleet {
 
 /// The gain of a copy of a fleet's file by a merge.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Merged {
+pub struct MergeReport {
     /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
     pub revoked: Vec<String>,
     /// Nodes that it did not know.
@@ -584,11 +585,11 @@ pub struct Merged {
     /// Generations that both copies made, each with a secret of its own, and of which it has the other one's now: nodes
     /// that have its own one have to be renewed.
     pub replaced: Vec<u32>,
-    /// True if nodes are told something else now when they are enrolled or renewed.
+    /// Whether nodes are told something else now when they are enrolled or renewed.
     pub settings: bool,
 }
 
-impl Merged {
+impl MergeReport {
     fn between(before: &Roster, after: &Roster, secret: &FleetSecret) -> Self {
         let named: BTreeMap<_, _> = after.nodes.keys().map(|n| (secret.pseudonym(n.as_str()), n)).collect();
         let name = |node: &Pseudonym| named.get(node).map_or_else(|| node.short(), |n| n.to_string());
@@ -615,10 +616,10 @@ impl Merged {
 
 /// News that revocation lists brought to a copy of a fleet's file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Absorbed {
+pub struct CrlReport {
     /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
     pub revoked: Vec<String>,
-    /// True if another copy made a list later than this one: what else was done with it is unknown here.
+    /// Whether another copy made a list later than this one: what else was done with it is unknown here.
     pub is_behind: bool,
 }
 

@@ -47,7 +47,7 @@ impl Kem {
         }
     }
 
-    fn of_reply_key(key: &[u8]) -> Option<Self> {
+    fn from_reply_key(key: &[u8]) -> Option<Self> {
         [Self::X25519, Self::XWing].into_iter().find(|kem| kem.reply_key_bytes() == key.len())
     }
 }
@@ -141,7 +141,7 @@ pub fn seal_grant(
 ) -> Result<(Bytes, Bytes), GrantError> {
     let plain = Zeroizing::new(content.to_vec());
     let (info, aad) = (info(name, sink), serial.to_be_bytes());
-    match Kem::of_reply_key(reply_key).ok_or(GrantError::ReplyKey)? {
+    match Kem::from_reply_key(reply_key).ok_or(GrantError::ReplyKey)? {
         Kem::X25519 => {
             let (enc, sealed) = HPKE
                 .seal(&info, &aad, &plain, &HpkePublicKey(reply_key.to_vec()))

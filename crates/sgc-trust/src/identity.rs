@@ -200,7 +200,7 @@ impl Identity {
         self.parts.member.authority
     }
 
-    /// True if its fleet wants links and grants that a quantum computer does not open later.
+    /// Returns `true` if its fleet wants links and grants that a quantum computer does not open later.
     pub fn post_quantum(&self) -> bool {
         self.parts.member.post_quantum
     }
@@ -284,7 +284,7 @@ impl Identity {
         check_signs(&*key)?;
         let leaf = member.chain.first().ok_or(IdentityError::Missing(CHAIN_BLOCK))?;
         // At the chain's own beginning: whether it holds now is another question.
-        let validity = Validity::of(leaf).ok_or_else(|| {
+        let validity = Validity::from_certificate(leaf).ok_or_else(|| {
             IdentityError::Chain(CertError::Malformed("its validity cannot be read".into()))
         })?;
         let own = member.anchors.verify(&member.chain, validity.not_before).map_err(IdentityError::Chain)?;

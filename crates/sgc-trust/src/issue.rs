@@ -143,7 +143,7 @@ pub(crate) fn fleet_list(
         revoked_secs: revocation.at.secs(),
     }));
     let unreadable = || FleetError::Making("its own revocation list cannot be read".into());
-    let algorithm = ListFields::of(&list).ok_or_else(unreadable)?.algorithm;
+    let algorithm = ListFields::from_list(&list).ok_or_else(unreadable)?.algorithm;
     let tbs = ListFields::tbs_with_revoked_nodes(&list, &value).ok_or_else(unreadable)?;
     let signature = ca_key.sign(&tbs).map_err(FleetError::making)?;
     Ok(ListFields::signed(&tbs, algorithm, &signature))
@@ -240,13 +240,14 @@ pub(crate) struct RequestedKey {
 
 impl RequestedKey {
     /// Of a request that this key signed.
-    pub(crate) fn of(request: &[u8]) -> Result<Self, FleetError> {
+    pub(crate) fn from_request(request: &[u8]) -> Result<Self, FleetError> {
         const ECDSA: [&rcgen::SignatureAlgorithm; 2] =
             [&rcgen::PKCS_ECDSA_P256_SHA256, &rcgen::PKCS_ECDSA_P384_SHA384];
         if request.len() > CSR_BYTES_MAX {
             return Err(FleetError::Request("it is too long"));
         }
-        let fields = RequestFields::of(request).ok_or(FleetError::Request("it is not PKCS #10 in DER"))?;
+        let fields =
+            RequestFields::from_request(request).ok_or(FleetError::Request("it is not PKCS #10 in DER"))?;
         let (key_algorithm, key) = fields.key;
         let used = CHAIN_ALGORITHMS
             .iter()
@@ -272,7 +273,7 @@ impl RequestedKey {
 /// Returns a hash of the key that a request (PKCS #10, DER) is about; that the key signed it is not checked. Requests
 /// that cannot be read differ by all their bytes.
 pub fn requested_key_hash(request: &[u8]) -> [u8; 32] {
-    match RequestFields::of(request) {
+    match RequestFields::from_request(request) {
         Some(RequestFields { key: (algorithm, key), .. }) => sha256(&[algorithm, key]),
         None => sha256(&[request]),
     }
@@ -290,7 +291,7 @@ impl PublicKeyData for RequestedKey {
 
 /// What certificates and lists take over from the certificate of their CA.
 fn issuer_params(ca: &CertificateDer<'_>) -> Result<CertificateParams, FleetError> {
-    let fields = CaFields::of(ca).ok_or(FleetError::CaName)?;
+    let fields = CaFields::from_certificate(ca).ok_or(FleetError::CaName)?;
     let mut params = CertificateParams::default();
     params.distinguished_name = DistinguishedName::new();
     for (id, tag, value) in fields.name {

@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_spelling_is_allowed() {
+    fn only_one_spelling_is_allowed() {
         for good in ["arm-1", "a", "0", "lab.arm_2", &"x".repeat(LABEL_BYTES_MAX)] {
             assert_eq!(good.parse::<NodeName>().unwrap().as_str(), good);
         }

@@ -74,13 +74,13 @@ impl Membership {
         &self.fleet
     }
 
-    /// True if it is for a node that only routes: it holds no secret.
+    /// Returns `true` if it is for a node that only routes: it holds no secret.
     pub fn is_router(&self) -> bool {
         self.secret.is_none()
     }
 
     pub(crate) fn comment(&self, head: &str) -> String {
-        let not_after = self.chain.first().and_then(|c| Validity::of(c));
+        let not_after = self.chain.first().and_then(|c| Validity::from_certificate(c));
         let expires = not_after.map_or_else(|| "?".to_owned(), |v| v.not_after.to_string());
         format!(
             "{head}# node:    {}{}\n# fleet:   {}\n# expires: {expires}\n",
@@ -204,20 +204,20 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
     }
     naming.sort_unstable_by_key(|n| std::cmp::Reverse(n.generation));
     let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
-    let About { node, fleet, post_quantum, .. } = about;
+    let NodeSummary { node, fleet, post_quantum, .. } = about;
     let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
     member.check_secrets()?;
     Ok(FileParts { member, key: key.map(|b| b.content), reset_key })
 }
 
-struct About {
+struct NodeSummary {
     node: NodeName,
     fleet: FleetName,
     post_quantum: bool,
     names_from_root: bool,
 }
 
-fn read_about(about: &[u8]) -> Result<About, IdentityError> {
+fn read_about(about: &[u8]) -> Result<NodeSummary, IdentityError> {
     let decode = |r: &mut Reader<'_>| {
         let version = r.u8()?;
         if !(FILE_VERSION_1..=FILE_VERSION).contains(&version) {
@@ -235,5 +235,5 @@ fn read_about(about: &[u8]) -> Result<About, IdentityError> {
     r.finish().map_err(IdentityError::About)?;
     let node = node.parse().map_err(IdentityError::Name)?;
     let fleet = fleet.parse().map_err(IdentityError::Name)?;
-    Ok(About { node, fleet, post_quantum, names_from_root })
+    Ok(NodeSummary { node, fleet, post_quantum, names_from_root })
 }

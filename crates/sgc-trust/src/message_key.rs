@@ -88,7 +88,7 @@ impl MessageKey {
         &self.public
     }
 
-    /// True if it is of the kind that `suite` signs with.
+    /// Returns `true` if it is of the kind that `suite` signs with.
     pub fn fits(&self, suite: Suite) -> bool {
         match (&*self.inner, suite.scheme()) {
             (Inner::Unsigned, Scheme::Unsigned) | (Inner::Ed25519(_), Scheme::Ed25519) => true,

@@ -19,7 +19,7 @@ pub struct Grantees {
 
 /// Why a peer is in a set of grantees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Listed {
+pub enum GrantReason {
     /// It is named itself.
     Node,
     /// A group of it is named.
@@ -30,21 +30,21 @@ pub enum Listed {
 
 impl Grantees {
     /// How `peer` is among them, if it is.
-    pub fn find(&self, peer: &VerifiedPeer) -> Option<Listed> {
+    pub fn find(&self, peer: &VerifiedPeer) -> Option<GrantReason> {
         self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
     }
 
     /// How a node whose certificate proves this is among them, if it is. For those who ask about a node that is
     /// not there; what decides about one that is, is [`Grantees::find`].
-    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<Listed> {
+    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<GrantReason> {
         if self.nodes.contains(node) {
-            return Some(Listed::Node);
+            return Some(GrantReason::Node);
         }
         let group = groups.iter().find(|g| self.groups.contains(&(*ca, **g)));
-        group.map(|g| Listed::Group(*g)).or(self.fleets.contains(ca).then_some(Listed::Fleet))
+        group.map(|g| GrantReason::Group(*g)).or(self.fleets.contains(ca).then_some(GrantReason::Fleet))
     }
 
-    /// True if nobody is.
+    /// Returns `true` if nobody is.
     pub fn is_empty(&self) -> bool {
         self.fleets.is_empty() && self.nodes.is_empty() && self.groups.is_empty()
     }
@@ -61,7 +61,7 @@ pub struct Policy {
 
 /// Why a peer is not permitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum Denied {
+pub enum DenialReason {
     /// Neither it, nor a group of it, nor its fleet is named.
     #[error("neither the node, nor a group that its certificate puts it into, nor its fleet is named")]
     NotListed,
@@ -72,12 +72,12 @@ pub enum Denied {
 
 impl Policy {
     /// Whether `peer` may join as `role`, and because of what.
-    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<Listed, Denied> {
+    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<GrantReason, DenialReason> {
         let grantees = match role {
             Role::Subscribe => &self.subscribe,
-            Role::Publish if self.publish.is_empty() => return Err(Denied::Role),
+            Role::Publish if self.publish.is_empty() => return Err(DenialReason::Role),
             Role::Publish => &self.publish,
         };
-        grantees.find(peer).ok_or(Denied::NotListed)
+        grantees.find(peer).ok_or(DenialReason::NotListed)
     }
 }

@@ -38,12 +38,12 @@ impl Revocation {
         Self { incarnation, at: UnixMillis(at.secs() * 1000) }
     }
 
-    /// True if certificates of this incarnation are revoked by it.
+    /// Returns `true` if certificates of this incarnation are revoked by it.
     pub fn covers(&self, incarnation: u32) -> bool {
         incarnation <= self.incarnation
     }
 
-    /// True if `other` adds nothing to it.
+    /// Returns `true` if `other` adds nothing to it.
     fn includes(&self, other: &Self) -> bool {
         self.incarnation > other.incarnation || (self.incarnation == other.incarnation && self.at <= other.at)
     }

@@ -39,9 +39,9 @@ pub struct RosterNode {
     pub changed: UnixMillis,
     /// Its groups, sorted.
     pub groups: Vec<GroupName>,
-    /// True if it only routes: it has no secret.
+    /// Whether it only routes: it has no secret.
     pub router: bool,
-    /// True if its certificates let it carry others' names.
+    /// Whether its certificates let it carry others' names.
     pub may_route: bool,
     /// The newest generation of the naming secret that it was handed; 0 if that is unknown, or if it has none.
     pub generation: u32,
@@ -58,7 +58,7 @@ impl RosterNode {
         good.map(|c| c.not_after).max()
     }
 
-    /// True if another copy says the same of it, apart from when it was last handed something.
+    /// Returns `true` if another copy says the same of it, apart from when it was last handed something.
     pub(crate) fn is_as(&self, other: &Self) -> bool {
         let Self { generation, seen, .. } = *self;
         *self == Self { generation, seen, ..other.clone() }

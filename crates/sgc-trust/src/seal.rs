@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sealed_opens_and_the_head_is_behind_the_first_fragment() {
+    fn sealed_packets_open_and_the_head_is_behind_the_first_fragment() {
         for suite in CIPHERS {
             for (total, index, bytes) in [(0, 0, 0), (5, 0, 5), (40, 0, 16), (40, 1, 16), (40, 2, 8)] {
                 let h = header(suite, total, index);

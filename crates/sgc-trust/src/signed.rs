@@ -10,7 +10,7 @@ use bytes::Bytes;
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{
     AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, LinkStateBody, Name, RefuseReason,
-    RejectReason, Signed, UnixMillis,
+    RejectReason, SignedBody, UnixMillis,
 };
 
 use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
@@ -115,36 +115,36 @@ impl Identity {
     }
 
     /// Signs an advertisement of this node.
-    pub fn sign_advert(&self, body: &AdvertBody) -> Signed {
+    pub fn sign_advert(&self, body: &AdvertBody) -> SignedBody {
         self.signed(ADVERT, body)
     }
 
     /// Signs a join of this node.
-    pub fn sign_join(&self, body: &JoinBody) -> Signed {
+    pub fn sign_join(&self, body: &JoinBody) -> SignedBody {
         self.signed(JOIN, body)
     }
 
     /// Signs a link state of this node.
-    pub fn sign_link_state(&self, body: &LinkStateBody) -> Signed {
+    pub fn sign_link_state(&self, body: &LinkStateBody) -> SignedBody {
         self.signed(LINK_STATE, body)
     }
 
     /// Signs an answer of this node, the owner of the name.
-    pub fn sign_answer(&self, body: &AnswerBody) -> Signed {
+    pub fn sign_answer(&self, body: &AnswerBody) -> SignedBody {
         self.signed(ANSWER, body)
     }
 
-    fn signed(&self, context: &str, body: &impl Encode) -> Signed {
+    fn signed(&self, context: &str, body: &impl Encode) -> SignedBody {
         let body = body.to_bytes();
         let signature = self.sign(context, &body).into();
-        Signed { body, signature }
+        SignedBody { body, signature }
     }
 }
 
 /// Verifies an advertisement: chain, time, signature, sequence number; and derives the names it may claim.
 pub fn verify_advert(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedAdvert, SignedError> {
     let body = AdvertBody::from_slice(&signed.body)?;
@@ -161,7 +161,7 @@ pub fn verify_advert(
 /// Verifies a join: chain, time, signature.
 pub fn verify_join(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedJoin, SignedError> {
     let body = JoinBody::from_slice(&signed.body)?;
@@ -173,7 +173,7 @@ pub fn verify_join(
 /// Verifies a link state: chain, time, signature, sequence number. Whether the node may carry others' names is for the caller to see.
 pub fn verify_link_state(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedLinkState, SignedError> {
     let body = LinkStateBody::from_slice(&signed.body)?;
@@ -184,13 +184,13 @@ pub fn verify_link_state(
 }
 
 /// A fingerprint of something signed, body and signature: what was verified once needs not be verified again.
-pub fn signed_digest(signed: &Signed) -> [u8; 32] {
+pub fn signed_digest(signed: &SignedBody) -> [u8; 32] {
     let length = (signed.body.len() as u64).to_be_bytes();
     crate::verify::sha256(&[&length, &signed.body, &signed.signature])
 }
 
 /// Verifies an answer by the owner of the name.
-pub fn verify_answer(owner: &VerifiedPeer, signed: &Signed) -> Result<AnswerBody, SignedError> {
+pub fn verify_answer(owner: &VerifiedPeer, signed: &SignedBody) -> Result<AnswerBody, SignedError> {
     let body = AnswerBody::from_slice(&signed.body)?;
     owner.verify_signature(ANSWER, &signed.body, &signed.signature)?;
     Ok(body)

@@ -93,7 +93,7 @@ impl Suite {
         }
     }
 
-    /// True if each source signs its messages, and members cannot forge one another.
+    /// Returns `true` if each source signs its messages, and members cannot forge one another.
     pub fn is_signed(self) -> bool {
         self.scheme() != Scheme::Unsigned
     }

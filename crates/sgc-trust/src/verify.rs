@@ -128,7 +128,7 @@ impl TrustAnchors {
         if let Some(long) = chain.iter().find(|c| c.len() > CERT_BYTES_MAX) {
             return Err(CertError::CertificateTooLong { bytes: long.len() });
         }
-        let hash = ChainHash::of(chain);
+        let hash = ChainHash::from_chain(chain);
         if let Some(peer) = self.chains.find(&hash, now) {
             return Ok(peer);
         }
@@ -206,7 +206,7 @@ impl Anchor {
         let path = webpki::anchor_from_trusted_cert(&der).map_err(reason)?.to_owned();
         let spki: Box<[u8]> =
             EndEntityCert::try_from(&der).map_err(reason)?.subject_public_key_info().as_ref().into();
-        let validity = Validity::of(&der).ok_or("its validity cannot be read")?;
+        let validity = Validity::from_certificate(&der).ok_or("its validity cannot be read")?;
         let path_length = path_length(&der).ok_or("its path length cannot be read")?;
         let fingerprint = CaFingerprint(sha256(&[&spki]));
         Ok((Self { der, spki, fingerprint, validity, path_length }, path))
@@ -214,7 +214,9 @@ impl Anchor {
 
     /// While this CA and all of these hold.
     fn validity_with(&self, chain: &[CertificateDer<'_>]) -> Option<Validity> {
-        chain.iter().try_fold(self.validity, |all, certificate| Some(all.overlap(Validity::of(certificate)?)))
+        chain.iter().try_fold(self.validity, |all, certificate| {
+            Some(all.overlap(Validity::from_certificate(certificate)?))
+        })
     }
 
     /// Path validation takes a trusted CA as it is; an expired one is not trusted here.
@@ -301,7 +303,7 @@ pub struct VerifiedPeer {
     pub ca: CaFingerprint,
     /// Its certificate.
     pub cert: CertId,
-    /// True if its certificate lets it carry others' names (`sgc:role:router`).
+    /// Whether its certificate lets it carry others' names (`sgc:role:router`).
     pub may_route: bool,
     /// All certificates of its path, from the one below the CA to its own.
     pub path: Arc<[CertId]>,
@@ -322,7 +324,7 @@ impl VerifiedPeer {
             .map_err(|_| SignatureError { signer: self.node_id })
     }
 
-    /// True if its certificate puts it into this group.
+    /// Returns `true` if its certificate puts it into this group.
     pub fn is_in(&self, group: &GroupTag) -> bool {
         self.groups.binary_search(group).is_ok()
     }
@@ -365,8 +367,8 @@ impl VerifiedPeer {
         let cert = path.last_mut().ok_or(CertError::NoCertificate)?;
         cert.node = Some(NodeIncarnation { pseudonym, incarnation });
         let cert = cert.clone();
-        let Validity { not_before, not_after } =
-            Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
+        let Validity { not_before, not_after } = Validity::from_certificate(der)
+            .ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
         let spki = leaf.subject_public_key_info();
         let (algorithm_id, key) = split_spki(&spki).ok_or(CertError::KeyUnsupported)?;
         let algorithm = *OBJECT_ALGORITHMS
@@ -567,7 +569,7 @@ pub enum CertError {
 }
 
 impl CertError {
-    /// True if the certificate, or its CA's, does not hold at the time of the check.
+    /// Returns `true` if the certificate, or its CA's, does not hold at the time of the check.
     pub fn is_expiry(&self) -> bool {
         matches!(self, Self::Expired { .. } | Self::NotYetValid { .. } | Self::CaExpired { .. })
     }

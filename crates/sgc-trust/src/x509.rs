@@ -44,7 +44,7 @@ pub(crate) struct Validity {
 
 impl Validity {
     /// Of a DER certificate (RFC 5280, 4.1.2.5).
-    pub(crate) fn of(certificate: &[u8]) -> Option<Self> {
+    pub(crate) fn from_certificate(certificate: &[u8]) -> Option<Self> {
         let mut certificate = Der(certificate).enter(SEQUENCE)?;
         let mut tbs = certificate.enter(SEQUENCE)?;
         if tbs.peek()? == VERSION {
@@ -93,14 +93,14 @@ pub(crate) struct CaFields<'a> {
     /// Its components in order: type, tag of the value, value.
     pub(crate) name: Vec<(Vec<u64>, u8, &'a [u8])>,
     pub(crate) key_id: Option<&'a [u8]>,
-    /// True if its basic constraints say that it is one.
+    /// Whether its basic constraints say that it is one.
     pub(crate) is_ca: bool,
     /// True unless its key usage leaves out the signing of certificates.
     pub(crate) may_sign_certificates: bool,
 }
 
 impl<'a> CaFields<'a> {
-    pub(crate) fn of(certificate: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_certificate(certificate: &'a [u8]) -> Option<Self> {
         let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
         if tbs.peek()? == VERSION {
             tbs.skip()?;
@@ -150,7 +150,7 @@ pub(crate) struct RequestFields<'a> {
 }
 
 impl<'a> RequestFields<'a> {
-    pub(crate) fn of(request: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_request(request: &'a [u8]) -> Option<Self> {
         let mut whole = Der(request);
         let mut request = whole.enter(SEQUENCE)?;
         let from = request.0;
@@ -185,12 +185,12 @@ fn object_id(content: &[u8]) -> Option<Vec<u64>> {
     (!arcs.is_empty() && arc == 0).then_some(arcs)
 }
 
-/// True unless a DER certificate has a key usage that leaves out the signing of revocation lists.
+/// Returns `true` unless a DER certificate has a key usage that leaves out the signing of revocation lists.
 pub(crate) fn may_sign_lists(certificate: &[u8]) -> Option<bool> {
     Some(key_usage(certificate)?.is_none_or(|bits| bits & CRL_SIGN != 0))
 }
 
-/// True if the key usage of a DER certificate names the signing of certificates.
+/// Returns `true` if the key usage of a DER certificate names the signing of certificates.
 pub(crate) fn names_certificate_signing(certificate: &[u8]) -> Option<bool> {
     Some(key_usage(certificate)?.is_some_and(|bits| bits & KEY_CERT_SIGN != 0))
 }
@@ -248,14 +248,14 @@ pub(crate) struct ListFields<'a> {
     pub(crate) issuer: &'a [u8],
     /// Big-endian, without leading zeros; absent in lists of another profile.
     pub(crate) number: Option<&'a [u8]>,
-    /// True if it has an issuing distribution point: it may speak of some certificates only.
+    /// Whether it has an issuing distribution point: it may speak of some certificates only.
     pub(crate) is_scoped: bool,
     /// The value of the extension that revokes nodes, if it has one: then it is a fleet's list.
     pub(crate) revoked_nodes: Option<&'a [u8]>,
 }
 
 impl<'a> ListFields<'a> {
-    pub(crate) fn of(list: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_list(list: &'a [u8]) -> Option<Self> {
         let mut list = Der(list).enter(SEQUENCE)?;
         let from = list.0;
         let mut fields = list.enter(SEQUENCE)?;
@@ -502,7 +502,7 @@ mod tests {
         for der in [&[][..], &[SEQUENCE], &[SEQUENCE, 5, 1], &[SEQUENCE, 0x84, 1, 1, 1, 1], &[SEQUENCE, 0x80]]
         {
             assert!(Der(der).enter(SEQUENCE).is_none());
-            assert!(Validity::of(der).is_none() && split_spki(der).is_none());
+            assert!(Validity::from_certificate(der).is_none() && split_spki(der).is_none());
         }
     }
 }

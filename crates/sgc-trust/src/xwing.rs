@@ -152,7 +152,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_encapsulated_to_a_published_key_opens_with_it() {
+    fn a_secret_encapsulated_to_a_published_key_opens_with_it() {
         for vector in &vectors() {
             let (enc, secret) = encapsulate(&vector["pk"]).unwrap();
             assert_eq!(private_key(vector).decapsulate(&enc).unwrap(), secret);
@@ -175,7 +175,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_key_or_a_secret_is_refused() {
+    fn malformed_keys_and_secrets_are_refused() {
         let (key, public) = PrivateKey::generate().unwrap();
         let (enc, _) = encapsulate(&public).unwrap();
         for bytes in [&enc[..0], &enc[..ENC_BYTES - 1], &[&enc[..], &[0]].concat()] {

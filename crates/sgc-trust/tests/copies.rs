@@ -170,7 +170,7 @@ fn a_copy_learns_from_a_list_what_another_one_revoked() {
     assert!(told.is_behind && told.revoked.len() == 2, "{told:?}");
     assert!(told.revoked.contains(&"va".to_owned()) && told.revoked.contains(&vc), "{told:?}");
     let mut old = copy(&old);
-    assert_eq!(old.absorb(&anchors, at(3)).unwrap(), Absorbed::default());
+    assert_eq!(old.absorb(&anchors, at(3)).unwrap(), CrlReport::default());
     // Its own next list says it too, and it makes no certificate of either.
     old.revoke(&[], at(4)).unwrap();
     let own = with(old.anchors(), &old.revocation_list(at(4)).unwrap(), 4);

@@ -91,7 +91,7 @@ fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn what_is_sealed_is_as_the_vectors_say() {
+fn sealed_packets_match_the_vectors() {
     for vector in vectors() {
         assert!(vector.headers.last().is_some_and(|h| h.to == Some(SINK)));
         let random = matches!(vector.suite.name().split('-').next(), Some("paper"));

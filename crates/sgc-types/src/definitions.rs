@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_named_comes_before_the_environment_and_what_ships() {
+    fn named_folders_come_before_the_environment_and_shipped_types() {
         let dir = tempfile::tempdir().unwrap();
         write(dir.path(), "ament/share/mine/msg/A.msg", "int8 from_ament");
         write(dir.path(), "ament/share/mine/srv/S.srv", "int8 a\n---\nint8 b");

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_cdr::{Layout, TypeName};
 
-use crate::Described;
+use crate::ResolvedType;
 
 /// Types that are kept.
 pub const TYPES_MAX: usize = 1024;
@@ -25,11 +25,11 @@ pub const TYPES_PER_OWNER_BYTES_MAX: usize = TYPES_BYTES_MAX / 2;
 pub struct TypeStore {
     types_max: usize,
     bytes_max: usize,
-    kept: Mutex<Kept>,
+    kept: Mutex<StoreState>,
 }
 
 #[derive(Debug, Default)]
-struct Kept {
+struct StoreState {
     types: BTreeMap<(TypeName, String), Entry>,
     bytes: usize,
     taken_in: u64,
@@ -37,7 +37,7 @@ struct Kept {
 
 #[derive(Debug)]
 struct Entry {
-    described: Arc<Described>,
+    described: Arc<ResolvedType>,
     /// Grows with each that is taken in.
     at: u64,
 }
@@ -65,7 +65,7 @@ impl TypeStore {
     }
 
     /// Whether a type can be taken in.
-    pub fn has_room_for(&self, described: &Described) -> bool {
+    pub fn has_room_for(&self, described: &ResolvedType) -> bool {
         let kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
         let bytes = kept.bytes + described.description().len();
@@ -73,7 +73,7 @@ impl TypeStore {
     }
 
     /// Takes a type in; one that is known already stays as it is.
-    pub fn insert(&self, described: Described) -> Result<Arc<Described>, StoreFull> {
+    pub fn insert(&self, described: ResolvedType) -> Result<Arc<ResolvedType>, StoreFull> {
         let mut kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
         if let Some(known) = kept.types.get(&key) {
@@ -98,7 +98,7 @@ impl TypeStore {
     }
 
     /// A type with its description; without a hash, of those with this name the one that came last.
-    pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Described>> {
+    pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<ResolvedType>> {
         let kept = self.lock();
         let named = || {
             let named = kept.types.range((name.clone(), String::new())..).take_while(|((n, _), _)| n == name);
@@ -116,7 +116,7 @@ impl TypeStore {
     }
 
     /// The layout of messages of a type. The request and the response of a service are found by each hash that its endpoints
-    /// announce ([`Described::is_announced_as`]).
+    /// announce ([`ResolvedType::is_announced_as`]).
     pub fn layout(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Layout>> {
         if let Some(described) = self.described(name, type_hash) {
             return Some(described.layout().clone());
@@ -125,7 +125,7 @@ impl TypeStore {
         service.layout().part(name).map(Arc::new)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Kept> {
+    fn lock(&self) -> MutexGuard<'_, StoreState> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -136,9 +136,10 @@ mod tests {
 
     use super::*;
 
-    fn described(name: &str, text: &str) -> Described {
+    fn described(name: &str, text: &str) -> ResolvedType {
         let mut look_up = |_: &TypeName| Some(text.to_owned()).filter(|text| !text.is_empty());
-        Described::of(Library::empty().layout(&name.parse().unwrap(), &mut look_up).unwrap()).unwrap()
+        ResolvedType::from_layout(Library::empty().layout(&name.parse().unwrap(), &mut look_up).unwrap())
+            .unwrap()
     }
 
     #[test]
@@ -149,7 +150,7 @@ mod tests {
         assert!(store.layout(&name, None).is_none());
         let (old, new) = (store.insert(old).unwrap(), store.insert(new).unwrap());
         store.insert(described("p/msg/AB", "int8 other")).unwrap();
-        let hash = |found: Option<Arc<Described>>| found.unwrap().type_hash().to_owned();
+        let hash = |found: Option<Arc<ResolvedType>>| found.unwrap().type_hash().to_owned();
         assert_eq!(hash(store.described(&name, Some(old.type_hash()))), old.type_hash());
         assert_eq!(hash(store.described(&name, None)), new.type_hash());
         assert!(store.described(&name, Some("RIHS01_00")).is_none());
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_full_takes_nothing_in_before_it_is_told_what_is_in_use() {
+    fn a_full_store_takes_nothing_in_before_unused_types_are_removed() {
         let of = |n: usize| described(&format!("p/msg/A{n}"), "int8 a");
         let bytes = of(0).description().len();
         for store in [TypeStore::with_limits(2, usize::MAX), TypeStore::with_limits(9, 2 * bytes + bytes / 2)]

@@ -11,7 +11,7 @@ use crate::operation::OperationAnswer;
 use crate::packet::Class;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
-use crate::types::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
+use crate::type_descriptions::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
 
 /// Most entries of one catalogue.
 pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
@@ -106,13 +106,13 @@ pub struct CatalogueEntry {
     pub metadata: Metadata,
     /// The name is that of the owner and this.
     pub blind: Blind,
-    /// True if the one who asked may subscribe to it.
+    /// Whether the one who asked may subscribe to it.
     pub subscribe: bool,
-    /// True if the one who asked may publish on it.
+    /// Whether the one who asked may publish on it.
     pub publish: bool,
     /// Cipher suite id.
     pub suite: u8,
-    /// True if the DDS type has no key.
+    /// Whether the DDS type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash, if the owner's side knows it.
     pub type_hash: Option<String>,

@@ -32,12 +32,12 @@ impl ClockWatch {
 
 /// A wall clock as its owner told it, carried on by the monotonic clock here.
 #[derive(Clone, Copy, Debug)]
-pub struct ToldClock {
+pub struct PeerClock {
     time: UnixMillis,
     at: Now,
 }
 
-impl ToldClock {
+impl PeerClock {
     /// The clock that a peer told at `at`.
     pub fn new(time: UnixMillis, at: Now) -> Self {
         Self { time, at }
@@ -89,10 +89,10 @@ mod tests {
     #[test]
     fn a_difference_ends_when_either_clock_is_set() {
         let base = base();
-        let told = ToldClock::new(UnixMillis(base.unix.0 + 7_200_000), base);
+        let told = PeerClock::new(UnixMillis(base.unix.0 + 7_200_000), base);
         assert_eq!(told.ahead_ms(at(base, 5000, 0)), 7_200_000);
         assert_eq!(told.ahead_ms(at(base, 5000, 7_200_000)), 0);
-        assert_eq!(ToldClock::new(UnixMillis(0), base).ahead_ms(base), -1_795_000_000_000);
-        assert_eq!(ToldClock::new(UnixMillis(u64::MAX), base).ahead_ms(base), i64::MAX);
+        assert_eq!(PeerClock::new(UnixMillis(0), base).ahead_ms(base), -1_795_000_000_000);
+        assert_eq!(PeerClock::new(UnixMillis(u64::MAX), base).ahead_ms(base), i64::MAX);
     }
 }

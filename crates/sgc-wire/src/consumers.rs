@@ -5,7 +5,7 @@ use crate::control::Role;
 use crate::ids::Name;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
-use crate::types::TYPE_HASH_BYTES_MAX;
+use crate::type_descriptions::TYPE_HASH_BYTES_MAX;
 
 /// Most consumers in one answer.
 pub const CONSUMERS_MAX: usize = 512;

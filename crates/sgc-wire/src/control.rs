@@ -1,7 +1,7 @@
 //! Control frames between neighbours, and the signed bodies that travel in them from end to end.
 //!
 //! A frame is one type byte and its fields. What is signed is kept as the bytes that were signed
-//! ([`Signed`]), so that no re-encoding can change what a signature covers. Checking signatures is
+//! ([`SignedBody`]), so that no re-encoding can change what a signature covers. Checking signatures is
 //! `sgc-trust`'s, acting on frames `sgc-router`'s and `sgc-endpoint`'s.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
@@ -51,7 +51,7 @@ pub enum Control {
         /// Between routers it means nothing: they know the topology.
         cost: u32,
         /// An [`AdvertBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
     /// The sender can no longer reach these names.
     Unreach {
@@ -71,7 +71,7 @@ pub enum Control {
     /// A signed request to join a name's tree; travels towards the owner.
     Join {
         /// Name and sink as in the body, for routers that only pass it on.
-        signed: Signed,
+        signed: SignedBody,
     },
     /// A sink is gone; travels towards the owner.
     Leave {
@@ -83,7 +83,7 @@ pub enum Control {
     /// The owner's signed answer to a join; travels along the branch to the sink.
     Answer {
         /// An [`AnswerBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
     /// A router refuses a join, or cuts a branch.
     Reject {
@@ -91,7 +91,7 @@ pub enum Control {
         name: Name,
         /// Sink.
         sink: SinkId,
-        /// Why.
+        /// The reason.
         reason: RejectReason,
     },
     /// A sink asks a source of its name for messages it did not get; travels towards the owner.
@@ -116,7 +116,7 @@ pub enum Control {
     /// To whom a node is linked, and at what cost; travels from router to router.
     LinkState {
         /// A [`LinkStateBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
     /// Does anybody know where these names are? From router to router; answered with advertisements, now or when
     /// they become known.
@@ -165,7 +165,7 @@ pub enum Control {
     LaneAnswer {
         /// As offered.
         token: LaneToken,
-        /// True if it is.
+        /// Whether it is.
         accepted: bool,
     },
     /// The sender, which cannot dial, wants a lane for this name.
@@ -221,7 +221,7 @@ pub struct Hello {
     pub incarnation: u64,
     /// True for a router, which carries others' names; false for a node that only serves itself.
     pub transit: bool,
-    /// True if another run of this node has taken a link of this one over: this run takes over from nobody.
+    /// Whether another run of this node has taken a link of this one over: this run takes over from nobody.
     pub yields: bool,
     /// Beginning of this run, by its own clock: the floor in its link states.
     pub started: UnixMillis,
@@ -265,7 +265,7 @@ pub enum RejectReason {
 
 /// Bytes and a signature over them.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Signed {
+pub struct SignedBody {
     /// What was signed.
     pub body: Bytes,
     /// Signature by the key of the first certificate in the body's chain or of the name's owner.
@@ -283,7 +283,7 @@ pub struct AdvertBody {
     pub issued_at: UnixMillis,
     /// For how long it holds, milliseconds from its arrival.
     pub lease_ms: u32,
-    /// True if these names are withdrawn.
+    /// Whether these names are withdrawn.
     pub withdraw: bool,
     /// One per name: `name = SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
     pub blinds: Vec<Blind>,
@@ -302,7 +302,7 @@ pub struct LinkStateBody {
     pub lease_ms: u32,
     /// Advertisements of this node with lower sequence numbers are of an earlier run, and void.
     pub floor: u64,
-    /// True if the node carries others' names.
+    /// Whether the node carries others' names.
     pub transit: bool,
     /// The routers that it is linked to, ascending by node.
     pub routers: Vec<Adjacency>,
@@ -333,7 +333,7 @@ pub enum Role {
 pub enum Request {
     /// To receive what is published under the name.
     Subscribe {
-        /// True if the grant is to say what the name stands for: for one who cannot see the owner's catalogue.
+        /// Whether the grant is to say what the name stands for: for one who cannot see the owner's catalogue.
         describe: bool,
     },
     /// To publish under the name.
@@ -411,7 +411,7 @@ pub enum Answer {
     },
     /// Refused, or a grant taken back.
     Refuse {
-        /// Why.
+        /// The reason.
         reason: RefuseReason,
     },
 }
@@ -531,14 +531,14 @@ fn decode_names(r: &mut Reader<'_>) -> Result<Vec<Name>, DecodeError> {
     r.list("names", NAMES_PER_FRAME_MAX, Name::decode)
 }
 
-impl Encode for Signed {
+impl Encode for SignedBody {
     fn encode(&self, w: &mut Writer) {
         w.bytes(&self.body);
         w.bytes(&self.signature);
     }
 }
 
-impl Decode for Signed {
+impl Decode for SignedBody {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Ok(Self {
             body: blob(r, "signed body", CONTROL_FRAME_BYTES_MAX)?,
@@ -840,13 +840,13 @@ impl Decode for Control {
                 yields: r.bool("yields")?,
                 started: UnixMillis::decode(r)?,
             }),
-            2 => Self::Advert { cost: r.u32()?, signed: Signed::decode(r)? },
+            2 => Self::Advert { cost: r.u32()?, signed: SignedBody::decode(r)? },
             3 => Self::Unreach { names: decode_names(r)? },
             4 => Self::Interest { names: decode_names(r)? },
             5 => Self::Uninterest { names: decode_names(r)? },
-            6 => Self::Join { signed: Signed::decode(r)? },
+            6 => Self::Join { signed: SignedBody::decode(r)? },
             7 => Self::Leave { name: Name::decode(r)?, sink: SinkId::decode(r)? },
-            8 => Self::Answer { signed: Signed::decode(r)? },
+            8 => Self::Answer { signed: SignedBody::decode(r)? },
             9 => Self::Reject {
                 name: Name::decode(r)?,
                 sink: SinkId::decode(r)?,
@@ -862,7 +862,7 @@ impl Decode for Control {
             11 => Self::Goodbye,
             12 => Self::Crl { der: blob(r, "revocation list", CRL_BYTES_MAX)? },
             13 => Self::Ack { name: Name::decode(r)?, sink: SinkId::decode(r)?, serial: r.u64()? },
-            14 => Self::LinkState { signed: Signed::decode(r)? },
+            14 => Self::LinkState { signed: SignedBody::decode(r)? },
             15 => Self::Query { id: r.u64()?, hops: r.u8()?, names: decode_names(r)? },
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
@@ -884,7 +884,7 @@ mod tests {
     use crate::ids::LABELS_MAX;
 
     fn frames() -> Vec<Control> {
-        let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
+        let signed = SignedBody { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
         let label = Label::new(LABELS_MAX - 1).unwrap();
         vec![

@@ -120,7 +120,7 @@ impl SourceId {
     }
 
     /// A source of the publisher with this tag.
-    pub fn of_publisher(tag: [u8; 8], random: [u8; 8]) -> Self {
+    pub fn from_publisher(tag: [u8; 8], random: [u8; 8]) -> Self {
         let mut id = [0; 16];
         id[..8].copy_from_slice(&tag);
         id[8..].copy_from_slice(&random);

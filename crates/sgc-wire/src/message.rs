@@ -81,12 +81,12 @@ impl MessageHead {
     }
 
     /// The head of a message that is about a call.
-    pub fn of_call(kind: MessageKind, number: u64) -> Self {
+    pub fn for_call(kind: MessageKind, number: u64) -> Self {
         Self::new(kind, number as i64)
     }
 
     /// The head of a mark by which a node says that this publisher of its local network asserted its liveliness.
-    pub const fn of_assertion(publisher: [u8; 8]) -> Self {
+    pub const fn for_assertion(publisher: [u8; 8]) -> Self {
         Self::new(MessageKind::Mark, i64::from_be_bytes(publisher))
     }
 
@@ -193,7 +193,7 @@ mod tests {
     #[test]
     fn mark_with_a_time_stamp_names_the_publisher_that_asserted_its_liveliness() {
         let publisher = [0xff, 2, 3, 4, 5, 6, 7, 8];
-        let bytes = MessageHead::of_assertion(publisher).to_vec();
+        let bytes = MessageHead::for_assertion(publisher).to_vec();
         assert_eq!(bytes, [&[4, 0, 0, 0][..], &publisher].concat());
         assert_eq!(MessageHead::from_slice(&bytes).unwrap().asserted(), Some(publisher));
         assert_eq!(MessageHead::new(MessageKind::Mark, 0).asserted(), None);
@@ -207,7 +207,7 @@ mod tests {
             let bytes = [kind, 0, 0, 0, 0xff, 0, 0, 0, 0, 0, 0, 9];
             let head = MessageHead::from_slice(&bytes).unwrap();
             assert_eq!((head.kind as u8, head.call()), (kind, 0xff00_0000_0000_0009));
-            assert_eq!((head, head.to_vec()), (MessageHead::of_call(head.kind, head.call()), bytes.into()));
+            assert_eq!((head, head.to_vec()), (MessageHead::for_call(head.kind, head.call()), bytes.into()));
         }
         assert!(MessageHead::from_slice(&[11; 12]).is_err());
     }

@@ -66,11 +66,11 @@ pub enum Operation {
         node: String,
         /// Its groups.
         groups: Vec<String>,
-        /// True if it only routes.
+        /// Whether it only routes.
         router: bool,
-        /// True if it may route for others as well.
+        /// Whether it may route for others as well.
         may_route: bool,
-        /// True if it may have been revoked before.
+        /// Whether it may have been revoked before.
         again: bool,
         /// Validity asked for its certificate, milliseconds.
         valid_ms: u64,
@@ -95,7 +95,7 @@ pub enum OperationAnswer {
     Challenge(Challenge),
     /// Nothing was done.
     Refused {
-        /// Why.
+        /// The reason.
         why: OperationRefusal,
         /// The reason in words, at most [`REFUSAL_DETAIL_BYTES_MAX`] bytes; may be empty.
         detail: String,
@@ -139,7 +139,7 @@ pub struct RosterPage {
     pub expires: UnixMillis,
     /// The node that renews certificates.
     pub authority: Option<String>,
-    /// True if links and grants resist quantum computers.
+    /// Whether links and grants resist quantum computers.
     pub post_quantum: bool,
     /// False if the file is from before rosters.
     pub has_roster: bool,
@@ -149,7 +149,7 @@ pub struct RosterPage {
     pub generations: Vec<(u32, UnixMillis)>,
     /// Nodes by name.
     pub nodes: Vec<RosterRow>,
-    /// True if there are nodes behind the last of these.
+    /// Whether there are nodes behind the last of these.
     pub more: bool,
 }
 
@@ -164,9 +164,9 @@ pub struct RosterRow {
     pub incarnation: u32,
     /// Its groups.
     pub groups: Vec<String>,
-    /// True if it only routes.
+    /// Whether it only routes.
     pub router: bool,
-    /// True if it may route for others.
+    /// Whether it may route for others.
     pub may_route: bool,
     /// Last moment at which a certificate of it holds.
     pub expires: Option<UnixMillis>,

@@ -247,7 +247,7 @@ impl Payload {
         self.0.iter().map(Bytes::len).sum()
     }
 
-    /// True if there is nothing.
+    /// Returns `true` if there is nothing.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

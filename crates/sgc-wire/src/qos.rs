@@ -83,7 +83,7 @@ impl Representations {
         if self == Self::XCDR2 { self } else { Self::XCDR1 }
     }
 
-    /// True if a writer that offers this is understood by a reader that takes `other`.
+    /// Returns `true` if a writer that offers this is understood by a reader that takes `other`.
     pub fn meets(self, other: Self) -> bool {
         self.0 & other.0 != 0
     }
@@ -130,12 +130,12 @@ impl Qos {
     /// Bound on the length of one partition's name, bytes.
     pub const PARTITION_BYTES_MAX: usize = 256;
 
-    /// True if late joiners receive history.
+    /// Returns `true` if late joiners receive history.
     pub fn is_transient_local(&self) -> bool {
         self.durability >= Durability::TransientLocal
     }
 
-    /// True if samples are acknowledged.
+    /// Returns `true` if samples are acknowledged.
     pub fn is_reliable(&self) -> bool {
         self.reliability == Reliability::Reliable
     }

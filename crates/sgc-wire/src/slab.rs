@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_come_back_is_used_again() {
+    fn returned_memory_is_used_again() {
         let mut slab = Slab::default();
         let mut places = std::collections::BTreeSet::new();
         for n in 0..100 * SHARERS {
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_short_shares_and_what_is_long_does_not() {
+    fn short_pieces_share_memory_and_long_ones_do_not() {
         let place = |room: &BytesMut| room.as_ptr() as usize;
         let mut slab = Slab::default();
         let rooms: Vec<_> = (0..SHARERS).map(|_| slab.room(100)).collect();

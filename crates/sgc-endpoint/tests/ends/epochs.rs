@@ -115,7 +115,7 @@ fn only_announced_sources_are_believed() {
 }
 
 #[test]
-fn what_no_grant_explains_is_given_up() {
+fn packets_that_no_grant_explains_are_given_up() {
     let mut unknown = source_with(SUITE, config(6, 0));
     let mut later = source(SUITE, 0);
     let known = source_with(SUITE, config(7, 0));

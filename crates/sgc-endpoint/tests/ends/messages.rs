@@ -117,7 +117,7 @@ fn incomplete_messages_are_bounded_and_counted() {
 }
 
 #[test]
-fn one_source_cannot_take_the_room_for_incomplete_messages_of_others() {
+fn a_source_cannot_take_the_room_for_incomplete_messages_of_others() {
     let mut sources: Vec<_> = (1..=3).map(|id| unrecovered(Suite::Standard, id)).collect();
     let limits = SinkLimits { partial_bytes_max: 200_000, ..SinkLimits::default() };
     let announces: Vec<_> = sources.iter().map(Source::announce).collect();

@@ -15,9 +15,9 @@ type KeyAndNonce = (u32, SourceId, Option<SinkId>, u64, u16);
 /// Everything that was sealed: associated data, ciphertext and tag. With one key and nonce, two of them are
 /// the same only if text and associated data are.
 #[derive(Default)]
-struct Sealed(BTreeMap<KeyAndNonce, (Vec<u8>, Vec<u8>)>);
+struct SealedTexts(BTreeMap<KeyAndNonce, (Vec<u8>, Vec<u8>)>);
 
-impl Sealed {
+impl SealedTexts {
     fn add(&mut self, seed: u64, packet: &Packet) {
         let h = &packet.header;
         let mut sealed = text(packet);
@@ -34,7 +34,7 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
         let suite = Suite::ALL[seed as usize % 4];
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut dice = move |n: u32| rng.next_u32() % n;
-        let (mut sealed, mut epoch, mut incarnation) = (Sealed::default(), 1, 0u8);
+        let (mut sealed, mut epoch, mut incarnation) = (SealedTexts::default(), 1, 0u8);
         // So few that marks of what is gone go ahead of many an answer.
         let recovery = RecoveryLimits { messages_max: 6, bytes_max: 1 << 20 };
         let config = |id| SourceConfig { recovery, ..config(id, 4) };

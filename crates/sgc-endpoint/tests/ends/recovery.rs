@@ -144,7 +144,7 @@ fn a_mark_shows_what_was_lost_before_a_silence_and_is_no_message() {
 }
 
 #[test]
-fn what_its_source_keeps_no_more_is_counted_and_passed_over() {
+fn messages_that_a_source_no_longer_keeps_are_counted_and_passed_over() {
     for live in [true, false] {
         let (mut source, mut sink) = ends(4);
         delivered(&mut sink, &published(&mut source, bytes(1), false));
@@ -235,7 +235,7 @@ fn an_end_that_is_played_again_loses_nothing() {
 }
 
 #[test]
-fn what_was_recorded_without_a_listener_is_there_to_be_asked_for() {
+fn messages_recorded_without_a_listener_can_be_recovered() {
     for suite in [Suite::Group, Suite::Standard] {
         let mut source = source(suite, 0);
         let mut sink = sink(suite, &[&source]);

@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_urgent_comes_first_and_the_rest_in_turn() {
+    fn urgent_frames_go_first_and_the_rest_take_turns() {
         let gate = Arc::new(Gate::default());
         gate.open(limits(10_000, 20_000));
         gate.set(20_000, limits(10_000, 20_000), false);

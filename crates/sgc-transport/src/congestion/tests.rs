@@ -92,7 +92,7 @@ struct Node {
 }
 
 /// A packet under way: when it arrives, its number, and at which node.
-type UnderWay = (Instant, u64, usize, Vec<u8>);
+type InFlightPacket = (Instant, u64, usize, Vec<u8>);
 
 /// Pairs of senders and receivers.
 struct World {
@@ -101,7 +101,7 @@ struct World {
     nodes: Vec<Node>,
     path: Path,
     pipe: Pipe,
-    under_way: BinaryHeap<Reverse<UnderWay>>,
+    under_way: BinaryHeap<Reverse<InFlightPacket>>,
     number: u64,
     rng: ChaCha8Rng,
 }
@@ -368,8 +368,8 @@ fn table() {
     println!(
         "\n| what changes | controller | used before | after | reached after s | queue p99, ms |\n|---|---|---|---|---|---|"
     );
-    type Change = fn(&mut Path);
-    let changes: [(&str, Path, Change); 4] = [
+    type PathChange = fn(&mut Path);
+    let changes: [(&str, Path, PathChange); 4] = [
         ("5 to 1 Mbit/s", Path { one_way: ms(20), ..THIN }, |p| p.bits_per_second = 1_000_000),
         ("1 to 20 Mbit/s", Path { bits_per_second: 1_000_000, one_way: ms(20), ..THIN }, |p| {
             p.bits_per_second = 20_000_000

@@ -16,8 +16,8 @@ use rustls_pki_types::{CertificateDer, UnixTime};
 use sgc_trust::{CertError, VerifiedPeer};
 use sgc_wire::CERT_BYTES_MAX;
 
-use super::front::{self, Echo, Inside, Token};
-use super::keys::{Keys, Loan};
+use super::front::{self, Echo, RecordMessage, Token};
+use super::keys::{Keys, SigningKeyLease};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, Refusal};
 use crate::options::LinkOptions;
@@ -205,7 +205,7 @@ pub(super) enum Stage {
 /// DTLS with one peer.
 pub(super) struct Association {
     dtls: Dtls,
-    _key: Loan,
+    _key: SigningKeyLease,
     credentials: CredentialStore,
     is_dialer: bool,
     /// The dialer takes a listener that has no DTLS 1.3.
@@ -239,7 +239,7 @@ pub(super) struct Association {
 impl Association {
     /// `None` if DTLS cannot use the key of the identity.
     pub(super) fn new(setup: &Setup<'_>, now: Instant) -> Option<Self> {
-        let key = Loan::new(setup.credentials.identity().certified_key())?;
+        let key = SigningKeyLease::new(setup.credentials.identity().certified_key())?;
         let takes_dtls12 = setup.options.dtls12;
         // A listener tells the version from the hello. A dialer that has asked for both may be talked out of 1.3 by
         // anyone on the way, and in 1.2 certificates travel in the clear.
@@ -336,7 +336,7 @@ impl Association {
     /// Sends a token to the peer, which repeats it.
     pub(super) fn probe(&mut self, token: Token, now: Instant, sink: &mut Sink) {
         if matches!(self.stage, Stage::Up { .. }) {
-            self.say(Inside::Probe { token });
+            self.say(RecordMessage::Probe { token });
             self.drain(now, sink);
         }
     }
@@ -361,7 +361,7 @@ impl Association {
             Stage::Asking { next, interval, .. } if *next <= now => {
                 *interval *= 2;
                 *next = now + *interval;
-                self.say(Inside::Ask);
+                self.say(RecordMessage::Ask);
                 self.drain(now, sink);
             }
             Stage::Refusing { why, until } if *until <= now => {
@@ -457,12 +457,12 @@ impl Association {
         }
     }
 
-    /// True as long as nothing was made of it, and the peer has said nothing that QUIC could speak of.
+    /// Returns `true` as long as nothing was made of it, and the peer has said nothing that QUIC could speak of.
     pub(super) fn is_unused(&self) -> bool {
         !self.is_claimed && !self.has_data
     }
 
-    /// True once the peer showed a certificate, which takes a cookie of DTLS: it receives where it says.
+    /// Returns `true` once the peer showed a certificate, which takes a cookie of DTLS: it receives where it says.
     pub(super) fn has_shown(&self) -> bool {
         self.certificate.is_some()
     }
@@ -510,7 +510,7 @@ impl Association {
         });
     }
 
-    fn say(&mut self, inside: Inside) {
+    fn say(&mut self, inside: RecordMessage) {
         let result = self.dtls.send_application_data(&inside.to_bytes()).map(drop);
         self.check(result);
     }
@@ -545,8 +545,8 @@ impl Association {
                 Output::ApplicationData(data) => {
                     self.heard = now;
                     has_heard = true;
-                    if Inside::is_inside(data) {
-                        self.heed(Inside::parse(data), now, &mut sink.proof);
+                    if RecordMessage::is_inside(data) {
+                        self.heed(RecordMessage::parse(data), now, &mut sink.proof);
                     } else if matches!(self.stage, Stage::Up { .. }) {
                         self.has_data = true;
                         sink.plaintext(data);
@@ -596,7 +596,7 @@ impl Association {
         if self.is_dialer {
             let Some(peer) = self.listener.take() else { return self.refuse(CertError::NoCertificate) };
             self.stage = Stage::Asking { peer, next: now + ASK_INTERVAL, interval: ASK_INTERVAL };
-            return self.say(Inside::Ask);
+            return self.say(RecordMessage::Ask);
         }
         let verdict = match self.certificate.as_slice() {
             [] => Err(CertError::NoCertificate),
@@ -612,40 +612,40 @@ impl Association {
     fn refuse(&mut self, why: CertError) {
         let alert = tls_alert(&why);
         for _ in 0..REFUSAL_COPIES {
-            self.say(Inside::Refused { alert });
+            self.say(RecordMessage::Refused { alert });
         }
         self.end(End::Refused(why));
     }
 
     /// What the peer says besides QUIC.
-    fn heed(&mut self, inside: Inside, now: Instant, proof: &mut Option<Token>) {
+    fn heed(&mut self, inside: RecordMessage, now: Instant, proof: &mut Option<Token>) {
         match (inside, self.is_dialer) {
-            (Inside::Ask, false) => match &self.stage {
-                Stage::Up { .. } => self.say(Inside::Answer { id: self.id, reset: self.reset }),
+            (RecordMessage::Ask, false) => match &self.stage {
+                Stage::Up { .. } => self.say(RecordMessage::Answer { id: self.id, reset: self.reset }),
                 Stage::Refusing { why, .. } => {
                     let why = why.clone();
                     self.refuse(why);
                 }
                 _ => {}
             },
-            (Inside::Answer { id, reset }, true) => {
+            (RecordMessage::Answer { id, reset }, true) => {
                 if let Stage::Asking { peer, .. } = &self.stage {
                     self.stage = Stage::Up { peer: peer.clone(), since: now };
                     self.prefix = front::id_prefix(id);
                     self.reset = reset;
                 }
             }
-            (Inside::Refused { alert }, _) => {
+            (RecordMessage::Refused { alert }, _) => {
                 let is_early = matches!(self.stage, Stage::Asking { .. } | Stage::Refusing { .. });
                 if is_early || (!self.is_dialer && !self.is_claimed) {
                     self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
                 }
             }
-            (Inside::Probe { token }, true) => self.say(Inside::Proof { token }),
-            (Inside::Proof { token }, false) => *proof = Some(token),
-            (Inside::Unknown, false) => self.say(Inside::Refused { alert: ALERT_VERSION }),
-            (Inside::Ask | Inside::Proof { .. } | Inside::Unknown, true)
-            | (Inside::Answer { .. } | Inside::Probe { .. }, false) => {}
+            (RecordMessage::Probe { token }, true) => self.say(RecordMessage::Proof { token }),
+            (RecordMessage::Proof { token }, false) => *proof = Some(token),
+            (RecordMessage::Unknown, false) => self.say(RecordMessage::Refused { alert: ALERT_VERSION }),
+            (RecordMessage::Ask | RecordMessage::Proof { .. } | RecordMessage::Unknown, true)
+            | (RecordMessage::Answer { .. } | RecordMessage::Probe { .. }, false) => {}
         }
     }
 }

@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::keys;
-use super::mux::{Mux, Progress, Reports, wait_for_end, wait_until_up};
+use super::mux::{Mux, Progress, RefusalReceiver, wait_for_end, wait_until_up};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, ProtocolError, Refusal};
 use crate::framing::Greeting;
@@ -25,7 +25,7 @@ use crate::{race, socket};
 pub(crate) struct DtlsListener {
     mux: Arc<Mux>,
     quic: QuicListener,
-    reports: Reports,
+    reports: RefusalReceiver,
 }
 
 impl DtlsListener {
@@ -66,13 +66,13 @@ impl DtlsListener {
 /// Dials links over DTLS, each from a socket of its own: whatever arrives there is of one association, so that nothing
 /// has to be told apart, and dials to one address do not get into each other's way.
 pub(crate) struct DtlsDialer {
-    shared: Arc<Shared>,
+    shared: Arc<DialContext>,
     metrics: Arc<TransportMetrics>,
-    links: Mutex<Vec<Dialed>>,
+    links: Mutex<Vec<DialSocket>>,
 }
 
 /// What every dial needs.
-struct Shared {
+struct DialContext {
     credentials: CredentialStore,
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
@@ -80,18 +80,18 @@ struct Shared {
 
 /// The socket of one link, twice: as the associations see it and as quinn does.
 #[derive(Clone)]
-struct Dialed {
+struct DialSocket {
     remote: SocketAddr,
     mux: Arc<Mux>,
     endpoint: Endpoint,
 }
 
 /// A dial that has not led to a link yet: given up, it says goodbye.
-struct Attempt(Dialed);
+struct Attempt(DialSocket);
 
 impl Drop for Attempt {
     fn drop(&mut self) {
-        let Dialed { mux, endpoint, .. } = self.0.clone();
+        let DialSocket { mux, endpoint, .. } = self.0.clone();
         // Where the runtime is gone, there is nothing left to say it with.
         if let Ok(runtime) = tokio::runtime::Handle::try_current() {
             // QUIC has a word to say before, if there is a connection.
@@ -104,7 +104,7 @@ impl Drop for Attempt {
 }
 
 /// A connection that has not greeted.
-struct Connected {
+struct UngreetedConnection {
     attempt: Attempt,
     connection: Connection,
     parts: Parts,
@@ -118,7 +118,7 @@ impl DtlsDialer {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> Self {
-        let shared = Shared { credentials, options, metrics: Arc::clone(&metrics) };
+        let shared = DialContext { credentials, options, metrics: Arc::clone(&metrics) };
         Self { shared: Arc::new(shared), metrics, links: Mutex::default() }
     }
 
@@ -140,8 +140,8 @@ impl DtlsDialer {
         Ok(link)
     }
 
-    async fn greet(&self, connected: Connected, greeting: Greeting) -> Result<QuicLink, LinkError> {
-        let Connected { attempt, connection, parts, peer, mut progress } = connected;
+    async fn greet(&self, connected: UngreetedConnection, greeting: Greeting) -> Result<QuicLink, LinkError> {
+        let UngreetedConnection { attempt, connection, parts, peer, mut progress } = connected;
         let inner = parts.findings.verdict().and_then(|verdict| verdict.as_ref().ok());
         if inner.is_none_or(|inner| inner.node_id != peer.node_id) {
             let (code, text) = CloseReason::Protocol(ProtocolError::OtherNode.to_string()).to_wire();
@@ -184,15 +184,15 @@ impl DtlsDialer {
     }
 }
 
-impl Shared {
-    async fn connect(&self, remote: SocketAddr) -> Result<Connected, LinkError> {
+impl DialContext {
+    async fn connect(&self, remote: SocketAddr) -> Result<UngreetedConnection, LinkError> {
         let (io, _) = socket::bind(socket::any_like(remote), &self.options)?;
         let (credentials, options) = (self.credentials.clone(), self.options.clone());
         let (mux, _) = Mux::start(true, io, credentials, options, Arc::clone(&self.metrics))?;
         let config = quic::endpoint_config(Flavor::Dtls, None, 0);
         let endpoint =
             Endpoint::new_with_abstract_socket(config, None, mux.socket(), Arc::new(PromptRuntime))?;
-        let attempt = Attempt(Dialed { remote, mux, endpoint });
+        let attempt = Attempt(DialSocket { remote, mux, endpoint });
         let dialed = &attempt.0;
         let mut progress = dialed.mux.dial(remote).ok_or(LinkError::KeyUnsupported)?;
         let peer = wait_until_up(&mut progress).await?;
@@ -206,6 +206,6 @@ impl Shared {
             connection = connecting => connection?,
             error = wait_for_end(&mut progress) => return Err(error),
         };
-        Ok(Connected { attempt, connection, parts, peer, progress })
+        Ok(UngreetedConnection { attempt, connection, parts, peer, progress })
     }
 }

@@ -13,7 +13,7 @@ use sgc_trust::Identity;
 
 use super::association::{Association, Setup, Sink, Stage};
 use super::front;
-use super::keys::{Keys, Loan};
+use super::keys::{Keys, SigningKeyLease};
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
 
@@ -60,7 +60,7 @@ impl<'a> Script<'a> {
 /// The hostile end.
 struct Peer {
     dtls: Dtls,
-    _key: Loan,
+    _key: SigningKeyLease,
     output: Vec<u8>,
     /// dimpl is of no use after an error.
     is_broken: bool,
@@ -99,7 +99,7 @@ impl Peer {
 }
 
 /// An association and its peer.
-struct Meeting<'a> {
+struct AssociationPair<'a> {
     association: Association,
     is_dialer: bool,
     /// Bytes that nobody but a member is to see in the clear.
@@ -143,13 +143,13 @@ impl HandshakeExercise {
         }
     }
 
-    fn meet(&self, script: &mut Script<'_>) -> Option<Meeting<'_>> {
+    fn meet(&self, script: &mut Script<'_>) -> Option<AssociationPair<'_>> {
         let flags = script.byte();
         let (is_dialer, is_old) = (flags & 1 > 0, flags & 2 > 0);
         let sizes: &[usize] =
             if is_old { &[64, 300, 1150, 2048, 16_000, 60_000] } else { &[800, 1150, 2048, 16_000] };
         let datagram_bytes = sizes[usize::from(script.byte()) % sizes.len()];
-        let key = Loan::new(self.member.certified_key())?;
+        let key = SigningKeyLease::new(self.member.certified_key())?;
         let DtlsCertificate { mut certificate, private_key } = key.certificate();
         // In DTLS 1.3 dimpl cannot send longer ones.
         let longest = if is_old { 60_000 } else { datagram_bytes * 4 };
@@ -189,7 +189,7 @@ impl HandshakeExercise {
         let association = Association::new(&setup, now)?;
         let (output, sent) = (vec![0; 1 << 17], VecDeque::new());
         let leaf = &self.leaf[..];
-        Some(Meeting {
+        Some(AssociationPair {
             association,
             is_dialer,
             secret: &leaf[leaf.len() / 2..leaf.len() / 2 + 24],
@@ -202,7 +202,7 @@ impl HandshakeExercise {
     }
 }
 
-impl Meeting<'_> {
+impl AssociationPair<'_> {
     /// Takes what the association has to say, and looks at where it stands.
     fn settle(&mut self) {
         let mut at = 0;
@@ -225,11 +225,11 @@ impl Meeting<'_> {
     fn deliver(&mut self, datagram: &[u8]) {
         let (association, sink) = (&mut self.association, &mut self.sink);
         match front::sort(datagram) {
-            Some(front::Front::Plain(records) | front::Front::Id(_, records)) => {
+            Some(front::DatagramKind::Plain(records) | front::DatagramKind::Id(_, records)) => {
                 association.receive(records, self.now, sink);
             }
-            Some(front::Front::Refusal(alert, echo)) => association.refused_by_peer(alert, &echo),
-            Some(front::Front::Challenge(token, _)) => association.answer_challenge(&token, sink),
+            Some(front::DatagramKind::Refusal(alert, echo)) => association.refused_by_peer(alert, &echo),
+            Some(front::DatagramKind::Challenge(token, _)) => association.answer_challenge(&token, sink),
             _ => {}
         }
         self.settle();
@@ -240,9 +240,9 @@ impl Meeting<'_> {
     fn answer(&mut self) {
         while let Some(datagram) = self.to_peer.pop_front() {
             if let Some(
-                front::Front::Plain(records)
-                | front::Front::Id(_, records)
-                | front::Front::Ticket(_, records),
+                front::DatagramKind::Plain(records)
+                | front::DatagramKind::Id(_, records)
+                | front::DatagramKind::Ticket(_, records),
             ) = front::sort(&datagram)
             {
                 self.peer.drive(self.now, Some(records));

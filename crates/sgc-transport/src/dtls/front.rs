@@ -43,7 +43,7 @@ pub(super) type Echo = [u8; ECHO_BYTES];
 
 /// A datagram, by what stands in front.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Front<'a> {
+pub(super) enum DatagramKind<'a> {
     /// Records as DTLS knows them.
     Plain(&'a [u8]),
     /// Records of an association.
@@ -58,21 +58,21 @@ pub(super) enum Front<'a> {
 }
 
 /// Sorts a datagram; `None` if it is none of ours.
-pub(super) fn sort(datagram: &[u8]) -> Option<Front<'_>> {
+pub(super) fn sort(datagram: &[u8]) -> Option<DatagramKind<'_>> {
     let (first, rest) = datagram.split_first()?;
     match *first {
-        20..=63 => Some(Front::Plain(datagram)),
-        ID => rest.split_first_chunk().map(|(id, record)| Front::Id(u64::from_be_bytes(*id), record)),
-        TICKET => rest.split_first_chunk().map(|(token, record)| Front::Ticket(*token, record)),
+        20..=63 => Some(DatagramKind::Plain(datagram)),
+        ID => rest.split_first_chunk().map(|(id, record)| DatagramKind::Id(u64::from_be_bytes(*id), record)),
+        TICKET => rest.split_first_chunk().map(|(token, record)| DatagramKind::Ticket(*token, record)),
         CHALLENGE => {
             let (token, echo) = rest.split_first_chunk()?;
-            Some(Front::Challenge(*token, echo.try_into().ok()?))
+            Some(DatagramKind::Challenge(*token, echo.try_into().ok()?))
         }
-        RESET => rest.try_into().ok().map(Front::Reset),
-        BUSY => rest.try_into().ok().map(Front::Busy),
+        RESET => rest.try_into().ok().map(DatagramKind::Reset),
+        BUSY => rest.try_into().ok().map(DatagramKind::Busy),
         REFUSAL => {
             let (alert, echo) = rest.split_first()?;
-            Some(Front::Refusal(*alert, echo.try_into().ok()?))
+            Some(DatagramKind::Refusal(*alert, echo.try_into().ok()?))
         }
         _ => None,
     }
@@ -187,7 +187,7 @@ fn epoch(head: &[u8]) -> u16 {
 
 /// What is said inside of records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Inside {
+pub(super) enum RecordMessage {
     /// The dialer asks.
     Ask,
     /// The listener answers: put this id in front from now on; that is how a reset of it would look.
@@ -202,7 +202,7 @@ pub(super) enum Inside {
     Unknown,
 }
 
-impl Inside {
+impl RecordMessage {
     pub(super) fn is_inside(plaintext: &[u8]) -> bool {
         plaintext.first() == Some(&INSIDE)
     }
@@ -246,24 +246,24 @@ impl Inside {
 pub fn exercise(datagram: &[u8]) {
     let again = match sort(datagram) {
         None => None,
-        Some(Front::Plain(record)) => {
+        Some(DatagramKind::Plain(record)) => {
             let _ = has_plaintext(record);
             // A hello is plaintext.
             assert!(client_hello(record).is_none() || has_plaintext(record));
             assert!(!is_without_dtls13(record) || has_plaintext(record));
             Some(record.to_vec())
         }
-        Some(Front::Id(id, record)) => Some([&id_prefix(id), record].concat()),
-        Some(Front::Ticket(token, record)) => Some([&ticket_prefix(&token), record].concat()),
-        Some(Front::Challenge(token, echo)) => Some(challenge(&token, &echo)),
-        Some(Front::Reset(token)) => Some(reset(&token)),
-        Some(Front::Busy(echo)) => Some(busy(&echo)),
-        Some(Front::Refusal(alert, echo)) => Some(refusal(alert, &echo)),
+        Some(DatagramKind::Id(id, record)) => Some([&id_prefix(id), record].concat()),
+        Some(DatagramKind::Ticket(token, record)) => Some([&ticket_prefix(&token), record].concat()),
+        Some(DatagramKind::Challenge(token, echo)) => Some(challenge(&token, &echo)),
+        Some(DatagramKind::Reset(token)) => Some(reset(&token)),
+        Some(DatagramKind::Busy(echo)) => Some(busy(&echo)),
+        Some(DatagramKind::Refusal(alert, echo)) => Some(refusal(alert, &echo)),
     };
     assert!(again.is_none_or(|again| again == datagram));
-    if Inside::is_inside(datagram) {
-        let inside = Inside::parse(datagram);
-        assert!(inside == Inside::Unknown || inside.to_bytes() == datagram);
+    if RecordMessage::is_inside(datagram) {
+        let inside = RecordMessage::parse(datagram);
+        assert!(inside == RecordMessage::Unknown || inside.to_bytes() == datagram);
     }
 }
 
@@ -334,8 +334,11 @@ mod tests {
     #[test]
     fn random_datagrams_are_sorted_without_harm() {
         let mut rng = ChaCha20Rng::seed_from_u64(7);
-        let known =
-            [hello(), challenge(&[1; 16], &[2; 16]), Inside::Answer { id: 7, reset: [3; 16] }.to_bytes()];
+        let known = [
+            hello(),
+            challenge(&[1; 16], &[2; 16]),
+            RecordMessage::Answer { id: 7, reset: [3; 16] }.to_bytes(),
+        ];
         for round in 0..20_000 {
             let mut bytes = match known.get(round % 8) {
                 Some(known) => known.clone(),

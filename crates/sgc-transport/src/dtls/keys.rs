@@ -22,12 +22,12 @@ fn lent() -> MutexGuard<'static, HashMap<u64, Arc<CertifiedKey>>> {
 
 /// A key that can be signed with for as long as this lives.
 #[derive(Debug)]
-pub(super) struct Loan {
+pub(super) struct SigningKeyLease {
     number: u64,
     certificate: DtlsCertificate,
 }
 
-impl Loan {
+impl SigningKeyLease {
     /// `None` if DTLS cannot use the key, or the certificate is longer than those that nodes read.
     pub(super) fn new(key: Arc<CertifiedKey>) -> Option<Self> {
         scheme(&key)?;
@@ -44,7 +44,7 @@ impl Loan {
     }
 }
 
-impl Drop for Loan {
+impl Drop for SigningKeyLease {
     fn drop(&mut self) {
         lent().remove(&self.number);
     }

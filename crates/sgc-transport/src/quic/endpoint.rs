@@ -19,7 +19,8 @@ use tokio::time::timeout;
 
 use super::config::{Flavor, Parts};
 use super::{
-    ControlRx, Fate, Inlet, Outlet, Places, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
+    ControlRx, Inlet, LinkEnd, LinkInner, Outlet, Places, QuicLink, Urgency, canonical, close, config,
+    send_frame,
 };
 use crate::budget::WindowLease;
 use crate::credentials::CredentialStore;
@@ -193,7 +194,7 @@ impl Acceptor {
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         validated.store(true, Relaxed);
-        let fate = Fate::new(self.options.idle_timeout);
+        let fate = LinkEnd::new(self.options.idle_timeout);
         let claim = match &self.dtls {
             None => None,
             Some(mux) => {
@@ -215,7 +216,7 @@ impl Acceptor {
             Ok((greeting, control)) => {
                 let ended = claim.as_ref().map(Claim::ended);
                 let places = Places::new(self.options.flows_max);
-                let held = Held { fate, places, lease, claim };
+                let held = LinkResources { fate, places, lease, claim };
                 let link = link(connection, &findings, false, greeting, control, held);
                 let link = link.map_err(Refusal::Certificate)?;
                 if let Some(ended) = ended {
@@ -326,7 +327,7 @@ pub(crate) async fn greet(
     greeting: Greeting,
     options: &LinkOptions,
 ) -> Result<QuicLink, LinkError> {
-    let fate = Fate::new(options.idle_timeout);
+    let fate = LinkEnd::new(options.idle_timeout);
     let after = options.handshake_timeout;
     let greeted = async {
         let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
@@ -340,7 +341,7 @@ pub(crate) async fn greet(
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
         Ok(control) => {
             let places = Places::new(options.flows_max);
-            let held = Held { fate, places, lease, claim: None };
+            let held = LinkResources { fate, places, lease, claim: None };
             link(connection, &findings, true, greeting, control, held).map_err(LinkError::RefusedHere)
         }
         Err(error) => {
@@ -375,8 +376,8 @@ async fn hear_greeting(rx: &mut ControlRx) -> Result<Greeting, LinkError> {
 }
 
 /// Resources that a link keeps until it ends.
-struct Held {
-    fate: Arc<Fate>,
+struct LinkResources {
+    fate: Arc<LinkEnd>,
     places: Arc<Places>,
     lease: WindowLease,
     claim: Option<Claim>,
@@ -388,7 +389,7 @@ fn link(
     is_dialer: bool,
     Greeting { lane }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
-    Held { fate, places, lease, claim }: Held,
+    LinkResources { fate, places, lease, claim }: LinkResources,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
@@ -396,7 +397,7 @@ fn link(
     let gate = Arc::clone(&control_tx.gate);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
     let labels = Arc::default();
-    let shared = Shared {
+    let shared = LinkInner {
         connection,
         peer,
         is_dialer,
@@ -452,7 +453,7 @@ fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) 
 }
 
 /// Why an authenticated peer has no link after all.
-fn ungreeted(connection: &Connection, fate: &Fate, error: LinkError) -> Refusal {
+fn ungreeted(connection: &Connection, fate: &LinkEnd, error: LinkError) -> Refusal {
     match error {
         LinkError::Protocol(why) => {
             close(connection, fate, &CloseReason::Protocol(why.to_string()), why.clone().into());

@@ -48,10 +48,10 @@ const READ_PIECES: usize = 32;
 /// A link over one QUIC connection.
 #[derive(Clone)]
 pub struct QuicLink {
-    shared: Arc<Shared>,
+    shared: Arc<LinkInner>,
 }
 
-struct Shared {
+struct LinkInner {
     connection: Connection,
     peer: VerifiedPeer,
     is_dialer: bool,
@@ -62,7 +62,7 @@ struct Shared {
     labels: Arc<Labels>,
     /// For datagrams that leave.
     datagrams: std::sync::Mutex<Slab>,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
     places: Arc<Places>,
     _lease: WindowLease,
@@ -72,12 +72,12 @@ struct Shared {
 
 /// How the connection came to end, where this side knows better than QUIC.
 #[derive(Debug)]
-pub(crate) struct Fate {
+pub(crate) struct LinkEnd {
     idle_timeout: Duration,
     ended_here: OnceLock<LinkError>,
 }
 
-impl Fate {
+impl LinkEnd {
     fn new(idle_timeout: Duration) -> Arc<Self> {
         Arc::new(Self { idle_timeout, ended_here: OnceLock::new() })
     }
@@ -115,12 +115,12 @@ pub(crate) struct Outlet {
     pending: Chunks,
     /// The part of it that is being written.
     piece: Chunks,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
 }
 
 impl Outlet {
-    fn new(stream: SendStream, urgency: Urgency, fate: &Arc<Fate>, gate: &Arc<Gate>) -> Self {
+    fn new(stream: SendStream, urgency: Urgency, fate: &Arc<LinkEnd>, gate: &Arc<Gate>) -> Self {
         // Fails only on a stream that is closed already, which the first write then says.
         let _ = stream.set_priority(urgency.priority());
         let (fate, gate) = (Arc::clone(fate), Arc::clone(gate));
@@ -265,13 +265,13 @@ fn skip(chunks: &mut Chunks, mut bytes: usize) {
 #[derive(Debug)]
 pub(crate) struct Inlet {
     stream: RecvStream,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     /// None for the control stream, which is no flow.
     _place: Option<Place>,
 }
 
 impl Inlet {
-    fn new(stream: RecvStream, fate: &Arc<Fate>, place: Option<Place>) -> Self {
+    fn new(stream: RecvStream, fate: &Arc<LinkEnd>, place: Option<Place>) -> Self {
         Self { stream, fate: Arc::clone(fate), _place: place }
     }
 
@@ -380,13 +380,13 @@ impl Link for QuicLink {
     }
 
     async fn open_flow(&self, class: Class) -> Result<FlowTx, LinkError> {
-        let Shared { connection, fate, gate, .. } = &*self.shared;
+        let LinkInner { connection, fate, gate, .. } = &*self.shared;
         let stream = connection.open_uni().await.map_err(|e| fate.explain(&e))?;
         Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, Urgency::Of(class), fate, gate))))
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
-        let Shared { connection, fate, labels, places, .. } = &*self.shared;
+        let LinkInner { connection, fate, labels, places, .. } = &*self.shared;
         let stream = connection.accept_uni().await.map_err(|e| fate.explain(&e))?;
         let inlet = Inlet::new(stream, fate, Some(places.take(connection)));
         Ok(FlowRx::new(flow::Inlet::Quic(inlet), Arc::clone(labels)))
@@ -397,7 +397,7 @@ impl Link for QuicLink {
     }
 
     async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let Shared { connection, fate, gate, datagrams, .. } = &*self.shared;
+        let LinkInner { connection, fate, gate, datagrams, .. } = &*self.shared;
         let bytes = packet.encoded_bytes_as(label);
         let max = connection.max_datagram_size().unwrap_or(0);
         if bytes > max {
@@ -420,7 +420,7 @@ impl Link for QuicLink {
     }
 
     async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
-        let Shared { connection, fate, labels, .. } = &*self.shared;
+        let LinkInner { connection, fate, labels, .. } = &*self.shared;
         let datagram = connection.read_datagram().await.map_err(|e| fate.explain(&e))?;
         Ok(Packet::from_datagram_as(datagram, |label| labels.name_of(label)))
     }
@@ -469,7 +469,7 @@ impl fmt::Debug for QuicLink {
     }
 }
 
-fn close(connection: &Connection, fate: &Fate, reason: &CloseReason, error: LinkError) {
+fn close(connection: &Connection, fate: &LinkEnd, reason: &CloseReason, error: LinkError) {
     // The first reason stays, as it does in QUIC.
     let _ = fate.ended_here.set(error);
     let (code, text) = reason.to_wire();

@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_opens_many_may_open_more_up_to_the_bound() {
+    fn a_peer_that_opens_many_flows_may_open_more_up_to_the_bound() {
         let places = Places::new(1000);
         let given: Vec<_> = (0..1000).filter_map(|n| Some((n, places.note_taken()?))).collect();
         assert_eq!(given, [(128, 512), (256, 1000)]);
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn who_opens_and_ends_needs_no_more() {
+    fn a_peer_that_ends_its_flows_needs_no_more_places() {
         let places = Places::new(1000);
         for _ in 0..1000 {
             assert_eq!(places.note_taken(), None);

@@ -14,7 +14,7 @@ use tokio::time::{Sleep, sleep_until, timeout};
 
 use super::record::RecordError;
 use super::wire::Wire;
-use super::{Shared, State};
+use super::{LinkInner, State};
 use crate::error::{CloseReason, LinkError, ProtocolError};
 
 /// Bytes fetched from the machine at once, at least and at most: what is urgent waits for no more. Between, what the path
@@ -33,7 +33,7 @@ pub(super) const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 const DRAIN_BYTES_MAX: u64 = 4 << 20;
 
 /// Runs a link until it is over.
-pub(super) async fn run(wire: Wire, shared: Arc<Shared>, idle_timeout: Duration) {
+pub(super) async fn run(wire: Wire, shared: Arc<LinkInner>, idle_timeout: Duration) {
     let mut driver = Driver {
         wire,
         out: VecDeque::new(),
@@ -75,7 +75,7 @@ struct Driver {
 
 impl Driver {
     /// Ready once nothing more is to be done: true if the peer is to be waited for.
-    fn poll(&mut self, cx: &mut Context<'_>, shared: &Shared) -> Poll<bool> {
+    fn poll(&mut self, cx: &mut Context<'_>, shared: &LinkInner) -> Poll<bool> {
         for _ in 0..ROUNDS_MAX {
             let now = Instant::now();
             let has_read = match self.read(cx, shared, now) {
@@ -130,7 +130,12 @@ impl Driver {
         Poll::Pending
     }
 
-    fn read(&mut self, cx: &mut Context<'_>, shared: &Shared, now: Instant) -> Poll<Result<(), LinkError>> {
+    fn read(
+        &mut self,
+        cx: &mut Context<'_>,
+        shared: &LinkInner,
+        now: Instant,
+    ) -> Poll<Result<(), LinkError>> {
         let mut buffer = ReadBuf::new(&mut self.buffer);
         let result = ready!(Pin::new(&mut self.wire).poll_read(cx, &mut buffer));
         let result = result.and_then(|()| match buffer.filled().len() {
@@ -187,11 +192,11 @@ impl Driver {
     }
 }
 
-trait PollElapsed {
+trait PollTimer {
     fn poll_elapsed(self, cx: &mut Context<'_>) -> Poll<()>;
 }
 
-impl PollElapsed for Pin<&mut Sleep> {
+impl PollTimer for Pin<&mut Sleep> {
     fn poll_elapsed(self, cx: &mut Context<'_>) -> Poll<()> {
         std::future::Future::poll(self, cx)
     }

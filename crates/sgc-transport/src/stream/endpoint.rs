@@ -13,8 +13,8 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use super::driver::{DRAIN_TIMEOUT, run};
-use super::handshake::{self, Made};
-use super::{About, Shared, StreamLink};
+use super::handshake::{self, EstablishedStream};
+use super::{LinkInfo, LinkInner, StreamLink};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
@@ -238,27 +238,33 @@ impl StreamDialer {
 
 /// Makes a link of a stream, and starts its task.
 pub(super) fn start(
-    made: Made,
+    made: EstablishedStream,
     remote: SocketAddr,
     is_dialer: bool,
     options: &LinkOptions,
-) -> (StreamLink, Arc<Shared>) {
-    let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
-    let shared = Shared::new(options, counters);
+) -> (StreamLink, Arc<LinkInner>) {
+    let EstablishedStream { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
+    let shared = LinkInner::new(options, counters);
     shared.lock().mux.note_handshake(rtt);
     prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
-    let about = About { remote, is_dialer, lane, key_exchange, mtu_bytes };
+    let about = LinkInfo { remote, is_dialer, lane, key_exchange, mtu_bytes };
     (StreamLink::new(Arc::clone(&shared), peer, about), shared)
 }
 
 /// The links of one endpoint, to be closed with it.
 #[derive(Default)]
 struct Links {
-    all: Mutex<Vec<Weak<Shared>>>,
+    all: Mutex<Vec<Weak<LinkInner>>>,
 }
 
 impl Links {
-    fn start(&self, made: Made, remote: SocketAddr, is_dialer: bool, options: &LinkOptions) -> StreamLink {
+    fn start(
+        &self,
+        made: EstablishedStream,
+        remote: SocketAddr,
+        is_dialer: bool,
+        options: &LinkOptions,
+    ) -> StreamLink {
         let (link, shared) = start(made, remote, is_dialer, options);
         let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
         if all.len() == all.capacity() {

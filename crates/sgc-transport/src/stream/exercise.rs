@@ -14,7 +14,7 @@ use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt as _, DuplexStream, ReadBuf
 use tokio::time::timeout;
 
 use super::endpoint::start;
-use super::handshake::{self, Prepared};
+use super::handshake::{self, PreparedSocket};
 use super::wire::{Counters, Wire};
 use crate::credentials::CredentialStore;
 use crate::framing::Greeting;
@@ -116,8 +116,8 @@ impl DoorExercise {
         let steps: Vec<Step> = script.chunks_exact(4).map(Step::from_bytes).collect();
         let ours = steps.iter().copied().step_by(2).collect();
         let theirs = steps.iter().copied().skip(1).step_by(2).collect();
-        let near = Altered { pipe: near, steps: ours, at: 0 };
-        let far = Altered { pipe: far, steps: theirs, at: 0 };
+        let near = TamperingPipe { pipe: near, steps: ours, at: 0 };
+        let far = TamperingPipe { pipe: far, steps: theirs, at: 0 };
         let listener = async {
             if let Some(link) = self.accept(Box::new(near), scheme).await {
                 converse(&link).await;
@@ -141,7 +141,7 @@ impl DoorExercise {
     }
 }
 
-fn prepared(wire: Wire) -> Prepared {
+fn prepared(wire: Wire) -> PreparedSocket {
     (wire, Arc::<Counters>::default(), MTU_BYTES)
 }
 
@@ -222,14 +222,14 @@ impl Step {
 }
 
 /// A pipe on which somebody alters what is read.
-struct Altered {
+struct TamperingPipe {
     pipe: DuplexStream,
     steps: std::collections::VecDeque<Step>,
     /// Bytes since the last step.
     at: usize,
 }
 
-impl AsyncRead for Altered {
+impl AsyncRead for TamperingPipe {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         let room = buf.remaining();
@@ -273,7 +273,7 @@ impl AsyncRead for Altered {
     }
 }
 
-impl AsyncWrite for Altered {
+impl AsyncWrite for TamperingPipe {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.get_mut().pipe).poll_write(cx, buf)
     }

@@ -24,8 +24,8 @@ use tokio::net::TcpStream;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
 use super::driver::part;
-use super::record::{Keys, RecordError, Tagged};
-use super::wire::{Below, Counted, Counters, Wire};
+use super::record::{Keys, RecordError, RecordStream};
+use super::wire::{Counters, CountingTcp, TlsIo, Wire};
 use super::ws::{self, UpgradeError};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, ProtocolError, Refusal};
@@ -52,7 +52,7 @@ fn alpn(scheme: Scheme) -> &'static [u8] {
 }
 
 /// A stream with the peer at its other end.
-pub(super) struct Made {
+pub(super) struct EstablishedStream {
     pub(super) wire: Wire,
     pub(super) counters: Arc<Counters>,
     pub(super) peer: VerifiedPeer,
@@ -64,8 +64,8 @@ pub(super) struct Made {
 }
 
 /// A TLS connection over whatever is below, and what is known of it.
-pub(super) struct Secured {
-    tls: TlsStream<Below>,
+pub(super) struct TlsConnection {
+    tls: TlsStream<TlsIo>,
     findings: Arc<Findings>,
     counters: Arc<Counters>,
     mtu_bytes: u16,
@@ -99,7 +99,7 @@ impl From<io::Error> for Failure {
 }
 
 /// Sets a fresh connection up: nothing waits for company, and little waits unsent.
-fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<Prepared> {
+fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<PreparedSocket> {
     tcp.set_nodelay(true)?;
     let socket = SockRef::from(&tcp);
     if let Some(dscp) = options.dscp {
@@ -108,12 +108,12 @@ fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<Prepared> {
     socket.set_tcp_notsent_lowat(UNSENT_BYTES_MAX)?;
     let mtu_bytes = u16::try_from(socket.tcp_mss()?).unwrap_or(u16::MAX);
     let counters = Arc::<Counters>::default();
-    let wire = Box::new(Counted { tcp, counters: Arc::clone(&counters) });
+    let wire = Box::new(CountingTcp { tcp, counters: Arc::clone(&counters) });
     Ok((wire, counters, mtu_bytes))
 }
 
-fn below(scheme: Scheme, wire: Wire) -> Below {
-    if scheme == Scheme::Tcp { Below::until_close_notify(wire) } else { Below::whole(wire) }
+fn below(scheme: Scheme, wire: Wire) -> TlsIo {
+    if scheme == Scheme::Tcp { TlsIo::until_close_notify(wire) } else { TlsIo::whole(wire) }
 }
 
 /// Accepts on a TCP connection: all of the handshake.
@@ -123,22 +123,22 @@ pub(super) async fn accept(
     path: &str,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Made, Refusal> {
+) -> Result<EstablishedStream, Refusal> {
     let prepared = prepare(tcp, options).map_err(|e| refusal(&Findings::default(), e.into()))?;
     accept_on(prepared, scheme, path, credentials, options).await
 }
 
 /// A fresh connection: itself, its counters and its longest packet.
-pub(super) type Prepared = (Wire, Arc<Counters>, u16);
+pub(super) type PreparedSocket = (Wire, Arc<Counters>, u16);
 
 /// The same on any stream of bytes.
 pub(super) async fn accept_on(
-    (mut wire, counters, mtu_bytes): Prepared,
+    (mut wire, counters, mtu_bytes): PreparedSocket,
     scheme: Scheme,
     path: &str,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Made, Refusal> {
+) -> Result<EstablishedStream, Refusal> {
     let nothing = Findings::default();
     let refused = |failure| refusal(&nothing, failure);
     if scheme == Scheme::Wss {
@@ -171,7 +171,7 @@ pub(super) async fn accept_on(
         }
     };
     let rtt = Duration::ZERO;
-    let mut secured = Secured { tls, findings, counters, mtu_bytes, scheme, asked, rtt };
+    let mut secured = TlsConnection { tls, findings, counters, mtu_bytes, scheme, asked, rtt };
     match secured.be_greeted().await {
         Ok(greeting) => secured.made(greeting).map_err(refused),
         Err(failure) => {
@@ -182,23 +182,23 @@ pub(super) async fn accept_on(
     }
 }
 
-/// Dials on a TCP connection, up to the listener's certificate; whether it accepts ours, [`Secured::greet`] tells.
+/// Dials on a TCP connection, up to the listener's certificate; whether it accepts ours, [`TlsConnection::greet`] tells.
 pub(super) async fn dial(
     tcp: TcpStream,
     url: &LinkUrl,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Secured, LinkError> {
+) -> Result<TlsConnection, LinkError> {
     dial_on(prepare(tcp, options)?, url, credentials, options).await
 }
 
 /// The same on any stream of bytes.
 pub(super) async fn dial_on(
-    (mut wire, counters, mtu_bytes): Prepared,
+    (mut wire, counters, mtu_bytes): PreparedSocket,
     url: &LinkUrl,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Secured, LinkError> {
+) -> Result<TlsConnection, LinkError> {
     let nothing = Findings::default();
     let failed = |failure| link_error(&nothing, failure);
     if url.scheme == Scheme::Wss {
@@ -218,7 +218,7 @@ pub(super) async fn dial_on(
         Ok(tls) => {
             let (tls, scheme) = (TlsStream::Client(tls), url.scheme);
             let (asked, rtt) = (Instant::now(), Duration::ZERO);
-            Ok(Secured { tls, findings, counters, mtu_bytes, scheme, asked, rtt })
+            Ok(TlsConnection { tls, findings, counters, mtu_bytes, scheme, asked, rtt })
         }
         Err((error, below)) => {
             // The listener hears why.
@@ -228,15 +228,15 @@ pub(super) async fn dial_on(
     }
 }
 
-impl Secured {
+impl TlsConnection {
     /// The innermost TLS, for who says something of his own in it.
     #[cfg(feature = "fuzzing")]
-    pub(super) fn into_stream(self) -> TlsStream<Below> {
+    pub(super) fn into_stream(self) -> TlsStream<TlsIo> {
         self.tls
     }
 
     /// The dialer's greeting; the listener's answer says that it accepts us.
-    pub(super) async fn greet(mut self, greeting: Greeting) -> Result<Made, LinkError> {
+    pub(super) async fn greet(mut self, greeting: Greeting) -> Result<EstablishedStream, LinkError> {
         match self.exchange(&greeting).await {
             Ok(()) => self.made(greeting).map_err(|failure| link_error(&Findings::default(), failure)),
             Err(failure) => {
@@ -314,7 +314,7 @@ impl Secured {
         }
     }
 
-    fn made(self, Greeting { lane }: Greeting) -> Result<Made, Failure> {
+    fn made(self, Greeting { lane }: Greeting) -> Result<EstablishedStream, Failure> {
         // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
         let verdict = self.findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate));
         let peer = verdict.map_err(Failure::Certificate)?;
@@ -328,16 +328,16 @@ impl Secured {
             (Scheme::Tcp, TlsStream::Client(tls)) => {
                 let (below, tls) = tls.into_inner();
                 let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), true)?;
-                Box::new(Tagged::new(below.into_wire(), keys))
+                Box::new(RecordStream::new(below.into_wire(), keys))
             }
             (Scheme::Tcp, TlsStream::Server(tls)) => {
                 let (below, tls) = tls.into_inner();
                 let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), false)?;
-                Box::new(Tagged::new(below.into_wire(), keys))
+                Box::new(RecordStream::new(below.into_wire(), keys))
             }
             (_, tls) => Box::new(tls),
         };
-        Ok(Made {
+        Ok(EstablishedStream {
             wire,
             counters: self.counters,
             peer,

@@ -70,9 +70,9 @@ pub struct StreamLink {
 
 /// What the users of a link and its flows hold in common. The link lives as long as one of them does.
 struct Handle {
-    shared: Arc<Shared>,
+    shared: Arc<LinkInner>,
     peer: VerifiedPeer,
-    about: About,
+    about: LinkInfo,
     labels: Arc<Labels>,
     /// What was begun and is not yet written, so that a frame goes out whole also when a sender is cancelled.
     control_tx: tokio::sync::Mutex<Chunks>,
@@ -81,7 +81,7 @@ struct Handle {
 
 /// What does not change while a link lives.
 #[derive(Debug)]
-struct About {
+struct LinkInfo {
     remote: SocketAddr,
     is_dialer: bool,
     lane: Option<LaneToken>,
@@ -90,7 +90,7 @@ struct About {
 }
 
 /// What a link's users and its task share.
-struct Shared {
+struct LinkInner {
     _lease: WindowLease,
     state: Mutex<State>,
     counters: Arc<Counters>,
@@ -115,7 +115,7 @@ struct State {
     is_drained: bool,
 }
 
-impl Shared {
+impl LinkInner {
     fn new(options: &LinkOptions, counters: Arc<Counters>) -> Arc<Self> {
         let lease = options.receive_budget.lease(options.receive_window_bytes);
         let limits = Limits {
@@ -426,7 +426,7 @@ impl fmt::Debug for Inlet {
 }
 
 impl StreamLink {
-    fn new(shared: Arc<Shared>, peer: VerifiedPeer, about: About) -> Self {
+    fn new(shared: Arc<LinkInner>, peer: VerifiedPeer, about: LinkInfo) -> Self {
         let handle = Handle {
             shared,
             peer,

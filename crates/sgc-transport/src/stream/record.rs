@@ -121,7 +121,7 @@ impl Key {
 }
 
 /// A stream of bytes as records on another.
-pub(super) struct Tagged {
+pub(super) struct RecordStream {
     wire: Wire,
     keys: Keys,
     /// Records that are to be written, and how much of them was.
@@ -138,7 +138,7 @@ pub(super) struct Tagged {
     failure: Option<RecordError>,
 }
 
-impl Tagged {
+impl RecordStream {
     pub(super) fn new(wire: Wire, keys: Keys) -> Self {
         Self {
             wire,
@@ -213,7 +213,7 @@ impl Tagged {
     }
 }
 
-impl AsyncRead for Tagged {
+impl AsyncRead for RecordStream {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         if buf.remaining() == 0 {
@@ -262,7 +262,7 @@ impl AsyncRead for Tagged {
     }
 }
 
-impl AsyncWrite for Tagged {
+impl AsyncWrite for RecordStream {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         self.poll_write_vectored(cx, &[IoSlice::new(buf)])
     }
@@ -315,7 +315,7 @@ mod tests {
     async fn records(writes: &[&[u8]]) -> Vec<Vec<u8>> {
         let [near, _] = keys(&AES_128_GCM);
         let (mut far, wire) = tokio::io::duplex(1 << 20);
-        let mut tagged = Tagged::new(Box::new(wire), near);
+        let mut tagged = RecordStream::new(Box::new(wire), near);
         let mut all = Vec::new();
         for write in writes {
             tagged.write_all(write).await.unwrap();
@@ -330,7 +330,7 @@ mod tests {
     /// Returns the content that the far end hands on of these bytes, and its last result.
     async fn read(bytes: &[u8]) -> (Vec<u8>, io::Result<usize>) {
         let [_, far] = keys(&AES_128_GCM);
-        let mut tagged = Tagged::new(Box::new(io::Cursor::new(bytes.to_vec())), far);
+        let mut tagged = RecordStream::new(Box::new(io::Cursor::new(bytes.to_vec())), far);
         let mut got = Vec::new();
         let end = tagged.read_to_end(&mut got).await;
         (got, end)
@@ -342,12 +342,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_written_arrives_in_any_division_of_the_stream() {
+    async fn written_bytes_arrive_in_any_division_of_the_stream() {
         for algorithm in [&AES_128_GCM, &AES_256_GCM, &CHACHA20_POLY1305] {
             for size in [1, 7, 1 << 20] {
                 let [near, far] = keys(algorithm);
                 let (tx, rx) = tokio::io::duplex(size);
-                let (mut tx, mut rx) = (Tagged::new(Box::new(tx), near), Tagged::new(Box::new(rx), far));
+                let (mut tx, mut rx) =
+                    (RecordStream::new(Box::new(tx), near), RecordStream::new(Box::new(rx), far));
                 let text: Vec<u8> = (0..50_000_u32).map(|n| n as u8).collect();
                 let sent = text.clone();
                 let writer = tokio::spawn(async move {
@@ -371,7 +372,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn whatever_is_changed_ends_the_stream_before_it_is_handed_on() {
+    async fn any_change_ends_the_stream_before_it_is_handed_on() {
         let [first, second, third] =
             <[Vec<u8>; 3]>::try_from(records(&[b"first", b"second", b"third"]).await).unwrap();
         let (got, end) = read(&[&first[..], &second, &third].concat()).await;
@@ -399,7 +400,7 @@ mod tests {
         }
         // A record that was sent one way does not verify the other way.
         let [near, _] = keys(&AES_128_GCM);
-        let mut tagged = Tagged::new(Box::new(io::Cursor::new(first)), near);
+        let mut tagged = RecordStream::new(Box::new(io::Cursor::new(first)), near);
         assert!(is_altered(&tagged.read_to_end(&mut Vec::new()).await));
     }
 

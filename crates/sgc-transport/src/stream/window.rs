@@ -96,7 +96,7 @@ impl Window {
         Some(number)
     }
 
-    /// True if enough was written since the last ping for another to tell something.
+    /// Returns `true` if enough was written since the last ping for another to tell something.
     pub(crate) fn is_ping_due(&self) -> bool {
         let (least, most) = PING_BYTES;
         let last = self.pings.back().map_or(self.delivered, |ping| ping.written);
@@ -121,7 +121,7 @@ impl Window {
         true
     }
 
-    /// True if more may be written now: `more` bytes above the window are for what is urgent.
+    /// Returns `true` if more may be written now: `more` bytes above the window are for what is urgent.
     pub(crate) fn has_room(&self, more: u64) -> bool {
         self.in_flight() < self.limit() + more
     }

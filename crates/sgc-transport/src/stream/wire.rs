@@ -33,12 +33,12 @@ impl Counters {
 }
 
 /// A TCP connection that counts.
-pub(super) struct Counted {
+pub(super) struct CountingTcp {
     pub(super) tcp: TcpStream,
     pub(super) counters: Arc<Counters>,
 }
 
-impl AsyncRead for Counted {
+impl AsyncRead for CountingTcp {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -51,7 +51,7 @@ impl AsyncRead for Counted {
     }
 }
 
-impl Counted {
+impl CountingTcp {
     fn count(&self, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         if let Poll::Ready(Ok(n)) = &written {
             self.counters.sent.fetch_add(*n as u64, Relaxed);
@@ -60,7 +60,7 @@ impl Counted {
     }
 }
 
-impl AsyncWrite for Counted {
+impl AsyncWrite for CountingTcp {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.tcp).poll_write(cx, buf);
         self.count(written)
@@ -92,7 +92,7 @@ const RECORD_HEAD_BYTES: usize = 5;
 
 /// What TLS reads from and writes to. Where TLS is to end before the stream does, it hands out one TLS record at a time and
 /// keeps the stream open when TLS ends: so what follows the record that ends TLS is never read as TLS.
-pub(super) struct Below {
+pub(super) struct TlsIo {
     wire: Wire,
     /// Nothing: passes everything on as it is.
     records: Option<Records>,
@@ -108,7 +108,7 @@ struct Records {
     left: usize,
 }
 
-impl Below {
+impl TlsIo {
     /// TLS is all there is.
     pub(super) fn whole(wire: Wire) -> Self {
         Self { wire, records: None }
@@ -125,7 +125,7 @@ impl Below {
     }
 }
 
-impl AsyncRead for Below {
+impl AsyncRead for TlsIo {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let Self { wire, records } = self.get_mut();
         let Some(records) = records else { return Pin::new(wire).poll_read(cx, buf) };
@@ -163,7 +163,7 @@ impl AsyncRead for Below {
     }
 }
 
-impl AsyncWrite for Below {
+impl AsyncWrite for TlsIo {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.get_mut().wire).poll_write(cx, buf)
     }
@@ -206,7 +206,7 @@ mod tests {
             let (mut tx, rx) = tokio::io::duplex(size);
             let sent = stream.clone();
             let writer = tokio::spawn(async move { tx.write_all(&sent).await });
-            let mut below = Below::until_close_notify(Box::new(rx));
+            let mut below = TlsIo::until_close_notify(Box::new(rx));
             for record in [record(b"first"), record(b""), record(b"second")] {
                 let mut got = Vec::new();
                 while got.len() < record.len() {

@@ -20,7 +20,7 @@ pub struct PlaceLimits {
 
 /// Why a place was not to be had.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Crowded {
+pub enum PlaceRefusal {
     /// The peer's own address holds as many as one address may.
     Prefix {
         /// The address.
@@ -41,9 +41,9 @@ pub enum PlaceDecision<T> {
     /// There is room.
     Admit,
     /// There is room because this handshake gave way; the caller ends it.
-    Evict(T, Crowded),
+    Evict(T, PlaceRefusal),
     /// There is none.
-    Refuse(Crowded),
+    Refuse(PlaceRefusal),
 }
 
 /// The handshakes under way at one listener, the oldest first. Each holds a `T`, by which the caller can end it.
@@ -100,7 +100,7 @@ impl<T> Places<T> {
     ) -> PlaceDecision<T> {
         let own = self.held.iter().filter(|place| place.prefix == prefix).count();
         if own >= self.limits.per_prefix {
-            let crowded = Crowded::Prefix { prefix, held: own };
+            let crowded = PlaceRefusal::Prefix { prefix, held: own };
             return self.displace(|place| place.prefix == prefix, false, crowded, now, is_engaged);
         }
         if self.held.len() < self.limits.all {
@@ -113,7 +113,7 @@ impl<T> Places<T> {
         let most = counts.values().copied().max().unwrap_or(0);
         // Displacing one of theirs leaves them with as many as the newcomer's address, at least.
         let is_heavier = most > own + 1;
-        let crowded = Crowded::All { held: self.held.len() };
+        let crowded = PlaceRefusal::All { held: self.held.len() };
         let is_heaviest = |place: &Place<T>| counts.get(&place.prefix) == Some(&most);
         self.displace(is_heaviest, is_heavier, crowded, now, is_engaged)
     }
@@ -127,7 +127,7 @@ impl<T> Places<T> {
         &mut self,
         is_candidate: impl Fn(&Place<T>) -> bool,
         is_heavier: bool,
-        crowded: Crowded,
+        crowded: PlaceRefusal,
         now: Instant,
         is_engaged: impl Fn(&T) -> bool,
     ) -> PlaceDecision<T> {
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_has_no_more_than_its_share_however_often_it_asks() {
+    fn an_address_has_no_more_than_its_share_however_often_it_asks() {
         let mut bench = Bench::new();
         let mut refused = 0;
         for _ in 0..100 {
@@ -199,7 +199,7 @@ mod tests {
         assert_eq!(bench.held_by(1), [0, 1, 2], "engaged handshakes are not displaced at once");
         assert_eq!(bench.ask(2, true), PlaceDecision::Admit);
         bench.now += PLACE_HELD_MIN;
-        let crowded = Crowded::Prefix { prefix: host(1), held: 3 };
+        let crowded = PlaceRefusal::Prefix { prefix: host(1), held: 3 };
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((0, true), crowded));
     }
 
@@ -209,7 +209,7 @@ mod tests {
         for engaged in [true, false, false] {
             assert_eq!(bench.ask(1, engaged), PlaceDecision::Admit);
         }
-        let crowded = Crowded::Prefix { prefix: host(1), held: 3 };
+        let crowded = PlaceRefusal::Prefix { prefix: host(1), held: 3 };
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((1, false), crowded));
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((2, false), crowded));
         assert_eq!(bench.ask(1, true), PlaceDecision::Refuse(crowded));
@@ -221,7 +221,7 @@ mod tests {
         for from in [1, 1, 1, 2, 2, 2, 3, 3] {
             assert_eq!(bench.ask(from, true), PlaceDecision::Admit);
         }
-        let crowded = Crowded::All { held: 8 };
+        let crowded = PlaceRefusal::All { held: 8 };
         assert_eq!(
             bench.ask(4, true),
             PlaceDecision::Evict((0, true), crowded),
@@ -239,7 +239,7 @@ mod tests {
         for from in 1..=8 {
             assert_eq!(bench.ask(from, true), PlaceDecision::Admit);
         }
-        let crowded = Crowded::All { held: 8 };
+        let crowded = PlaceRefusal::All { held: 8 };
         assert_eq!(bench.ask(9, true), PlaceDecision::Refuse(crowded));
         bench.now += PLACE_HELD_MIN;
         assert_eq!(bench.ask(9, true), PlaceDecision::Evict((0, true), crowded));

@@ -29,7 +29,7 @@ struct Window {
 
 /// Events that were counted instead of logged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Repeated<K> {
+pub struct RepeatCount<K> {
     /// The address and the kind; `None` stands for all addresses that were not told apart.
     pub source: Option<(AddressPrefix, K)>,
     /// Number of events.
@@ -65,7 +65,7 @@ impl<K: Ord + Copy> Repeats<K> {
     }
 
     /// Returns what was counted in the windows that have ended, and forgets addresses of which nothing came.
-    pub fn take_due(&mut self, now: Instant) -> Vec<Repeated<K>> {
+    pub fn take_due(&mut self, now: Instant) -> Vec<RepeatCount<K>> {
         let mut all = Vec::new();
         let mut end = |window: &mut Window, source| {
             let within = now.saturating_duration_since(window.since);
@@ -75,7 +75,7 @@ impl<K: Ord + Copy> Repeats<K> {
             let count = std::mem::take(&mut window.count);
             window.since = now;
             if count > 0 {
-                all.push(Repeated { source, count, within });
+                all.push(RepeatCount { source, count, within });
             }
             count > 0
         };
@@ -114,11 +114,11 @@ mod tests {
         assert_eq!(repeats.due(), Some(start + REPEAT_WINDOW));
         assert_eq!(repeats.take_due(start + REPEAT_WINDOW / 2), []);
         let end = start + REPEAT_WINDOW;
-        let counted = Repeated { source: Some((host(1), 'x')), count: 999, within: REPEAT_WINDOW };
+        let counted = RepeatCount { source: Some((host(1), 'x')), count: 999, within: REPEAT_WINDOW };
         assert_eq!(repeats.take_due(end), [counted]);
         assert!(!repeats.note(host(1), 'x', end), "it goes on, and is still counted");
         assert!(repeats.note(host(2), 'x', end), "what had ended is news again");
-        let counted = Repeated { count: 1, ..counted };
+        let counted = RepeatCount { count: 1, ..counted };
         assert_eq!(repeats.take_due(end + REPEAT_WINDOW), [counted]);
         assert_eq!(repeats.take_due(end + 2 * REPEAT_WINDOW), []);
         assert_eq!(repeats.due(), None, "nothing is kept of it");
@@ -131,7 +131,7 @@ mod tests {
         assert_eq!(said, REPEAT_SOURCES_MAX);
         assert_eq!(repeats.sources.len(), REPEAT_SOURCES_MAX);
         let count = 100_000 - REPEAT_SOURCES_MAX as u64;
-        let counted = Repeated { source: None, count, within: REPEAT_WINDOW };
+        let counted = RepeatCount { source: None, count, within: REPEAT_WINDOW };
         assert_eq!(repeats.take_due(start + REPEAT_WINDOW), [counted]);
         assert!(repeats.note(host(1), 'x', start + REPEAT_WINDOW), "and then there is room again");
     }

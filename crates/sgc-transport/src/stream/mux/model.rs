@@ -49,10 +49,10 @@ struct End {
     mux: Mux,
     /// Written and not yet arrived.
     wire: VecDeque<u8>,
-    tx: Vec<Sent>,
+    tx: Vec<SendModel>,
     /// Which of them has which number on the wire.
     by_wire: BTreeMap<u64, usize>,
-    rx: BTreeMap<RxId, Received>,
+    rx: BTreeMap<RxId, ReceiveModel>,
     may_open: bool,
     control: Sending,
     control_read: u64,
@@ -74,7 +74,7 @@ struct Sending {
     may_write: bool,
 }
 
-struct Sent {
+struct SendModel {
     id: TxId,
     number: u64,
     sending: Sending,
@@ -85,7 +85,7 @@ struct Sent {
 }
 
 #[derive(Default)]
-struct Received {
+struct ReceiveModel {
     read: u64,
     is_over: bool,
     is_stopped: bool,
@@ -165,7 +165,7 @@ impl End {
         let sending = Sending { may_write: true, ..Sending::default() };
         let number = self.tx.len() as u64 + 1;
         let (is_finished, is_reset, is_stopped, is_released) = Default::default();
-        self.tx.push(Sent { id, number, sending, is_finished, is_reset, is_stopped, is_released });
+        self.tx.push(SendModel { id, number, sending, is_finished, is_reset, is_stopped, is_released });
     }
 
     /// Writes what is pending of a flow, unless it is to wait.
@@ -202,7 +202,7 @@ impl End {
 
     fn accept(&mut self) {
         while let Some(id) = self.mux.accept() {
-            self.rx.insert(id, Received::default());
+            self.rx.insert(id, ReceiveModel::default());
             self.readable.insert(id);
         }
     }
@@ -276,7 +276,7 @@ impl End {
     }
 
     fn step(&mut self, op: u64, input: &mut Input<'_>, from: &End) {
-        let pick = |list: &Vec<Sent>, n: u64| (!list.is_empty()).then(|| n as usize % list.len());
+        let pick = |list: &Vec<SendModel>, n: u64| (!list.is_empty()).then(|| n as usize % list.len());
         match op {
             0 => self.open([Class::Bulk, Class::Default, Class::Realtime][input.next() as usize % 3]),
             1 | 2 => {

@@ -15,7 +15,7 @@ use sgc_wire::{
 
 use crate::Endpoint;
 use crate::compression::{CompressionError, Compressor, Decompressor};
-use crate::joins::Wish;
+use crate::joins::JoinKind;
 use crate::owner::{OLDER_REQUEST, is_older, place};
 use crate::shares::GrantedSink;
 
@@ -47,7 +47,7 @@ impl PackedType {
         Some(Self { type_hash: type_hash.to_owned(), encoding, bytes })
     }
 
-    fn of(&self, name: Name) -> DescribedType {
+    fn describe(&self, name: Name) -> DescribedType {
         let (encoding, description) = (self.encoding, self.bytes.clone());
         DescribedType { name, type_hash: self.type_hash.clone(), encoding, description }
     }
@@ -150,7 +150,7 @@ impl Endpoint {
             else {
                 continue;
             };
-            let described = described.of(*name);
+            let described = described.describe(*name);
             let more = described.to_vec().len();
             if bytes + more <= ANSWER_BYTES_MAX {
                 bytes += more;
@@ -206,7 +206,7 @@ impl Endpoint {
         let (name, _) = types_name(&owner);
         self.leave(now, &name);
         if !names.is_empty() {
-            self.join(now, name, owner, Wish::Types(names));
+            self.join(now, name, owner, JoinKind::Types(names));
         }
     }
 }
@@ -228,7 +228,7 @@ mod tests {
     fn a_description_comes_back_whether_it_shrinks_or_not() {
         for bytes in [Bytes::from_static(b"short"), vec![7; TYPE_DESCRIPTION_BYTES_MAX].into()] {
             let packed = PackedType::new("RIHS01_00", &bytes).unwrap();
-            assert_eq!(unpack_type(&packed.of(Name([1; 32]))), Ok(bytes));
+            assert_eq!(unpack_type(&packed.describe(Name([1; 32]))), Ok(bytes));
         }
         let long = Bytes::from(vec![0; TYPE_DESCRIPTION_BYTES_MAX + 1]);
         assert_eq!(PackedType::new("RIHS01_00", &long), None);
