@@ -20,7 +20,7 @@ use sgc_wire::{Class, Label, Name};
 /// Packets of a round; those of both forms take turns.
 const PACKETS: u64 = 100_000;
 const ROUNDS: usize = 15;
-/// What the suite `group` adds to the first fragment: message head and tag.
+/// Bytes that the suite `group` adds to the first fragment: message head and tag.
 const SEALED: usize = 12 + 16;
 
 fn main() {

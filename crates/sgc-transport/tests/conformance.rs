@@ -265,7 +265,7 @@ async fn queued_packets_leave_together_and_in_order(scheme: &str) {
         }
         assert_eq!(tx.queued_bytes(), 0);
     }
-    // What is queued at the end belongs to it.
+    // Queued packets at the end belong to the flow.
     tx.finish().await.unwrap();
     let mut rx = soon(far.accept_flow()).await.unwrap();
     let mut seqs = Vec::new();
@@ -462,7 +462,7 @@ async fn a_dead_peer_is_noticed_and_a_restarted_one_at_once(scheme: &str) {
     let second = runtime();
     let _restarted = listen(&second, &url);
     let error = soon(link.closed()).await;
-    // What the kernel says of a connection whose program is gone does not tell whether another took its place.
+    // The kernel's error for a connection whose program is gone does not tell whether another took its place.
     if is_tcp(scheme) {
         assert!(matches!(error, LinkError::Cut), "{error}");
         return second.shutdown_background();

@@ -17,7 +17,7 @@ use tokio::net::{TcpSocket, TcpStream};
 
 /// Places of the listeners below.
 const PLACES: usize = 12;
-/// Of these, for one address.
+/// Places for one address.
 const PLACES_PER_ADDRESS: usize = 4;
 /// More handshakes than there are places.
 const FLOOD: usize = 20;
@@ -102,7 +102,7 @@ async fn wait_for_pending(server: &Server, least: u64) {
     .await;
 }
 
-/// Whatever one host does, it holds its share of the places and no more, and others connect.
+/// One host holds at most its share of the places, and others connect.
 async fn a_stalling_address_keeps_nobody_else_out(scheme: &str) {
     let fleet = fleet(1);
     let arm = enroll(&fleet, "arm-1");

@@ -152,7 +152,7 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
     let fleet = fleet(1);
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), LinkOptions::default());
     let relay = Relay::start(server.addr, 5).await;
-    // What IPv6 and UDP leave of it.
+    // The path's MTU less the headers of IPv6 and UDP.
     relay.impairment.longest.store(1232, Relaxed);
     let dialer = dialer(enroll(&fleet, "arm-1"));
     let url = format!("{scheme}://{}", relay.addr).parse().unwrap();

@@ -35,7 +35,7 @@ async fn a_link_moves_to_a_fresh_socket_and_loses_nothing() {
     assert_ne!(far.remote(), before);
 }
 
-// Who gets a link.
+// Admission.
 
 #[tokio::test]
 async fn a_dialer_without_a_certificate_is_refused() {

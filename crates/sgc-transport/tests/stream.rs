@@ -1,5 +1,5 @@
-//! Peers of stream links that misbehave, played by bare TLS, and paths that do. What links do for their users:
-//! `conformance`.
+//! Peers of stream links that misbehave, played by bare TLS, and bad paths. `conformance` tests the links' promises to
+//! their users.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;
@@ -59,7 +59,7 @@ fn contains(haystack: &[u8], needle: &[u8]) -> bool {
     haystack.windows(needle.len()).any(|w| w == needle)
 }
 
-// Who gets a link.
+// Admission.
 
 #[tokio::test]
 async fn a_dialer_without_a_certificate_is_refused() {
@@ -168,7 +168,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
     assert!(server.metrics.refused(RefusalKind::TooManyFromAddress) >= 1000 - 2 * PLACES as u64);
     let mut ended = 0;
     for tcp in &mut silent[..1000 - 2 * PLACES] {
-        // Which way it ends is the kernel's.
+        // The kernel decides which error ends it.
         let _ = soon(tcp.read(&mut [0])).await;
         ended += 1;
     }
@@ -348,7 +348,7 @@ async fn a_peer_that_reads_nothing_is_left_and_harms_nobody() {
         }
     };
     assert!(matches!(error, LinkError::TimedOut { .. }), "{error}");
-    // What one peer does not take is little: what may be under way, and what may wait.
+    // A peer that reads nothing blocks only the bytes in flight and those that may wait.
     assert!(sent <= 1 << 20, "{sent}");
     far.send_control("x".into()).await.unwrap();
     assert_eq!(soon(near.recv_control()).await.unwrap(), "x");

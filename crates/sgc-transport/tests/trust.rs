@@ -1,4 +1,4 @@
-//! Who keeps a link and who gets one while certificates are renewed, revoked and run out; and with which keys.
+//! Links and handshakes while certificates are renewed, revoked and expire; and their keys.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;

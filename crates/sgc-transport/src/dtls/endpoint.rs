@@ -63,15 +63,15 @@ impl DtlsListener {
     }
 }
 
-/// Dials links over DTLS, each from a socket of its own: whatever arrives there is of one association, so that nothing
-/// has to be told apart, and dials to one address do not get into each other's way.
+/// Dials links over DTLS, each from a socket of its own: every datagram there belongs to one association, and dials to
+/// one address do not disturb each other.
 pub(crate) struct DtlsDialer {
     shared: Arc<DialContext>,
     metrics: Arc<TransportMetrics>,
     links: Mutex<Vec<DialSocket>>,
 }
 
-/// What every dial needs.
+/// Settings that every dial needs.
 struct DialContext {
     credentials: CredentialStore,
     options: LinkOptions,
@@ -86,15 +86,15 @@ struct DialSocket {
     endpoint: Endpoint,
 }
 
-/// A dial that has not led to a link yet: given up, it says goodbye.
+/// A dial that has not led to a link yet. Dropping it says goodbye.
 struct Attempt(DialSocket);
 
 impl Drop for Attempt {
     fn drop(&mut self) {
         let DialSocket { mux, endpoint, .. } = self.0.clone();
-        // Where the runtime is gone, there is nothing left to say it with.
+        // Without the runtime nothing can be sent any more.
         if let Ok(runtime) = tokio::runtime::Handle::try_current() {
-            // QUIC has a word to say before, if there is a connection.
+            // QUIC sends its close before, if there is a connection.
             runtime.spawn(async move {
                 endpoint.wait_idle().await;
                 mux.close();
@@ -122,7 +122,7 @@ impl DtlsDialer {
         Self { shared: Arc::new(shared), metrics, links: Mutex::default() }
     }
 
-    /// Dials these addresses in this order, and says `url` of them.
+    /// Dials these addresses in this order; errors name `url`.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
@@ -153,7 +153,7 @@ impl DtlsDialer {
         let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
         links.retain(|link| link.endpoint.open_connections() > 0);
         links.push(attempt.0.clone());
-        // Dropping the attempt does what is to be done at the end of the link.
+        // Dropping the attempt cleans up at the end of the link.
         Ok(link)
     }
 
@@ -174,7 +174,7 @@ impl DtlsDialer {
         for link in &links {
             link.endpoint.close(quinn::VarInt::from_u32(code), text.as_bytes());
         }
-        // Whoever has not heard by then learns it from its own time-out.
+        // The other peers notice the end by their own time-outs.
         let _ = timeout(quic::DRAIN_TIMEOUT, async {
             for link in &links {
                 link.endpoint.wait_idle().await;

@@ -1,7 +1,7 @@
-//! Whole handshakes with a hostile peer, as a script of bytes has them: for `sgc-fuzz-targets`.
+//! Whole handshakes with a hostile peer, driven by a script of bytes, for `sgc-fuzz-targets`.
 //!
-//! One end is an [`Association`]; the other is a bare `dimpl`, whose datagrams are lost, doubled, postponed, altered, cut
-//! into other records and pieces, and mixed with what the script makes up.
+//! One end is an [`Association`]; the other is a bare `dimpl`, whose datagrams are lost, doubled, postponed, altered,
+//! cut into other records and pieces, and mixed with records of the script.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -102,7 +102,7 @@ impl Peer {
 struct AssociationPair<'a> {
     association: Association,
     is_dialer: bool,
-    /// Bytes that nobody but a member is to see in the clear.
+    /// Bytes that only a member may see in the clear.
     secret: &'a [u8],
     is_member: bool,
     peer: Peer,
@@ -112,14 +112,13 @@ struct AssociationPair<'a> {
 }
 
 impl HandshakeExercise {
-    /// With the identity of the association, and another member of its fleet.
+    /// Creates one with the identity of the association, and another member of its fleet.
     pub fn new(ours: Arc<Identity>, member: Arc<Identity>) -> Self {
         let leaf = ours.chain()[0].to_vec();
         Self { credentials: CredentialStore::new(ours), leaf, member }
     }
 
-    /// Plays a script. Whatever it does, nobody but a member is believed, and a dialer shows its certificate to nobody
-    /// else.
+    /// Plays a script. In every script only a member is believed, and a dialer shows its certificate to no other peer.
     pub fn run(&self, script: &[u8]) {
         let mut script = Script(script);
         let Some(mut meeting) = self.meet(&mut script) else { return };
@@ -203,7 +202,7 @@ impl HandshakeExercise {
 }
 
 impl AssociationPair<'_> {
-    /// Takes what the association has to say, and looks at where it stands.
+    /// Takes the output of the association and checks its state.
     fn settle(&mut self) {
         let mut at = 0;
         for len in &self.sink.packet_lens {
@@ -236,7 +235,7 @@ impl AssociationPair<'_> {
         self.answer();
     }
 
-    /// Gives the peer what the association said.
+    /// Gives the peer the association's output.
     fn answer(&mut self) {
         while let Some(datagram) = self.to_peer.pop_front() {
             if let Some(

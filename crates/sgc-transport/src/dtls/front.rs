@@ -1,11 +1,11 @@
-//! What stands in front of DTLS records on the wire, and what is said inside of them besides QUIC; bytes alone.
+//! The bytes in front of DTLS records on the wire, and the messages beside QUIC inside of them.
 //!
-//! It sorts datagrams and makes them. Whether what they claim is true is for [`super::association`] and [`super::mux`].
+//! This module sorts datagrams and makes them. [`super::association`] and [`super::mux`] check their claims.
 
-/// In front of a record: the association that it belongs to, wherever it comes from. All of these bytes lie outside of
-/// what DTLS begins its records with (RFC 7983, RFC 9443).
+/// In front of a record: the association that it belongs to, wherever it comes from. DTLS records begin with none of
+/// these bytes (RFC 7983, RFC 9443).
 const ID: u8 = 0xc1;
-/// Prove that you receive at your address.
+/// Asks the peer to prove that it receives at its address.
 const CHALLENGE: u8 = 0xc2;
 /// In front of a record: the proof.
 const TICKET: u8 = 0xc3;
@@ -16,18 +16,18 @@ const BUSY: u8 = 0xc5;
 /// The certificate is refused, in a handshake that is not over.
 const REFUSAL: u8 = 0xc6;
 
-/// First byte of what is said inside of records and is not QUIC: QUIC never begins a packet with it.
+/// First byte of a message inside of records: QUIC never begins a packet with it.
 const INSIDE: u8 = 0;
 const HELLO: u8 = 1;
 const REFUSED: u8 = 2;
 const PROBE: u8 = 3;
 const PROOF: u8 = 4;
-/// What is spoken inside.
+/// Version of the protocol inside.
 pub(super) const INSIDE_VERSION: u8 = 1;
 
 pub(super) const ID_BYTES: usize = 8;
 pub(super) const TOKEN_BYTES: usize = 16;
-/// How much of a ClientHello's random an answer repeats, so that only who saw it can answer.
+/// Bytes of a ClientHello's random that an answer repeats, so that only nodes that saw the hello can answer.
 pub(super) const ECHO_BYTES: usize = 16;
 
 const RECORD_HEAD_BYTES: usize = 13;
@@ -41,14 +41,14 @@ const SUPPORTED_VERSIONS: u16 = 43;
 pub(super) type Token = [u8; TOKEN_BYTES];
 pub(super) type Echo = [u8; ECHO_BYTES];
 
-/// A datagram, by what stands in front.
+/// A datagram, by its first bytes.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum DatagramKind<'a> {
-    /// Records as DTLS knows them.
+    /// Plain DTLS records.
     Plain(&'a [u8]),
     /// Records of an association.
     Id(u64, &'a [u8]),
-    /// Records of somebody who received a challenge.
+    /// Records of a peer that received a challenge.
     Ticket(Token, &'a [u8]),
     Challenge(Token, Echo),
     Reset(Token),
@@ -57,7 +57,7 @@ pub(super) enum DatagramKind<'a> {
     Refusal(u8, Echo),
 }
 
-/// Sorts a datagram; `None` if it is none of ours.
+/// Sorts a datagram; `None` if it is unknown.
 pub(super) fn sort(datagram: &[u8]) -> Option<DatagramKind<'_>> {
     let (first, rest) = datagram.split_first()?;
     match *first {
@@ -102,8 +102,8 @@ pub(super) fn refusal(alert: u8, echo: &Echo) -> Vec<u8> {
     [&[REFUSAL, alert], &echo[..]].concat()
 }
 
-/// The beginning of the random of the ClientHello that a datagram begins with; `None` if it begins with anything else.
-/// A hello that comes in pieces counts by the piece that holds the random.
+/// Returns the beginning of the random if a datagram begins with a ClientHello. A hello that comes in pieces counts by
+/// the piece that holds the random.
 pub(super) fn client_hello(datagram: &[u8]) -> Option<Echo> {
     let (kind, body) = first_piece(datagram)?;
     // Two bytes of version, then the random.
@@ -143,7 +143,7 @@ fn has_supported_versions(body: &[u8]) -> Option<bool> {
     Some(false)
 }
 
-/// The kind and the content of the unencrypted handshake message that a datagram begins with, if it is the message's
+/// Returns kind and content of the unencrypted handshake message that a datagram begins with, if it is the message's
 /// first piece.
 fn first_piece(datagram: &[u8]) -> Option<(u8, &[u8])> {
     let (head, rest) = datagram.split_at_checked(RECORD_HEAD_BYTES)?;
@@ -153,15 +153,15 @@ fn first_piece(datagram: &[u8]) -> Option<(u8, &[u8])> {
     (is_handshake && handshake[6..9] == [0, 0, 0]).then_some((handshake[0], body))
 }
 
-/// Whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS 1.3 has
-/// a header of its own, 001CSLEE (RFC 9147, 4).
+/// Returns whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS
+/// 1.3 has a header of its own, 001CSLEE (RFC 9147, 4).
 pub(super) fn has_plaintext(mut records: &[u8]) -> bool {
     while let Some(first) = records.first() {
         let next = match first {
             0x20..=0x3f if first & 0x10 == 0 => {
                 let sequence_bytes = if first & 0x08 == 0 { 1 } else { 2 };
                 if first & 0x04 == 0 {
-                    // Without a length it is the last.
+                    // A record without a length is the last.
                     return false;
                 }
                 let at = 1 + sequence_bytes;
@@ -185,20 +185,20 @@ fn epoch(head: &[u8]) -> u16 {
     u16::from_be_bytes([head[3], head[4]])
 }
 
-/// What is said inside of records.
+/// A message inside of records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum RecordMessage {
-    /// The dialer asks.
+    /// The dialer asks for an id.
     Ask,
-    /// The listener answers: put this id in front from now on; that is how a reset of it would look.
+    /// The listener's answer: the id to put in front from now on, and the token of a reset.
     Answer { id: u64, reset: Token },
     /// The certificate is refused, with this alert (RFC 8446, 6.2).
     Refused { alert: u8 },
     /// The listener sends a token to an address.
     Probe { token: Token },
-    /// The dialer repeats it.
+    /// The dialer repeats the token.
     Proof { token: Token },
-    /// Another version, or nothing known.
+    /// Another version, or an unknown message.
     Unknown,
 }
 
@@ -241,7 +241,8 @@ impl RecordMessage {
     }
 }
 
-/// What the fuzzer and the seeded test throw at this module: whatever is sorted is made of the same bytes again.
+/// Checks this module with one datagram, for the fuzzer and the seeded test: a sorted datagram encodes to the same
+/// bytes.
 #[doc(hidden)]
 pub fn exercise(datagram: &[u8]) {
     let again = match sort(datagram) {
@@ -314,7 +315,7 @@ mod tests {
         assert!(is_without_dtls13(&message(HELLO_VERIFY_REQUEST, &[0xfe, 0xff, 1, 5])));
         assert!(is_without_dtls13(&server_hello(&[0, 23, 0, 0])));
         assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 0, 0, 43, 0, 2, 0xfe, 0xfc])));
-        // A hello that is cut off says nothing.
+        // A hello that is cut off proves nothing.
         assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 9])));
         assert!(!is_without_dtls13(&hello()));
     }

@@ -1,5 +1,5 @@
-//! The private key of an identity, for `dimpl`, which would rather read it: it gets a number instead, and the signatures
-//! that it asks for under that number.
+//! The private key of an identity, for `dimpl`, which expects to read it. It gets a number instead, and signatures
+//! under that number.
 
 use std::collections::HashMap;
 use std::panic::AssertUnwindSafe;
@@ -20,7 +20,7 @@ fn lent() -> MutexGuard<'static, HashMap<u64, Arc<CertifiedKey>>> {
     LENT.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A key that can be signed with for as long as this lives.
+/// A registered signing key, for as long as this lives.
 #[derive(Debug)]
 pub(super) struct SigningKeyLease {
     number: u64,
@@ -28,7 +28,7 @@ pub(super) struct SigningKeyLease {
 }
 
 impl SigningKeyLease {
-    /// `None` if DTLS cannot use the key, or the certificate is longer than those that nodes read.
+    /// Registers the key. Returns `None` if DTLS cannot use it, or the certificate is longer than the limit.
     pub(super) fn new(key: Arc<CertifiedKey>) -> Option<Self> {
         scheme(&key)?;
         let leaf = key.cert.first().filter(|leaf| leaf.len() <= CERT_BYTES_MAX)?.to_vec();
@@ -38,7 +38,7 @@ impl SigningKeyLease {
         Some(Self { number, certificate })
     }
 
-    /// The certificate, with the number for its key.
+    /// Returns the certificate, with the number of its key.
     pub(super) fn certificate(&self) -> DtlsCertificate {
         self.certificate.clone()
     }
@@ -50,7 +50,7 @@ impl Drop for SigningKeyLease {
     }
 }
 
-/// What the key signs with, if DTLS knows it.
+/// Returns the signature scheme of the key, if DTLS knows it.
 pub(super) fn scheme(key: &CertifiedKey) -> Option<SignatureScheme> {
     let known = [SignatureScheme::ECDSA_NISTP256_SHA256, SignatureScheme::ECDSA_NISTP384_SHA384];
     key.key.choose_scheme(&known).map(|signer| signer.scheme())

@@ -1,8 +1,8 @@
 //! Making QUIC links: listening and dialling.
 //!
-//! A link is handed out only after both certificates were verified and the greetings were exchanged. The latter is
-//! also how a dialer learns that it was accepted: in TLS 1.3 the client's handshake is over before the
-//! server has looked at its certificate.
+//! A link is handed out only after both certificates were verified and the greetings were exchanged. The greeting is
+//! also the dialer's proof that it was accepted: in TLS 1.3 the client's handshake is over before the server has looked
+//! at its certificate.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -39,7 +39,7 @@ use crate::url::LinkUrl;
 
 /// TLS requires a name; ours is neither sent nor compared.
 pub(crate) const SERVER_NAME: &str = "sgc.invalid";
-/// How long a closing endpoint waits for its peers to have heard of it.
+/// Time that a closing endpoint waits for its peers to hear of it.
 pub(crate) const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Awaits QUIC links on one socket.
@@ -73,13 +73,13 @@ impl Holder for Slot {
     }
 }
 
-/// What every incoming handshake needs.
+/// State that every incoming handshake needs.
 struct Acceptor {
     flavor: Flavor,
     credentials: CredentialStore,
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
-    /// The associations that these links travel in.
+    /// The associations below these links.
     dtls: Option<Arc<Mux>>,
 }
 
@@ -95,7 +95,7 @@ impl QuicListener {
         Self::on(flavor, socket, None, credentials, options, metrics)
     }
 
-    /// On a socket that is there, and over these associations.
+    /// Listens on this socket, over these associations.
     pub(crate) fn on(
         flavor: Flavor,
         socket: Arc<dyn AsyncUdpSocket>,
@@ -142,7 +142,7 @@ impl QuicListener {
         shut(&self.endpoint, reason).await;
     }
 
-    /// Starts the handshake of a peer that has a place, and returns the refusal that comes of it.
+    /// Starts the handshake of a peer that has a place, and returns its refusal.
     fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
         let pending = self.places.pending();
@@ -254,7 +254,7 @@ impl QuicDialer {
         Self { flavor, credentials, options, metrics, endpoints: Mutex::default() }
     }
 
-    /// Dials these addresses in this order, and says `url` of them.
+    /// Dials these addresses in this order; errors name `url`.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
@@ -333,7 +333,7 @@ pub(crate) async fn greet(
         let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
         let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
         let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
-        // At once: the listener learns of the stream from what is sent on it.
+        // Sent at once: the listener learns of the stream from its first bytes.
         send_frame(&mut tx, greeting.to_bytes()).await?;
         hear_greeting(&mut rx).await?;
         Ok((tx, rx))
@@ -425,7 +425,7 @@ fn key_exchange(connection: &Connection) -> KeyExchange {
     }
 }
 
-/// Why an incoming handshake failed.
+/// Returns the reason why an incoming handshake failed.
 fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) -> Refusal {
     const ALERT_CERTIFICATE_REQUIRED: u64 = 0x100 + 116;
     const ALERT_PROTOCOL_VERSION: u64 = 0x100 + 70;
@@ -452,7 +452,7 @@ fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) 
     }
 }
 
-/// Why an authenticated peer has no link after all.
+/// Returns the reason why an authenticated peer has no link after all.
 fn ungreeted(connection: &Connection, fate: &LinkEnd, error: LinkError) -> Refusal {
     match error {
         LinkError::Protocol(why) => {
@@ -471,6 +471,6 @@ fn ungreeted(connection: &Connection, fate: &LinkEnd, error: LinkError) -> Refus
 async fn shut(endpoint: &Endpoint, reason: &CloseReason) {
     let (code, text) = reason.to_wire();
     endpoint.close(VarInt::from_u32(code), text.as_bytes());
-    // Whoever has not heard by then learns it from its own time-out.
+    // The other peers notice the end by their own time-outs.
     let _ = timeout(DRAIN_TIMEOUT, endpoint.wait_idle()).await;
 }

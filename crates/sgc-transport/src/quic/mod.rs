@@ -40,9 +40,9 @@ use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
 use crate::labels::Labels;
 use crate::link::{KeyExchange, Link, LinkStats};
 
-/// How long QUIC has to end a connection by itself when what it travels in has ended.
+/// Time in which QUIC ends a connection by itself after the layer below has ended.
 const LAST_WORD: Duration = Duration::from_millis(500);
-/// How many pieces one read takes at most: it bounds what is received and not yet consumed.
+/// Most pieces of one read: it bounds received and unconsumed data.
 const READ_PIECES: usize = 32;
 
 /// A link over one QUIC connection.
@@ -60,17 +60,17 @@ struct LinkInner {
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
     labels: Arc<Labels>,
-    /// For datagrams that leave.
+    /// Memory for outgoing datagrams.
     datagrams: std::sync::Mutex<Slab>,
     fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
     places: Arc<Places>,
     _lease: WindowLease,
-    /// Its hold on what it travels in.
+    /// Hold on the association below.
     _claim: Option<Claim>,
 }
 
-/// How the connection came to end, where this side knows better than QUIC.
+/// The cause of a connection's end, where this side knows it better than QUIC.
 #[derive(Debug)]
 pub(crate) struct LinkEnd {
     idle_timeout: Duration,
@@ -90,7 +90,7 @@ impl LinkEnd {
     }
 }
 
-/// What comes before what on a link.
+/// Order of priorities on a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Urgency {
     Of(Class),
@@ -107,13 +107,13 @@ impl Urgency {
     }
 }
 
-/// The sending half of a stream. What it was given goes out whole and in order, also when a writer is cancelled.
+/// The sending half of a stream. Its bytes go out whole and in order, also when a writer is cancelled.
 #[derive(Debug)]
 pub(crate) struct Outlet {
     stream: SendStream,
     urgency: Urgency,
     pending: Chunks,
-    /// The part of it that is being written.
+    /// The part that is being written.
     piece: Chunks,
     fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
@@ -121,7 +121,7 @@ pub(crate) struct Outlet {
 
 impl Outlet {
     fn new(stream: SendStream, urgency: Urgency, fate: &Arc<LinkEnd>, gate: &Arc<Gate>) -> Self {
-        // Fails only on a stream that is closed already, which the first write then says.
+        // Fails only on a stream that is closed already, which the first write then reports.
         let _ = stream.set_priority(urgency.priority());
         let (fate, gate) = (Arc::clone(fate), Arc::clone(gate));
         Self { stream, urgency, pending: Vec::new(), piece: Vec::new(), fate, gate }
@@ -145,7 +145,7 @@ impl Outlet {
         Ok(())
     }
 
-    /// Writes what is pending, whatever else waits.
+    /// Writes everything pending, without waiting for the gate.
     async fn write_all(&mut self) -> Result<(), WriteError> {
         let written = self.stream.write_chunks(&mut self.pending).await?;
         self.pending.drain(..written.chunks);
@@ -153,14 +153,14 @@ impl Outlet {
         Ok(())
     }
 
-    /// Writes a piece of what is pending, as soon as the gate lets it.
+    /// Writes a piece of the pending bytes, as soon as the gate admits it.
     async fn write_piece(&mut self, class: Class) -> Result<(), WriteError> {
         let want = self.pending.iter().map(Bytes::len).sum();
         let permit = match self.gate.try_admit(class, want) {
             Some(permit) => permit,
             None => tokio::select! {
                 permit = self.gate.admit(class, want) => permit,
-                // It ends before it is finished only if the peer or the connection ends it.
+                // The stream stops before its end only if the peer or the connection ends it.
                 ended = self.stream.stopped() => return Err(match ended {
                     Ok(Some(code)) => WriteError::Stopped(code),
                     Ok(None) | Err(StoppedError::ZeroRttRejected) => WriteError::ClosedStream,
@@ -186,7 +186,7 @@ impl Outlet {
             })
             .await
         };
-        // What is left of it is pending, too; references would keep memory that has left.
+        // The rest is in `pending`, too; references here would keep memory of sent bytes.
         self.piece.clear();
         skip(&mut self.pending, written?.bytes);
         Ok(())
@@ -244,7 +244,7 @@ fn front(chunks: &[Bytes], mut bytes: usize, out: &mut Chunks) {
     }
 }
 
-/// Drops the first `bytes` of these, and what is empty then.
+/// Drops the first `bytes` of these, and empty pieces.
 fn skip(chunks: &mut Chunks, mut bytes: usize) {
     let whole = chunks
         .iter()
@@ -275,7 +275,7 @@ impl Inlet {
         Self { stream, fate: Arc::clone(fate), _place: place }
     }
 
-    /// Waits for more of the stream and appends it; false at its end.
+    /// Waits for more of the stream and appends it. Returns `false` at the end.
     pub(crate) async fn fill(&mut self, pieces: &mut Pieces) -> Result<bool, FlowError> {
         let mut chunks = [const { Bytes::new() }; READ_PIECES];
         match self.stream.read_chunks(&mut chunks).await {
@@ -319,13 +319,13 @@ impl ControlRx {
 }
 
 impl QuicLink {
-    /// Ends the link when what it travels in ends before it, with the error that comes of that.
+    /// Ends the link when the layer below ends first, with its error.
     pub(crate) fn end_with(&self, lower: impl Future<Output = LinkError> + Send + 'static) {
         let shared = Arc::downgrade(&self.shared);
         tokio::spawn(async move {
             let error = lower.await;
             if !matches!(error, LinkError::PeerRestarted) {
-                // QUIC may have been told more, which it has yet to read.
+                // QUIC may have a close frame of the peer still to read.
                 tokio::time::sleep(LAST_WORD).await;
             }
             // Closing what is closed would change the reason.
@@ -337,7 +337,7 @@ impl QuicLink {
         });
     }
 
-    /// Ends the link because of what the peer did, unless it has ended already.
+    /// Ends the link because of the peer's mistake, unless it has ended already.
     fn fail(&self, error: LinkError) -> LinkError {
         if let LinkError::Protocol(why) = &error {
             let reason = CloseReason::Protocol(why.to_string());

@@ -1,5 +1,5 @@
-//! Whole conversations with the front door of stream links, in memory, for fuzzing: hostile bytes into the acceptor, a
-//! member that says what it likes inside of TLS, and somebody on the way who alters what two honest ends say.
+//! Whole conversations with the acceptor of stream links, in memory, for fuzzing: hostile bytes into the acceptor, a
+//! member that sends arbitrary bytes inside of TLS, and an attacker who alters the bytes of two honest ends.
 
 use std::io;
 use std::pin::Pin;
@@ -44,11 +44,11 @@ pub struct DoorExercise {
 /// The mode that the first byte of a script chooses.
 #[derive(Clone, Copy)]
 enum Mode {
-    /// The script is what a stranger says.
+    /// The script holds the bytes of a stranger.
     Stranger,
-    /// The script is what a member says inside of its TLS, greeting and frames.
+    /// The script holds the bytes of a member inside of its TLS, greeting and frames.
     Member,
-    /// The script is what becomes of the bytes between two honest ends.
+    /// The script changes the bytes between two honest ends.
     Between,
 }
 
@@ -153,7 +153,7 @@ fn url(scheme: Scheme) -> LinkUrl {
     LinkUrl { scheme, host: "localhost".into(), port: 1, path: None, cost_ms: None }
 }
 
-/// Says all of this, and hears what comes until the other end has enough.
+/// Sends the whole script, and reads until the other end has enough.
 async fn say(mut wire: impl AsyncRead + AsyncWrite + Unpin, script: &[u8]) {
     let said = async {
         wire.write_all(script).await?;
@@ -164,7 +164,7 @@ async fn say(mut wire: impl AsyncRead + AsyncWrite + Unpin, script: &[u8]) {
     let _ = timeout(SILENCE, tokio::io::copy(&mut wire, &mut tokio::io::sink())).await;
 }
 
-/// Reads whatever comes on a link until it ends or falls silent.
+/// Reads everything on a link until it ends or falls silent.
 async fn read_all(link: &super::StreamLink) {
     loop {
         let more = async {
@@ -186,7 +186,7 @@ async fn read_all(link: &super::StreamLink) {
     }
 }
 
-/// One honest end: sends its frames, and checks that those of the other come unaltered and in order.
+/// Runs one honest end: sends its frames, and checks that those of the other arrive unaltered and in order.
 async fn converse(link: &super::StreamLink) {
     let frame = |number: u8| Bytes::from(vec![number; 100 * usize::from(number) + 1]);
     for number in 0..FRAMES {
@@ -206,7 +206,7 @@ async fn converse(link: &super::StreamLink) {
     read_all(link).await;
 }
 
-/// A change of the stream, so many bytes behind the step before.
+/// A change of the stream, this many bytes behind the step before.
 #[derive(Clone, Copy)]
 struct Step {
     after: usize,
@@ -221,7 +221,7 @@ impl Step {
     }
 }
 
-/// A pipe on which somebody alters what is read.
+/// A pipe whose bytes an attacker alters.
 struct TamperingPipe {
     pipe: DuplexStream,
     steps: std::collections::VecDeque<Step>,
@@ -263,7 +263,7 @@ impl AsyncRead for TamperingPipe {
             }
         }
         if bytes.is_empty() {
-            // Nothing is the end of the stream, which is not meant.
+            // An empty read would be the end of the stream, which is not meant.
             cx.waker().wake_by_ref();
             return Poll::Pending;
         }

@@ -1,8 +1,8 @@
 //! Records that everyone can read and nobody can alter, for `tcp://` (`docs/spec/wire.md`, stream links).
 //!
-//! The stream behind the handshake is cut into records with a tag each. Keys come from the TLS connection before it, one for
-//! each direction, and the number of the record is its nonce: so a record that is altered, left out, repeated, put
-//! elsewhere or sent back ends the link, and nothing of it is handed on. It hides nothing; payloads are sealed by their source.
+//! The stream behind the handshake is cut into records with a tag each. Keys come from the TLS connection before it,
+//! one for each direction, and the number of the record is its nonce: so a record that is altered, left out, repeated,
+//! moved or sent back ends the link, and none of it is handed on. Records hide nothing; the source seals payloads.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
@@ -21,21 +21,21 @@ const HEAD_BYTES: usize = 2;
 /// Longest content of a record, bytes.
 pub(super) const RECORD_BYTES_MAX: usize = 16 << 10;
 const TAG_BYTES: usize = 16;
-/// Most records under one key. It keeps what GMAC loses by each far from mattering; a link ends before it gets there.
+/// Most records under one key. It keeps the security loss of GMAC negligible; a link ends before.
 const RECORDS_MAX: u64 = 1 << 40;
 /// Bytes that wait to be written before more is taken.
 const PENDING_BYTES: usize = 64 << 10;
 /// Bytes read at once, at least.
 const READ_BYTES: usize = 32 << 10;
-/// Label that the keys are exported under (RFC 8446, 7.5); the context says which end seals with them.
+/// Label of the exported keys (RFC 8446, 7.5); the context names the end that seals with them.
 const EXPORTER: &[u8] = b"EXPORTER-SGC-tcp-records";
 const FROM_DIALER: &[u8] = b"dialer";
 const FROM_LISTENER: &[u8] = b"listener";
 
-/// Why a stream of records ended.
+/// The reason why a stream of records ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RecordError {
-    /// A tag does not hold, or a length is none.
+    /// Wrong tag, or an invalid length.
     #[error("a record does not verify")]
     Altered,
     /// The key was used as often as it may be.
@@ -81,7 +81,7 @@ impl Keys {
     }
 }
 
-/// The key of one direction, and how many records it was used for.
+/// The key of one direction, and the number of its records.
 struct Key {
     key: LessSafeKey,
     records: u64,
@@ -93,7 +93,7 @@ impl Key {
         Ok(Self { key: LessSafeKey::new(key), records: 0 })
     }
 
-    /// Each number once.
+    /// Returns the next nonce: each number once.
     fn nonce(&mut self) -> Result<Nonce, RecordError> {
         if self.records >= RECORDS_MAX {
             return Err(RecordError::UsedUp);
@@ -104,7 +104,7 @@ impl Key {
         Ok(Nonce::assume_unique_for_key(nonce))
     }
 
-    /// The tag of a record, its length included.
+    /// Returns the tag of a record, its length included.
     fn tag(&mut self, record: &[u8]) -> Result<[u8; TAG_BYTES], RecordError> {
         let nonce = self.nonce()?;
         let tag = self.key.seal_in_place_separate_tag(nonce, Aad::from(record), &mut []);
@@ -124,10 +124,10 @@ impl Key {
 pub(super) struct RecordStream {
     wire: Wire,
     keys: Keys,
-    /// Records that are to be written, and how much of them was.
+    /// Records to write, and the bytes of them that are written.
     out: Vec<u8>,
     written: usize,
-    /// Received bytes: verified content that is to be handed out, then an incomplete record, up to `filled`.
+    /// Received bytes: verified content to hand out, then an incomplete record, up to `filled`.
     input: Box<[u8]>,
     filled: usize,
     /// Beginning and end of the verified content that is left.
@@ -153,12 +153,12 @@ impl RecordStream {
         }
     }
 
-    /// Verifies the next record; false if it is not there as a whole.
+    /// Verifies the next record. Returns `false` if it is not complete.
     fn take_record(&mut self) -> Result<bool, RecordError> {
         let Some(rest) = self.input.get(self.next..self.filled) else { return Ok(false) };
         let Some((head, _)) = rest.split_at_checked(HEAD_BYTES) else { return Ok(false) };
         let length = usize::from(u16::from_be_bytes([head[0], head[1]]));
-        // Judged before anything waits for what it announces.
+        // Judged before anything waits for the announced bytes.
         if length == 0 || length > RECORD_BYTES_MAX {
             return Err(RecordError::Altered);
         }
@@ -171,7 +171,7 @@ impl RecordStream {
         Ok(true)
     }
 
-    /// Writes what waits.
+    /// Writes waiting records.
     fn poll_out(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         while let Some(rest) = self.out.get(self.written..).filter(|rest| !rest.is_empty()) {
             let n = ready!(Pin::new(&mut self.wire).poll_write(cx, rest))?;
@@ -185,7 +185,7 @@ impl RecordStream {
         Poll::Ready(Ok(()))
     }
 
-    /// Makes records of what fits: how many bytes of it.
+    /// Makes records of the bytes that fit and returns their number.
     fn queue(&mut self, bufs: &[IoSlice<'_>]) -> Result<usize, RecordError> {
         let mut slices = bufs.iter().map(|buf| &buf[..]).filter(|buf| !buf.is_empty());
         let mut slice = slices.next().unwrap_or_default();
@@ -239,14 +239,14 @@ impl AsyncRead for RecordStream {
                 Ok(false) => {}
                 Err(failure) => {
                     this.failure = Some(failure);
-                    // The content before it is good.
+                    // The content before the failure is good.
                     return Poll::Ready(if has_some { Ok(()) } else { Err(failure.into()) });
                 }
             }
             if has_some {
                 return Poll::Ready(Ok(()));
             }
-            // All that was verified is handed out: what is left moves to the front.
+            // All verified content is handed out: the rest moves to the front.
             this.input.copy_within(this.next..this.filled, 0);
             this.filled -= this.next;
             (this.next, this.ready) = (0, (0, 0));
@@ -305,13 +305,13 @@ mod tests {
 
     use super::*;
 
-    /// The keys of two ends.
+    /// Returns the keys of two ends.
     fn keys(algorithm: &'static Algorithm) -> [Keys; 2] {
         let key = |byte: u8| Key::new(algorithm, &vec![byte; algorithm.key_len()]).unwrap();
         [Keys { tx: key(1), rx: key(2) }, Keys { tx: key(2), rx: key(1) }]
     }
 
-    /// The records of these writes.
+    /// Returns the records of these writes.
     async fn records(writes: &[&[u8]]) -> Vec<Vec<u8>> {
         let [near, _] = keys(&AES_128_GCM);
         let (mut far, wire) = tokio::io::duplex(1 << 20);
@@ -356,7 +356,7 @@ mod tests {
                         tx.write_all(part).await.unwrap();
                     }
                     tx.flush().await.unwrap();
-                    // The other way is there, too.
+                    // The other direction works, too.
                     let mut answer = [0; 2];
                     tx.read_exact(&mut answer).await.unwrap();
                     assert_eq!(&answer, b"ok");
@@ -383,7 +383,7 @@ mod tests {
                 altered[at] ^= 1 << bit;
                 let (got, end) = read(&[&first[..], &altered, &third].concat()).await;
                 assert_eq!(got, b"first", "byte {at}, bit {bit}");
-                // A length that grew has the end of the stream come first.
+                // A length that grew makes the end of the stream come first.
                 assert!(is_altered(&end) || at < HEAD_BYTES, "byte {at}, bit {bit}: {end:?}");
             }
         }

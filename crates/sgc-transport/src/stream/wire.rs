@@ -1,5 +1,5 @@
-//! The streams of bytes below a link: what all of them can do, what is counted, and the end of TLS on a stream that goes
-//! on without it.
+//! The streams of bytes below a link: a common trait, counters, and the end of TLS on a stream that continues without
+//! it.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
@@ -13,7 +13,7 @@ use tokio::net::TcpStream;
 /// Any stream of bytes.
 pub(super) type Wire = Box<dyn Io>;
 
-/// What a stream of bytes can do.
+/// The abilities of a stream of bytes.
 pub(super) trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
@@ -26,13 +26,13 @@ pub(super) struct Counters {
 }
 
 impl Counters {
-    /// Sent and received.
+    /// Returns sent and received bytes.
     pub(super) fn read(&self) -> (u64, u64) {
         (self.sent.load(Relaxed), self.received.load(Relaxed))
     }
 }
 
-/// A TCP connection that counts.
+/// A TCP connection with counters.
 pub(super) struct CountingTcp {
     pub(super) tcp: TcpStream,
     pub(super) counters: Arc<Counters>,
@@ -90,36 +90,36 @@ impl AsyncWrite for CountingTcp {
 
 const RECORD_HEAD_BYTES: usize = 5;
 
-/// What TLS reads from and writes to. Where TLS is to end before the stream does, it hands out one TLS record at a time and
-/// keeps the stream open when TLS ends: so what follows the record that ends TLS is never read as TLS.
+/// The stream below TLS. Where TLS ends before the stream does, it hands out one TLS record at a time and keeps the
+/// stream open when TLS ends: so bytes behind the last record of TLS are never read as TLS.
 pub(super) struct TlsIo {
     wire: Wire,
-    /// Nothing: passes everything on as it is.
+    /// `None` passes everything on as it is.
     records: Option<Records>,
 }
 
 #[derive(Default)]
 struct Records {
     head: [u8; RECORD_HEAD_BYTES],
-    /// Of the head, received and handed out.
+    /// Bytes of the head, received and handed out.
     filled: usize,
     handed: usize,
-    /// Of the body, still to come.
+    /// Bytes of the body, still to come.
     left: usize,
 }
 
 impl TlsIo {
-    /// TLS is all there is.
+    /// Returns a stream that TLS uses to its end.
     pub(super) fn whole(wire: Wire) -> Self {
         Self { wire, records: None }
     }
 
-    /// TLS ends before the stream does.
+    /// Returns a stream that goes on after TLS ends.
     pub(super) fn until_close_notify(wire: Wire) -> Self {
         Self { wire, records: Some(Records::default()) }
     }
 
-    /// What is below.
+    /// Returns the stream below.
     pub(super) fn into_wire(self) -> Wire {
         self.wire
     }

@@ -83,7 +83,7 @@ pub fn joined(payload: &Payload) -> Bytes {
     out.freeze()
 }
 
-/// Whatever hangs fails.
+/// Fails if the future hangs.
 pub async fn soon<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(30), future).await.expect("it hangs")
 }

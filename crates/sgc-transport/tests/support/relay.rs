@@ -14,7 +14,7 @@ use tokio::task::JoinSet;
 /// How many datagrams later one that is reordered comes.
 const REORDER_DEPTH: usize = 4;
 
-/// What the relay does with datagrams from now on; permille.
+/// The relay's treatment of datagrams from now on; permille.
 #[derive(Default)]
 pub struct Impairment {
     pub loss: AtomicU32,
