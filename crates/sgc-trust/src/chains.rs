@@ -1,8 +1,8 @@
-//! Chains that were verified before. Every advertisement and join of a node repeats its chain, and verifying that takes
-//! as long as verifying what it signed.
+//! Chains that were verified before. Every advertisement and join of a node repeats its chain, and verifying the chain
+//! takes as long as verifying the signed body.
 //!
-//! What is known belongs to one value of [`crate::TrustAnchors`]: other CAs or newer revocation lists are another value,
-//! which knows nothing yet. Refusals are not remembered. Nothing but time spent depends on what is known.
+//! The table belongs to one value of [`crate::TrustAnchors`]: other CAs or newer revocation lists are another value,
+//! with an empty table. Refusals are not remembered. The table affects only the time spent.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -14,7 +14,7 @@ use sgc_wire::UnixMillis;
 use crate::verify::VerifiedPeer;
 use crate::x509::Validity;
 
-/// Most chains that are known of one set of CAs, some 600 bytes each. The first to come is the first to go.
+/// Most chains known of one set of CAs, some 600 bytes each. The oldest goes first.
 pub(crate) const CHAINS_KNOWN_MAX: usize = 16_384;
 
 /// Peers by the chains that they were verified with.
@@ -24,13 +24,13 @@ pub(crate) struct KnownChains(Mutex<ChainTable>);
 #[derive(Default)]
 struct ChainTable {
     peers: BTreeMap<ChainHash, KnownPeer>,
-    /// In the order in which they came.
+    /// Chains, the oldest first.
     order: VecDeque<ChainHash>,
 }
 
 struct KnownPeer {
     peer: VerifiedPeer,
-    /// While every certificate from the leaf to the CA holds.
+    /// Time in which every certificate from the leaf to the CA is valid.
     validity: Validity,
 }
 
@@ -52,7 +52,7 @@ impl ChainHash {
 }
 
 impl KnownChains {
-    /// The peer of a chain that was verified before and still holds.
+    /// Returns the peer of a chain that was verified before and is still valid.
     pub(crate) fn find(&self, chain: &ChainHash, now: UnixMillis) -> Option<VerifiedPeer> {
         let known = self.lock();
         let known = known.peers.get(chain)?;
@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn a_known_chain_ends_with_its_intermediate_and_with_its_ca() {
         let spans = [
-            // CA, intermediate, leaf: the years until which they hold.
+            // CA, intermediate, leaf: the years until which they are valid.
             [2040, 2028, 2035],
             [2028, 2040, 2035],
         ];
@@ -250,7 +250,7 @@ mod tests {
         assert!(!is_there(9) && is_there(10) && is_there(CHAINS_KNOWN_MAX + 9));
     }
 
-    /// A chain of a leaf and an intermediate, which with their CA hold until the ends of these years.
+    /// Makes a chain of a leaf and an intermediate, which with their CA are valid until the ends of these years.
     fn made(
         ca_until: i32,
         intermediate_until: i32,

@@ -1,8 +1,9 @@
-//! Who a node is, what it may do, and how payloads are sealed: identities, names, grants, suites, policy.
+//! Identities, names, grants, suites and policy: the proof of a node's identity, its rights, and the sealing of
+//! payloads.
 //!
-//! Pure: time is an argument, files are text. One thing draws randomness by itself: the cryptographic
-//! provider, for signatures and key encapsulation; nothing that decides behaviour depends on it.
-//! The normative text is `docs/spec/names.md` and `docs/spec/trust.md`.
+//! Pure: time is an argument, files are text. Only the cryptographic provider draws randomness by itself, for
+//! signatures and key encapsulation; no decision depends on it. The normative text is `docs/spec/names.md` and
+//! `docs/spec/trust.md`.
 #![forbid(unsafe_code)]
 
 mod batch;

@@ -1,4 +1,4 @@
-//! Who may join a share, and as what: closed unless it says otherwise.
+//! Permissions to join a share as subscriber or publisher: nobody may unless the policy says so.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use sgc_wire::{GroupTag, NodeId, Role};
 
 use crate::{CaFingerprint, VerifiedPeer};
 
-/// A set of peers, by what their certificates prove.
+/// A set of peers, by the facts that their certificates prove.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Grantees {
     /// Every node of the fleets with these CAs.
@@ -17,25 +17,25 @@ pub struct Grantees {
     pub groups: BTreeSet<(CaFingerprint, GroupTag)>,
 }
 
-/// Why a peer is in a set of grantees.
+/// The reason why a peer is in a set of grantees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum GrantReason {
-    /// It is named itself.
+    /// The node itself is named.
     Node,
-    /// A group of it is named.
+    /// A group of the node is named.
     Group(GroupTag),
-    /// Its whole fleet is named.
+    /// The node's whole fleet is named.
     Fleet,
 }
 
 impl Grantees {
-    /// How `peer` is among them, if it is.
+    /// Returns the reason why `peer` is in the set, if it is.
     pub fn find(&self, peer: &VerifiedPeer) -> Option<GrantReason> {
         self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
     }
 
-    /// How a node whose certificate proves this is among them, if it is. For those who ask about a node that is
-    /// not there; what decides about one that is, is [`Grantees::find`].
+    /// Returns the reason why a node with these facts is in the set, if it is. For questions about an absent node;
+    /// [`Grantees::find`] decides about a present one.
     pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<GrantReason> {
         if self.nodes.contains(node) {
             return Some(GrantReason::Node);
@@ -44,25 +44,25 @@ impl Grantees {
         group.map(|g| GrantReason::Group(*g)).or(self.fleets.contains(ca).then_some(GrantReason::Fleet))
     }
 
-    /// Returns `true` if nobody is.
+    /// Returns `true` if the set is empty.
     pub fn is_empty(&self) -> bool {
         self.fleets.is_empty() && self.nodes.is_empty() && self.groups.is_empty()
     }
 }
 
-/// Who may join one share.
+/// The peers that may join one share.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Policy {
-    /// Who may receive what is published.
+    /// Peers that may subscribe.
     pub subscribe: Grantees,
-    /// Who may publish, besides the owner.
+    /// Peers that may publish, besides the owner.
     pub publish: Grantees,
 }
 
-/// Why a peer is not permitted.
+/// The reason why a peer is not permitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum DenialReason {
-    /// Neither it, nor a group of it, nor its fleet is named.
+    /// Neither the node, nor a group of it, nor its fleet is named.
     #[error("neither the node, nor a group that its certificate puts it into, nor its fleet is named")]
     NotListed,
     /// The share offers that role to nobody.
@@ -71,7 +71,7 @@ pub enum DenialReason {
 }
 
 impl Policy {
-    /// Whether `peer` may join as `role`, and because of what.
+    /// Returns the reason why `peer` may join as `role`, or why not.
     pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<GrantReason, DenialReason> {
         let grantees = match role {
             Role::Subscribe => &self.subscribe,

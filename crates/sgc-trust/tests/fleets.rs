@@ -1,4 +1,4 @@
-//! What a fleet keeps of its nodes: the roster, roles, renewal, generations of secrets, CAs that exist already.
+//! A fleet's record of its nodes: the roster, roles, renewal, generations of secrets, existing CAs.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::time::Duration;
@@ -128,7 +128,7 @@ fn a_file_from_before_rosters_is_read_and_gets_one_when_it_changes() {
     assert!(!fleet.has_roster() && fleet.nodes().len() == 0);
     assert_eq!(again(&fleet).nodes().len(), 0);
     assert!(matches!(fleet.revoke(&[name("arm-1")], NOW), Err(FleetError::UnknownNode { .. })));
-    // A certificate from then can be entered, and is revoked then.
+    // A certificate from before the roster can be entered and then revoked.
     let error = fleet.adopt(name("desk"), old.chain(), NOW).unwrap_err();
     assert!(matches!(error, FleetError::Adopt(_)), "{error}");
     fleet.adopt(name("arm-1"), old.chain(), NOW).unwrap();
@@ -168,7 +168,7 @@ fn revoking_a_node_takes_back_all_of_its_certificates() {
     // Numbers grow also where the clock was set back.
     fleet.revoke(&[name("desk")], NOW).unwrap();
     assert!(fleet.crl_number() > number);
-    // What is over needs no list.
+    // Expired certificates need no list.
     fleet.revoke(&[name("desk")], at(100)).unwrap();
     assert!(fleet.nodes().all(|n| n.certificates.is_empty()));
 }

@@ -1,4 +1,4 @@
-//! What is taken back stays taken back: revocation lists, whoever brings them.
+//! Revocations are permanent, however the lists arrive.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::sync::Arc;

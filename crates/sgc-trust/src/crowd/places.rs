@@ -1,4 +1,4 @@
-//! Places for handshakes: a bound for all, a bound for each address, and which handshake gives way.
+//! Places for handshakes: a bound for all, a bound for each address, and the rule for the handshake that gives way.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ pub struct PlaceLimits {
     pub per_prefix: usize,
 }
 
-/// Why a place was not to be had.
+/// The reason why there is no place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlaceRefusal {
     /// The peer's own address holds as many as one address may.
@@ -91,7 +91,8 @@ impl<T> Places<T> {
         self.held.retain(|place| is_pending(&place.holder));
     }
 
-    /// Makes room for a peer of this address, or says why there is none. Callers pass the holder to [`Self::take`] then.
+    /// Makes room for a peer of this address, or returns the reason why there is none. The caller then passes the
+    /// holder to [`Self::take`].
     pub fn make_room(
         &mut self,
         prefix: AddressPrefix,
