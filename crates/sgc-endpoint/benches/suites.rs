@@ -22,7 +22,7 @@ struct Ends {
     suite: Suite,
     source: Source,
     sink: Sink,
-    /// Of each round, per message: sealing and opening.
+    /// Times of each round, per message: sealing and opening.
     rounds: Vec<(Duration, Duration)>,
 }
 

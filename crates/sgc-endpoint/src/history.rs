@@ -1,4 +1,4 @@
-//! What a source keeps of what it published: for late joiners, and for who lost something on the way.
+//! Published messages that a source keeps for late joiners, and for sinks with losses.
 //!
 //! One queue of consecutive numbers serves both; each has its own end of it. Payloads are references.
 
@@ -7,26 +7,26 @@ use std::collections::VecDeque;
 use bytes::Bytes;
 use sgc_wire::{MessageHead, MessageKind};
 
-/// Messages that a reliable source keeps for who lost them.
+/// Messages that a reliable source keeps for recovery.
 pub const RECOVERY_MESSAGES_MAX: usize = 4096;
 /// Bytes of those; the newest message is kept whatever its size.
 pub const RECOVERY_BYTES_MAX: usize = 16 << 20;
 
-/// What a kept message counts beyond its payload, bytes.
+/// Size of a kept message beyond its payload, bytes.
 const KEPT_OVERHEAD_BYTES: usize = 64;
 
-/// How much a reliable source keeps for who lost it. By number and bytes alone: that bounds memory as it is, and a
-/// bound by age would take away what is asked for after a long interruption, when nobody else has it.
+/// Messages that a reliable source keeps for recovery. Bounds are number and bytes: they bound memory, and a bound by
+/// age would drop messages that are asked for after a long interruption, when nobody else has them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RecoveryLimits {
-    /// Messages, marks among them; 0 if what is lost stays lost.
+    /// Messages, marks among them; 0 if lost messages stay lost.
     pub messages_max: usize,
     /// Bytes.
     pub bytes_max: usize,
 }
 
 impl RecoveryLimits {
-    /// Nothing: nobody can ask for it.
+    /// Keeps nothing: nobody can ask for lost messages.
     pub const NONE: Self = Self { messages_max: 0, bytes_max: 0 };
 }
 
@@ -57,7 +57,7 @@ impl HistoryEntry {
 struct Tail {
     from: u64,
     numbers: usize,
-    /// Numbers that are no marks.
+    /// Messages that are no marks.
     messages: usize,
     bytes: usize,
 }
@@ -83,14 +83,14 @@ pub(crate) struct History {
     recovery: RecoveryLimits,
     /// Consecutive numbers, up to the last published.
     kept: VecDeque<HistoryEntry>,
-    /// What late joiners get.
+    /// Messages for late joiners.
     late: Tail,
-    /// What is there to be recovered.
+    /// Messages for recovery.
     recent: Tail,
 }
 
 impl History {
-    /// Keeps `depth` messages of at most `bytes_max` for late joiners.
+    /// Returns a history of `depth` messages of at most `bytes_max` for late joiners.
     pub(crate) fn new(depth: usize, bytes_max: usize, recovery: RecoveryLimits) -> Self {
         let tail = || Tail { from: 1, numbers: 0, messages: 0, bytes: 0 };
         Self { depth, bytes_max, recovery, kept: VecDeque::new(), late: tail(), recent: tail() }
@@ -122,7 +122,7 @@ impl History {
         self.drop_unused();
     }
 
-    /// Keeps so many messages for late joiners from here on, at least one if it kept any.
+    /// Sets the number of messages for late joiners, at least one if it kept any.
     pub(crate) fn set_depth(&mut self, depth: usize) {
         if self.depth > 0 {
             self.depth = depth.max(1);
@@ -133,7 +133,7 @@ impl History {
 
     fn trim_late(&mut self) {
         let front = self.front();
-        // Marks are small, and count for late joiners in nothing but bytes.
+        // Marks are small, and only their bytes count for late joiners.
         while self.depth > 0
             && (self.late.messages > self.depth || self.late.bytes > self.bytes_max)
             && let Some(first) = self.kept.get((self.late.from - front) as usize)
@@ -150,13 +150,13 @@ impl History {
         }
     }
 
-    /// The number that is kept longest; that of late joiners if none is.
+    /// Returns the oldest number to keep; that of late joiners if there is none.
     fn front(&self) -> u64 {
         self.kept.front().map_or(self.late.from, |m| m.seq)
     }
 
-    /// Lets go what was dated before `ns`, up to the first that was not: messages of one publisher are dated in turn. What has
-    /// no date stays, marks go too.
+    /// Drops messages dated before `ns`, up to the first later one: dates of one publisher rise. Messages without a
+    /// date stay; marks go too.
     pub(crate) fn expire(&mut self, ns: i64) {
         while let Some(first) = self.kept.front()
             && (first.is_mark() || (1..ns).contains(&first.head.source_timestamp_ns))
@@ -171,17 +171,17 @@ impl History {
         }
     }
 
-    /// Where the history for late joiners begins: the next number if there is none.
+    /// Returns the beginning of the history for late joiners: the next number if there is none.
     pub(crate) fn late_from(&self) -> u64 {
         self.late.from
     }
 
-    /// The oldest number that is here; the next one if there is none.
+    /// Returns the oldest number that is here; the next one if there is none.
     pub(crate) fn oldest(&self) -> u64 {
         self.late.from.min(self.recent.from)
     }
 
-    /// The number published last, if it is here.
+    /// Returns the message published last, if it is here.
     pub(crate) fn newest(&self) -> Option<&HistoryEntry> {
         self.kept.back()
     }
@@ -190,7 +190,7 @@ impl History {
         self.kept.back_mut()
     }
 
-    /// What is here of `from..=to`, as references that outlive a change.
+    /// Returns the kept messages of `from..=to`, as references that outlive a change.
     pub(crate) fn range(&self, from: u64, to: u64) -> Vec<(u64, MessageHead, Bytes)> {
         let begin = self.kept.partition_point(|m| m.seq < from);
         let asked = self.kept.iter().skip(begin).take_while(|m| m.seq <= to);

@@ -1,12 +1,12 @@
-//! Publish and subscribe by name: what a node does for itself, as opposed to what it carries for others.
+//! Publish and subscribe by name: a node's own traffic, as opposed to the traffic that it carries for others.
 //!
-//! [`Endpoint`] is a pure machine: frames of its own router, the user's wishes and the time go in; frames and
-//! events come out. After each `handle_*` or wish the driver drains [`Endpoint::poll_output`] until
-//! [`Output::Timeout`]. [`Source`] and [`Sink`] are the two ends of the data path: they seal and open on the
-//! thread that calls them, and never call the machine.
+//! [`Endpoint`] is a pure machine: frames of its own router, the user's requests and the time go in; frames and events
+//! come out. After each call the driver drains [`Endpoint::poll_output`] until [`Output::Timeout`]. [`Source`] and
+//! [`Sink`] are the two ends of the data path: they seal and open on the thread that calls them, and never call the
+//! machine.
 //!
-//! It knows nothing of ROS (that is `sgc-ros`) and nothing of routes (that is `sgc-router`); it meets
-//! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
+//! The crate knows nothing of ROS (that is `sgc-ros`) and nothing of routes (that is `sgc-router`); it meets routers in
+//! frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
 mod advert_pace;

@@ -29,10 +29,10 @@ const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 /// So many small messages share a piece of memory at the source: with fewer than these it would count once too often, or
 /// not at all.
 const ROUNDS: usize = 8;
-/// What a packet and a message take besides their payload: header, head, tag, counters of references, a signature and
-/// the hashes of a batch; bytes. Less than the smallest payload here, so that a second copy of any shows.
+/// Bytes of a packet and a message besides their payload: header, head, tag, counters of references, a signature and
+/// the hashes of a batch. Less than the smallest payload here, so that a second copy of any shows.
 const ASIDE: usize = 700;
-/// What a key, a window and a verifier take, once for each source; bytes.
+/// Memory of a key, a window and a verifier, once for each source; bytes.
 const ONCE: usize = 40_000;
 
 fn ends(suite: Suite, history_depth: usize) -> (Source, Sink) {
@@ -121,7 +121,7 @@ fn a_large_message_takes_one_fragment_more_the_first_time() {
     assert!(first > bytes && first < bytes + ONCE, "{first}");
 }
 
-/// What the transport received in two pieces is joined first: a copy more.
+/// A packet that the transport received in two pieces is joined first: one copy more.
 #[test]
 fn a_packet_in_pieces_is_copied_once_more() {
     let (mut source, mut sink) = ends(Suite::Standard, 0);

@@ -197,7 +197,7 @@ fn an_older_request_of_a_sink_does_not_bring_its_key_back() {
 #[test]
 fn names_that_come_one_by_one_do_not_stay_apart() {
     let mut bench = owner();
-    // Which advertisement speaks for each name, as routers keep it.
+    // The advertisement that speaks for each name, as routers keep it.
     let mut words = std::collections::BTreeMap::new();
     let mut most = 0;
     for n in 0..500 {

@@ -184,7 +184,7 @@ fn a_source_that_is_not_announced_any_more_ends_with_the_epoch() {
     regranted(&mut sink, SINK, grant_of(2, &[&stays]));
     assert_eq!(delivered(&mut sink, &published(&mut gone, bytes(1), false)).len(), 1);
     let old = published(&mut gone, bytes(1), false);
-    // Who lost the right to publish but knows the new key is not believed in the new epoch.
+    // A node without the right to publish that knows the new key is not believed in the new epoch.
     rekeyed(&mut gone, 2);
     let new = published(&mut gone, bytes(2), false);
     assert_eq!(sink.handle_packet(&new[0]), Ok(Delivery::Parked));

@@ -1,4 +1,4 @@
-//! What is altered, made by another member, or taken from elsewhere is refused, and leaves nothing behind.
+//! Altered packets, packets of other members and copied packets are refused, and leave nothing behind.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};

@@ -83,7 +83,7 @@ fn flushed(source: &mut Source) -> Vec<Packet> {
     packets
 }
 
-/// What a late joiner gets.
+/// Returns the messages that a late joiner gets.
 fn replayed(source: &mut Source) -> Vec<Packet> {
     replayed_to(source, SINK, 0)
 }
@@ -105,7 +105,7 @@ fn payload(result: Result<Delivery, SinkDrop>) -> Option<Bytes> {
     }
 }
 
-/// What a sink says to a grant.
+/// Returns a sink's results of a grant.
 fn regranted(sink: &mut Sink, id: SinkId, grant: TopicGrant) -> Vec<Result<Delivery, SinkDrop>> {
     let mut released = Vec::new();
     sink.regrant(id, grant, |result| released.push(result));

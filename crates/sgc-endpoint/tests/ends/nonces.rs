@@ -9,7 +9,7 @@ use sgc_trust::{TAG_BYTES, opened_bytes};
 
 use super::*;
 
-/// What a packet's key is derived from, and its nonce.
+/// The inputs of a packet's key and nonce.
 type KeyAndNonce = (u32, SourceId, Option<SinkId>, u64, u16);
 
 /// Everything that was sealed: associated data, ciphertext and tag. With one key and nonce, two of them are
@@ -75,8 +75,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
     }
 }
 
-/// What is sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another
-/// epoch, it is under another key.
+/// A packet sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another epoch, it
+/// is under another key.
 #[test]
 fn replays_repeat_themselves_and_nothing_else() {
     for suite in [Suite::Group, Suite::Standard] {

@@ -1,4 +1,4 @@
-//! What a sink asks for again, what it gets, and what stays lost.
+//! Recovery: the messages that a sink asks for, those that it gets, and those that stay lost.
 
 use super::*;
 
@@ -39,7 +39,7 @@ fn a_gap_is_asked_for_and_filled_in_order() {
         assert_eq!(answer.len(), 4 + 1, "nothing that is here");
         assert_eq!(delivered(&mut sink, &answer), [3, 4, 5, 6].map(bytes), "{suite}");
         assert_eq!((sink.unsynced().count(), sink.ask(source.id())), (0, None));
-        // What comes late, over whatever way, is past.
+        // Late messages, on any route, are past.
         for late in &packets[2..] {
             assert_eq!(sink.handle_packet(late), Err(SinkDrop::Replayed));
         }
@@ -218,7 +218,7 @@ fn an_answer_that_is_on_its_way_is_waited_for() {
     assert_eq!(sink.ask_again(source.id()), AskAgain::No);
 }
 
-/// Who says too early that all was sent, with a recorded sign, gains nothing.
+/// A recorded sign of a history's end, sent too early, gains nothing.
 #[test]
 fn an_end_that_is_played_again_loses_nothing() {
     let mut source = source(SUITE, 5);
