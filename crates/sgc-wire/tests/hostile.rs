@@ -210,7 +210,7 @@ fn consumers_survive_mutation_and_arbitrary_bytes_within_their_bounds() {
     }
 }
 
-/// What is kept while an answer is read grows with its bytes, not with the number that it claims.
+/// Memory grows with the bytes of an answer, not with the number that it claims.
 #[test]
 fn claimed_consumers_that_do_not_follow_are_refused() {
     for claimed in [1, CONSUMERS_MAX as u32, CONSUMERS_MAX as u32 + 1, u32::MAX] {
