@@ -1,7 +1,7 @@
-//! [`Memory`]: announcements that are in force no longer, so that none of them becomes news again.
+//! [`Memory`]: announcements that are no longer in force, so that none of them becomes news again.
 //!
-//! A signed announcement verifies for minutes after it was superseded or its lease ended. The memory keeps a few digests and one
-//! number for each signer, so no signer can displace what is remembered of another.
+//! A signed announcement verifies for minutes after it was superseded or its lease ended. The memory keeps a few
+//! digests and one number for each signer, so no signer can displace the memory of another.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
@@ -18,16 +18,16 @@ const DIGESTS_MAX: usize = 8;
 struct SignerMemory {
     /// Announcements with lower numbers are void.
     floor: u64,
-    /// The floor that the last link state of the signer named, which ended.
+    /// The floor in the signer's last link state, which ended.
     run_floor: u64,
-    /// The one with the greatest number that ended without a newer one; its signer has to exceed it.
+    /// The announcement with the greatest number that ended without a newer one; its signer has to exceed the number.
     newest: Option<(u64, SignedBody)>,
     digests: VecDeque<[u8; 32]>,
-    /// After that no announcement of before verifies any more.
+    /// Time after which no earlier announcement verifies any more.
     until: Instant,
 }
 
-/// Announcements of all signers that are in force no longer.
+/// Announcements of all signers that are no longer in force.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
     signers: BTreeMap<NodeId, SignerMemory>,
@@ -51,12 +51,12 @@ impl Memory {
         self.signers.get(signer)?.newest.as_ref().map(|(seq, signed)| (*seq, signed))
     }
 
-    /// Returns when something is to be forgotten.
+    /// Returns the time of the next expiry.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.forgets.first().map(|(at, _)| *at)
     }
 
-    /// Remembers an announcement that a newer one took the place of. At most `max` signers are remembered; with more, the one
+    /// Remembers an announcement that a newer one replaced. At most `max` signers are remembered; with more, the one
     /// that was quiet for longest is forgotten.
     pub(crate) fn superseded(
         &mut self,
@@ -93,7 +93,7 @@ impl Memory {
         }
     }
 
-    /// Remembers the floor that a signer's link state named, now that the link state has ended.
+    /// Remembers the floor in a signer's link state, which has ended.
     pub(crate) fn run_ended(&mut self, now: Instant, signer: &NodeId, floor: u64, max: usize) {
         self.past(now, signer, max).run_floor = floor;
     }
@@ -103,7 +103,7 @@ impl Memory {
         self.signers.get(signer).map_or(0, |past| past.run_floor)
     }
 
-    /// Returns the memory of a signer, kept from now on for as long as anything of before may verify.
+    /// Returns the memory of a signer, kept from now on for as long as any earlier announcement may verify.
     fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut SignerMemory {
         if !self.signers.contains_key(signer)
             && self.signers.len() >= max
@@ -120,7 +120,7 @@ impl Memory {
         past
     }
 
-    /// Forgets what cannot verify any more.
+    /// Forgets announcements that cannot verify any more.
     pub(crate) fn expire(&mut self, now: Instant) {
         while let Some((_, signer)) = self.forgets.first().copied().filter(|(at, _)| *at <= now) {
             self.forget(&signer);

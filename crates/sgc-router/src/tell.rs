@@ -1,7 +1,8 @@
-//! Telling neighbours: all that is known to one that greets, in parts, and what its signer's allowance kept back.
+//! Telling neighbours: the whole state for one that greets, in parts, and announcements beyond their signers'
+//! allowances.
 //!
-//! The driver's queue for a link is bounded, and a full one ends the link. So a router hands out a part, waits until the link
-//! has taken it, and goes on. News that come meanwhile go out at once.
+//! The driver's queue for a link is bounded, and a full one ends the link. So a router hands out a part, waits until
+//! the link has taken it, and continues. News that come meanwhile go out at once.
 
 use std::collections::VecDeque;
 use std::ops::Bound;
@@ -19,7 +20,7 @@ const TELL_BYTES_MAX: usize = 1 << 20;
 /// Interval of looks at announcements beyond the allowance of their signer.
 const LATE_EVERY: Duration = Duration::from_millis(100);
 
-/// Progress of telling a neighbour the state that was known when it greeted.
+/// Progress of telling a neighbour the state at the time of its greeting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SyncProgress {
     /// Link states, in the order of their nodes.

@@ -1,4 +1,4 @@
-//! One router among scripted neighbours: which way it takes, and what it tells of it.
+//! One router among scripted neighbours: the routes that it takes, and the neighbours that it tells.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -42,7 +42,7 @@ struct Bench {
     seq: u64,
     /// Links that the router closed.
     closed: Vec<u32>,
-    /// Links that the router waits for to take what they were sent.
+    /// Links whose queues the router waits for.
     flushes: Vec<LinkId>,
     /// True while no link takes anything.
     stuck: bool,
@@ -280,7 +280,7 @@ impl Bench {
         told
     }
 
-    /// What leaves for all, having come in over a link.
+    /// Returns the links for a packet to all that came in over a link.
     fn egress(&self, ingress: u32) -> Vec<u32> {
         self.entry.iter().flat_map(|e| e.egress(LinkId(ingress))).map(|l| l.0).collect()
     }
@@ -406,7 +406,7 @@ fn names_are_told_to_all_routers_or_to_those_who_ask() {
         let names = vec![bench.name(&A)];
         bench.frame(1, Control::Query { id: 0, hops: 0, names });
         assert_eq!(bench.told(), [(1, "advert"), (1, "link state")], "{mapping:?}: an answer");
-        // Who asked hears of changes.
+        // The asker is told of changes.
         bench.frame(4, bench.advert_frame(11, true, &[A]));
         assert!(bench.told().contains(&(1, "withdrawal")), "{mapping:?}");
     }
@@ -518,7 +518,7 @@ fn an_advertisement_that_came_too_late_to_be_believed_by_others_is_not_told() {
     let body = LinkStateBody { lease_ms, ..bench.link_state(&bench.routers[3], 1, &[]) };
     let link_state = Control::LinkState { signed: bench.routers[3].sign_link_state(&body) };
     let late = bench.routers[4].clone();
-    // Those of router 4, which is not linked, and of the owner.
+    // The link states of router 4, which is not linked, and of the owner.
     let told = |bench: &Bench| {
         let all = bench.sent.iter().filter(|(link, _)| *link >= 6);
         all.filter(|(_, frame)| *frame == advert || *frame == link_state).count()
@@ -643,7 +643,7 @@ fn replays_of_a_nodes_announcements_leave_it_its_allowance_and_cost_who_brings_t
     }
     let of = |key| bench.dropped.iter().filter(|d| **d == key).count();
     assert_eq!(of("limit"), 0);
-    // Those that are remembered by their digest are known at once; others cost a verification, which is charged.
+    // Remembered ones are recognised by their digest at once; others cost a verification, which is charged.
     assert!(of("stale_flood") > 2000, "{}", of("stale_flood"));
     // Others bring news as before: the neighbour pays for itself.
     bench.dropped.clear();
@@ -1096,7 +1096,7 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
     let before = checked(&bench);
     let desk = bench.user.clone();
     for n in 0..20 {
-        // A member that signs again and again what it said, or that its link costs more each time.
+        // A member that repeats its announcements, or raises the cost of its link each time.
         for cost in [1000, 1000 + n * 1000] {
             bench.seq += 1;
             let body = LinkStateBody { transit: false, ..bench.link_state(&desk, bench.seq, &[(0, cost)]) };
