@@ -1,6 +1,7 @@
-//! JSON to values, straight by the layout: octets become bytes and numbers elements of their type, with nothing in between.
+//! JSON to values, straight by the layout: octets become bytes and numbers elements of their type, with nothing in
+//! between.
 //!
-//! What is understood is in docs/spec/json.md. Depth is that of the layout, since members that it does not have are errors.
+//! docs/spec/json.md defines the accepted JSON. The depth is that of the layout, because unknown members are errors.
 
 use std::cell::{Cell, RefCell};
 use std::fmt;
@@ -20,16 +21,16 @@ use crate::number::{Number, little};
 use crate::path;
 use crate::value::{PackedArray, Value};
 
-/// Base64 with or without the signs that fill it up.
+/// Base64 with or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
     &STANDARD,
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
 );
-/// Elements that room is made for before they are there.
+/// Most elements for which memory is reserved before they are read.
 const RESERVE_MAX: usize = 1024;
 
 impl Layout {
-    /// Reads a message of the type from JSON in UTF-8. Members that are left out take their default.
+    /// Reads a message of the type from JSON in UTF-8. Missing members take their default.
     pub fn from_json(&self, json: &[u8]) -> Result<Value, ValueError> {
         let no_text = |why: std::str::Utf8Error| {
             ValueProblem::Syntax(format!("the JSON is not UTF-8 at byte {}", why.valid_up_to()))
@@ -50,7 +51,7 @@ impl Layout {
     }
 }
 
-/// What all parts of a message share. `serde_json` knows no errors but its own: ours are kept here meanwhile.
+/// State that all parts of a message share. `serde_json` carries only its own errors: ours are kept here meanwhile.
 struct Reader<'a> {
     layout: &'a Layout,
     budget: RefCell<Budget>,
@@ -149,11 +150,11 @@ impl<'de> Visitor<'de> for Record<'_, '_> {
     }
 }
 
-/// The name of a member; its place is what comes of it.
+/// Reads the name of a member into its index.
 struct Key<'r, 'a> {
     reader: &'r Reader<'a>,
     this: &'a Struct,
-    /// The member that comes now, if they come in order.
+    /// The next member, if they come in order.
     next: usize,
 }
 
@@ -348,12 +349,12 @@ impl Visitor<'_> for PrimitiveSeed<'_, '_> {
     }
 }
 
-/// A float of the JSON that stands for it.
+/// Parses a float, or the JSON that stands for one.
 fn float(text: &str, primitive: Primitive) -> Result<Value, ValueProblem> {
     let of = |value: f64| Number::Float64(value).fit(primitive);
     let wrong = || ValueProblem::Kind { found: short(text), expected: primitive.name() };
     match text {
-        // `rosbridge_suite` writes null for what is no number.
+        // `rosbridge_suite` writes null for values that are no numbers.
         "null" | "\"NaN\"" => of(f64::NAN),
         "\"Infinity\"" => of(f64::INFINITY),
         "\"-Infinity\"" => of(f64::NEG_INFINITY),
@@ -386,7 +387,7 @@ struct Text<'r, 'a> {
 impl<'de> DeserializeSeed<'de> for Text<'_, '_> {
     type Value = Value;
 
-    /// As bytes, where half of a surrogate pair is no error.
+    /// Reads bytes, where half of a surrogate pair is no error.
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
         self.reader.value()?;
         deserializer.deserialize_bytes(self)
@@ -429,7 +430,7 @@ impl Visitor<'_> for Text<'_, '_> {
     }
 }
 
-/// The units of UTF-16 of a text in which halves of surrogate pairs stand as UTF-8 would write them.
+/// Returns the UTF-16 units of a text with half surrogate pairs in UTF-8 form.
 fn units(text: &[u8]) -> Vec<u16> {
     let mut units = Vec::with_capacity(text.len());
     for chunk in text.chunk_by(|_, next| next & 0xc0 == 0x80) {
@@ -438,7 +439,7 @@ fn units(text: &[u8]) -> Vec<u16> {
             (Err(_), [0xed, second, third]) => {
                 units.push(0xd000 | u16::from(second & 0x3f) << 6 | u16::from(third & 0x3f));
             }
-            // The rest is what `serde_json` took from a text.
+            // `serde_json` accepted everything else as text.
             (Err(_), _) => {}
         }
     }
@@ -452,7 +453,7 @@ mod tests {
     fn read(text: &str, json: &str) -> Result<String, String> {
         let layout = layout(text);
         let value = layout.from_json(json.as_bytes()).map_err(|error| error.to_string())?;
-        // What is read fits the type.
+        // Every value that was read fits the type.
         layout.encode(&value).unwrap();
         Ok(value.to_json())
     }

@@ -1,4 +1,4 @@
-//! What a message says.
+//! Values of messages.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use bytes::Bytes;
 
 use crate::definition::Primitive;
 
-/// A value of a message. What it was declared as is in its definition.
+/// A value of a message. Its definition has its declared type.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
     /// `bool`.
@@ -23,7 +23,7 @@ pub enum Value {
     Text(String),
     /// A `string` that is not UTF-8: its bytes.
     Raw(Bytes),
-    /// A `wstring` that is not UTF-16, since half of a surrogate pair lacks: its units.
+    /// A `wstring` that is not UTF-16, because half of a surrogate pair is missing: its units.
     Wide(Vec<u16>),
     /// Arrays and sequences of `byte`, `char` and `uint8`.
     Octets(Bytes),
@@ -36,11 +36,12 @@ pub enum Value {
 }
 
 impl Value {
-    /// A member by its path: `pose.position.x`, with `[2]` for an element of a sequence: `transforms[0].header`.
+    /// Returns a member by its path: `pose.position.x`, with `[2]` for an element of a sequence:
+    /// `transforms[0].header`.
     pub fn at(&self, path: &str) -> Option<Value> {
         enum Cursor<'a> {
             Within(&'a Value),
-            /// Of a sequence of primitives, which has no values in it.
+            /// An element of a packed sequence, which has no values in it.
             Made(Value),
         }
         let mut here = Cursor::Within(self);
@@ -74,7 +75,7 @@ impl Value {
         })
     }
 
-    /// What it is, for who expected something else.
+    /// Returns the kind of value, for errors.
     pub(crate) fn kind(&self) -> &'static str {
         match self {
             Self::Bool(_) => "a bool",
@@ -88,7 +89,7 @@ impl Value {
         }
     }
 
-    /// A text of UTF-8 or what looks like it.
+    /// Returns a text of UTF-8, or the raw bytes.
     pub(crate) fn from_bytes(bytes: Bytes) -> Self {
         match std::str::from_utf8(&bytes) {
             Ok(text) => Self::Text(text.to_owned()),
@@ -96,7 +97,7 @@ impl Value {
         }
     }
 
-    /// A text of UTF-16 or what looks like it.
+    /// Returns a text of UTF-16, or the raw units.
     pub(crate) fn from_units(units: Vec<u16>) -> Self {
         match String::from_utf16(&units) {
             Ok(text) => Self::Text(text),
@@ -105,8 +106,8 @@ impl Value {
     }
 }
 
-/// Elements of an array or a sequence of primitives, as they are in little endian CDR: an element takes no more than its
-/// bytes, and those of a payload are shared with it. Two are equal if all bits are: NaN is equal to itself.
+/// Elements of an array or a sequence of primitives, as in little endian CDR: an element takes no more than its bytes,
+/// and those of a payload share its memory. Two are equal if all bits are: NaN is equal to itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PackedArray {
     primitive: Primitive,
@@ -114,8 +115,8 @@ pub struct PackedArray {
 }
 
 impl PackedArray {
-    /// Elements of these bytes, the least of each first. `None` if the last one is not whole, if a `bool` is neither 0 nor
-    /// 1, and for `byte` and `uint8`, which are [`Value::Octets`].
+    /// Returns elements of these bytes, little endian. `None` if the last one is incomplete, if a `bool` is neither 0
+    /// nor 1, and for `byte` and `uint8`, which are [`Value::Octets`].
     pub fn new(primitive: Primitive, octets: Bytes) -> Option<Self> {
         let fits = match primitive {
             Primitive::Byte | Primitive::Uint8 => false,
@@ -125,40 +126,40 @@ impl PackedArray {
         fits.then_some(Self { primitive, octets })
     }
 
-    /// What its elements are.
+    /// Returns the type of its elements.
     pub fn primitive(&self) -> Primitive {
         self.primitive
     }
 
-    /// Its elements, the least byte of each first.
+    /// Returns the bytes of its elements, little endian.
     pub fn octets(&self) -> &Bytes {
         &self.octets
     }
 
-    /// How many elements there are.
+    /// Returns the number of elements.
     pub fn len(&self) -> usize {
         self.octets.len() / self.primitive.bytes()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no elements.
     pub fn is_empty(&self) -> bool {
         self.octets.is_empty()
     }
 
-    /// An element.
+    /// Returns an element.
     pub fn at(&self, index: usize) -> Option<Value> {
         let size = self.primitive.bytes();
         let begin = index.checked_mul(size)?;
         self.octets.get(begin..begin.checked_add(size)?).map(|bytes| scalar(self.primitive, bytes))
     }
 
-    /// All elements.
+    /// Iterates over all elements.
     pub fn iter(&self) -> impl Iterator<Item = Value> {
         self.octets.chunks_exact(self.primitive.bytes()).map(|bytes| scalar(self.primitive, bytes))
     }
 }
 
-/// A primitive of its bytes, the least first; those that lack are zero.
+/// Returns a primitive of its bytes, little endian; missing bytes are zero.
 pub(crate) fn scalar(primitive: Primitive, bytes: &[u8]) -> Value {
     let mut eight = [0; 8];
     for (to, from) in eight.iter_mut().zip(bytes) {

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use crate::value::Value;
 
-/// How much of a message is shown.
+/// Extent of the shown message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct YamlStyle {
     /// Elements of a sequence, and characters of a text, that are shown; `None` for all.
@@ -19,7 +19,7 @@ impl Default for YamlStyle {
 }
 
 impl Value {
-    /// As YAML, each line ended.
+    /// Returns YAML, each line ended.
     pub fn to_yaml(&self, style: YamlStyle) -> String {
         let mut out = String::new();
         match self {
@@ -39,7 +39,7 @@ impl Value {
     }
 }
 
-/// Writes what has lines of its own. `begun` if its first line is.
+/// Writes a value with lines of its own. `begun` if its first line has begun.
 fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun: bool) {
     let indent = |out: &mut String, begun: bool| {
         if !begun {
@@ -129,7 +129,7 @@ fn scalar(value: &Value, style: YamlStyle) -> String {
         Value::Float32(value) => float(f64::from(*value)),
         Value::Float64(value) => float(*value),
         Value::Text(text) => shown(text, style),
-        // YAML has no sign for what is no Unicode.
+        // YAML has no form for invalid Unicode.
         Value::Raw(bytes) => shown(&String::from_utf8_lossy(bytes), style),
         Value::Wide(units) => shown(&String::from_utf16_lossy(units), style),
         Value::List(_) | Value::Octets(_) | Value::PackedArray(_) => "[]".to_owned(),
@@ -146,7 +146,7 @@ fn shown(text: &str, style: YamlStyle) -> String {
     }
 }
 
-/// As Python shows a float in YAML: `1.0`, `1.0e-05`, `.nan`.
+/// Returns a float as Python shows it in YAML: `1.0`, `1.0e-05`, `.nan`.
 fn float(value: f64) -> String {
     if value.is_nan() {
         return ".nan".to_owned();
@@ -169,7 +169,7 @@ fn float(value: f64) -> String {
     if text.contains('.') { text } else { format!("{text}.0") }
 }
 
-/// A text, in quotes where YAML would take it for something else.
+/// Returns a text, in quotes where YAML would take it for something else.
 fn quoted(text: &str) -> String {
     let control = |c: char| {
         c.is_control() || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}' | '\u{fffe}' | '\u{ffff}')

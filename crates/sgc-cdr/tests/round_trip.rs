@@ -176,7 +176,7 @@ fn check(layout: &Layout, value: &Value, why: &str) {
             let (read, found) = layout.decode_as(&padded).unwrap();
             assert_eq!(layout.encode_as(&read, found).unwrap(), padded, "{why} {padding:?}");
         }
-        // What is cut is never the message.
+        // A truncated message never equals the whole.
         for end in 0..payload.len() {
             let _ = layout.decode(&payload.slice(..end));
         }
@@ -301,7 +301,7 @@ fn random_bytes_are_no_trouble() {
             layout.decode(&changed(&cdr).into()).ok(),
         ];
         for value in values.into_iter().flatten() {
-            // What is read can be written, and read.
+            // Every value that was read can be written, and read again.
             let payload = layout.encode(&value).unwrap();
             assert!(layout.decode(&payload.into()).is_ok());
         }
