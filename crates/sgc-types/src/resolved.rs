@@ -1,11 +1,11 @@
-//! A type that is known, with the description that others can be given (REP 2016).
+//! A known type, with its description for other nodes (REP 2016).
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use sgc_cdr::{DescriptionError, Layout, TypeName};
 
-/// A type that is known: a message's, or a service's with its messages.
+/// A known type: a message's, or a service's with its messages.
 #[derive(Clone, Debug)]
 pub struct ResolvedType {
     name: TypeName,
@@ -14,33 +14,33 @@ pub struct ResolvedType {
     layout: Arc<Layout>,
 }
 
-/// Why a description is not believed.
+/// The reason why a description is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ResolveError {
-    /// It is none, or one of another type than the one of the hash.
+    /// The description is invalid, or of another type than that of the hash.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// It is one of a type with another name.
+    /// The description is of a type with another name.
     #[error("the description is one of {found}, not of {expected}")]
     Name {
-        /// What it describes.
+        /// The described type.
         found: String,
-        /// What was asked for.
+        /// The requested type.
         expected: String,
     },
 }
 
 impl ResolvedType {
-    /// Describes a type.
+    /// Describes the type of a layout.
     pub fn from_layout(layout: Layout) -> Result<Self, DescriptionError> {
         let description = layout.describe()?.into();
         Self::new(layout, description).ok_or_else(nameless)
     }
 
-    /// Reads a description that somebody else made of the type of this name and hash.
+    /// Reads another node's description of the type of this name and hash.
     pub fn read(description: Bytes, name: &TypeName, type_hash: &str) -> Result<Self, ResolveError> {
         let layout = Layout::from_description(&description, type_hash)?;
-        // Described anew: what the hash does not vouch for is not passed on.
+        // Described anew, so that nothing outside of the hash is passed on.
         let this = Self::from_layout(layout)?;
         if this.name != *name {
             return Err(ResolveError::Name { found: this.name.to_string(), expected: name.to_string() });
@@ -53,18 +53,18 @@ impl ResolvedType {
         Some(Self { name, type_hash, description, layout: Arc::new(layout) })
     }
 
-    /// The type.
+    /// Returns the name of the type.
     pub fn name(&self) -> &TypeName {
         &self.name
     }
 
-    /// Its hash: `RIHS01_` and 64 hexadecimal digits.
+    /// Returns its hash: `RIHS01_` and 64 hexadecimal digits.
     pub fn type_hash(&self) -> &str {
         &self.type_hash
     }
 
-    /// Returns `true` for the hashes that endpoints announce for the type: its own, and of a service those of its request and its
-    /// response, which `rmw_fastrtps` announces.
+    /// Returns `true` for the hashes that endpoints announce for the type: its own, and for a service those of its
+    /// request and response, which `rmw_fastrtps` announces.
     pub fn is_announced_as(&self, type_hash: &str) -> bool {
         let is_of =
             |half: TypeName| self.layout.part(&half).is_some_and(|part| part.type_hash() == type_hash);
@@ -73,18 +73,18 @@ impl ResolvedType {
             || name.kind() != "msg" && (is_of(name.request()) || is_of(name.response()))
     }
 
-    /// A serialised `type_description_interfaces/msg/TypeDescription`.
+    /// Returns a serialised `type_description_interfaces/msg/TypeDescription`.
     pub fn description(&self) -> &Bytes {
         &self.description
     }
 
-    /// What its messages look like.
+    /// Returns the layout of its messages.
     pub fn layout(&self) -> &Arc<Layout> {
         &self.layout
     }
 }
 
-/// No library makes a layout of nothing.
+/// Error for a layout without a type, which no library makes.
 fn nameless() -> DescriptionError {
     DescriptionError::Content { what: "name of a type", found: String::new() }
 }

@@ -1,8 +1,7 @@
-//! The types that are known in this process, by name and hash: bounded in their number and in the bytes of what describes
-//! them.
+//! The types known in this process, by name and hash: bounded in number and in bytes of descriptions.
 //!
-//! What is full takes nothing more in until somebody says what is still in use: a type that somebody decodes with is never
-//! pushed out by one that somebody else sends.
+//! A full store takes nothing more in until its user removes unused types: a received type never displaces one that is
+//! being decoded with.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,16 +10,16 @@ use sgc_cdr::{Layout, TypeName};
 
 use crate::ResolvedType;
 
-/// Types that are kept.
+/// Most types that are kept.
 pub const TYPES_MAX: usize = 1024;
-/// Bytes of descriptions that are kept. What is made of them takes a few times as much.
+/// Most bytes of descriptions that are kept. The layouts take a few times as much.
 pub const TYPES_BYTES_MAX: usize = 8 << 20;
-/// Types that are kept for the interfaces of one owner: no one of them takes all the room.
+/// Most types that are kept for the interfaces of one owner, so that no owner takes all the room.
 pub const TYPES_PER_OWNER_MAX: usize = TYPES_MAX / 2;
-/// Bytes of their descriptions.
+/// Most bytes of their descriptions.
 pub const TYPES_PER_OWNER_BYTES_MAX: usize = TYPES_BYTES_MAX / 2;
 
-/// Types that are known. Shared: all of its calls are short.
+/// The known types. Shared: all of its calls are short.
 #[derive(Debug)]
 pub struct TypeStore {
     types_max: usize,
@@ -38,7 +37,7 @@ struct StoreState {
 #[derive(Debug)]
 struct Entry {
     described: Arc<ResolvedType>,
-    /// Grows with each that is taken in.
+    /// Grows with each type taken in.
     at: u64,
 }
 
@@ -59,12 +58,12 @@ impl Default for TypeStore {
 }
 
 impl TypeStore {
-    /// Keeps at most so many types, and so many bytes of descriptions.
+    /// Returns a store of at most this many types, and bytes of descriptions.
     pub fn with_limits(types_max: usize, bytes_max: usize) -> Self {
         Self { types_max, bytes_max, kept: Mutex::default() }
     }
 
-    /// Whether a type can be taken in.
+    /// Returns whether there is room for a type.
     pub fn has_room_for(&self, described: &ResolvedType) -> bool {
         let kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
@@ -72,7 +71,7 @@ impl TypeStore {
         kept.types.contains_key(&key) || kept.types.len() < self.types_max && bytes <= self.bytes_max
     }
 
-    /// Takes a type in; one that is known already stays as it is.
+    /// Takes a type in; a known one stays as it is.
     pub fn insert(&self, described: ResolvedType) -> Result<Arc<ResolvedType>, StoreFull> {
         let mut kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
@@ -97,7 +96,7 @@ impl TypeStore {
         kept.bytes = kept.types.values().map(|entry| entry.described.description().len()).sum();
     }
 
-    /// A type with its description; without a hash, of those with this name the one that came last.
+    /// Returns a type with its description; without a hash, the newest one with this name.
     pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<ResolvedType>> {
         let kept = self.lock();
         let named = || {
@@ -115,8 +114,8 @@ impl TypeStore {
         found.map(|entry| entry.described.clone())
     }
 
-    /// The layout of messages of a type. The request and the response of a service are found by each hash that its endpoints
-    /// announce ([`ResolvedType::is_announced_as`]).
+    /// Returns the layout of messages of a type. The request and the response of a service are found by each hash that
+    /// its endpoints announce ([`ResolvedType::is_announced_as`]).
     pub fn layout(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Layout>> {
         if let Some(described) = self.described(name, type_hash) {
             return Some(described.layout().clone());
@@ -180,7 +179,7 @@ mod tests {
             store.insert(of(1)).unwrap();
             assert!(!store.has_room_for(&of(2)) && store.has_room_for(&of(0)));
             assert_eq!(store.insert(of(2)).map(|_| ()), Err(StoreFull { types: 2, bytes: 2 * bytes }));
-            // What is there already needs no room.
+            // A known type needs no room.
             assert!(Arc::ptr_eq(&store.insert(of(0)).unwrap(), &first));
             store.retain(|name, _| name.name() == "A0");
             store.insert(of(2)).unwrap();
