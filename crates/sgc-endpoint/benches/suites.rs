@@ -1,8 +1,7 @@
-//! What the suites cost: from a payload to sealed and signed packets, and from those to a message, in one
-//! thread.
+//! Cost of the suites: from a payload to sealed and signed packets, and from those to a message, in one thread.
 //!
-//! The suites take turns in short rounds, so that what else the machine does meets all of them; of each the
-//! median round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
+//! The suites take turns in short rounds, so that other work of the machine affects all of them; of each the median
+//! round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};

@@ -1,4 +1,4 @@
-//! One endpoint, spoken to in frames: what it answers, what it believes, what it bounds.
+//! One endpoint, addressed in frames: its answers, its checks, its bounds.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use sgc_wire::{
     Metadata, Name, Qos, RefuseReason, Request, SecretBytes, SinkId, TopicGrant,
 };
 
-/// An endpoint and what came out of it since it was last asked.
+/// An endpoint, and its outputs since the last call.
 struct Bench {
     endpoint: Endpoint,
     clock: Clock,
@@ -94,7 +94,7 @@ impl Bench {
             .collect()
     }
 
-    /// The answers sent: whom to, and why not if not.
+    /// The answers sent: sink, and the reason of a refusal.
     fn answers(&self) -> Vec<(SinkId, Option<RefuseReason>)> {
         self.sent
             .iter()

@@ -1,4 +1,4 @@
-//! Epochs, announcements, parking, and what a replay comes to.
+//! Epochs, announcements, parking, and the results of replays.
 
 use sgc_endpoint::{EPOCHS_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 use sgc_trust::OpenError;

@@ -1,5 +1,5 @@
-//! The two ends of the data path against each other, in every suite: what a source makes, a sink delivers,
-//! once, and nothing else.
+//! The two ends of the data path against each other, in every suite: a sink delivers each message of a source once, and
+//! nothing else.
 
 mod assertions;
 mod epochs;
@@ -62,7 +62,7 @@ fn unrecovered(suite: Suite, id: u8) -> Source {
     source_with(suite, SourceConfig { recovery: RecoveryLimits::NONE, ..config(id, 0) })
 }
 
-/// A sink that was told of these sources as they are now, in epoch 1.
+/// Returns a sink with the present announcements of these sources, in epoch 1.
 fn sink(suite: Suite, sources: &[&Source]) -> Sink {
     Sink::new(NAME, SINK, grant(suite, 1, &announced(sources)), false, SinkLimits::default())
 }

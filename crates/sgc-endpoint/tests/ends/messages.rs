@@ -67,7 +67,7 @@ fn nothing_waits_without_more_and_a_batch_is_signed_once() {
     assert_eq!(published(&mut source, bytes(1), true).len(), 0);
     assert_eq!(flushed(&mut source).len(), 1);
     assert_eq!(flushed(&mut source).len(), 0);
-    // A message that is refused takes along what waited before it.
+    // A refused message takes along the ones that waited before it.
     published(&mut source, bytes(1), true);
     let mut packets = Vec::new();
     let too_large = vec![0; sgc_wire::MESSAGE_BYTES_MAX as usize + 1];
@@ -159,7 +159,7 @@ fn a_late_joiner_gets_the_history_first_and_each_message_once() {
         let live = published(&mut source, bytes(6), false);
         assert_eq!(sink.handle_packet(&live[0]), Ok(Delivery::NeedsHistory(source.id())));
         assert_eq!(sink.handle_packet(&live[0]), Err(SinkDrop::AwaitingHistory));
-        // All that was there when it joined, and what came since.
+        // All messages from before its join, and the ones since.
         assert_eq!(sink.ask(source.id()), Some(3));
         let history = replayed_to(&mut source, SINK, 3);
         assert_eq!(delivered(&mut sink, &history), [3, 4, 5, 6].map(bytes));
@@ -167,7 +167,7 @@ fn a_late_joiner_gets_the_history_first_and_each_message_once() {
         assert_eq!(delivered(&mut sink, &live).len(), 0);
         let next = published(&mut source, bytes(7), false);
         assert_eq!(delivered(&mut sink, &next), [bytes(7)]);
-        // The way changed: only what was lost, nothing twice.
+        // The route changed: only lost messages, nothing twice.
         let here = grant(suite, 1, &[source.announce()]);
         regranted(&mut sink, SinkId([3; 16]), here);
         assert_eq!(sink.unsynced().count(), 0, "nothing was lost");

@@ -1,5 +1,4 @@
-//! No key seals two texts under one nonce, whatever sources go through: the one thing that AES-GCM does not
-//! forgive.
+//! No key seals two texts under one nonce, in any history of sources: the one mistake that AES-GCM does not forgive.
 
 use std::collections::BTreeMap;
 

@@ -18,7 +18,7 @@ fn marked(source: &mut Source) -> Vec<Packet> {
     packets
 }
 
-/// Asks for what is missing and hands over the answer; what came of it.
+/// Asks for missing messages, hands over the answer, and returns the results.
 fn recovered(source: &mut Source, sink: &mut Sink) -> Vec<Bytes> {
     let from = sink.ask(source.id()).expect("something is missing");
     delivered(sink, &replayed_to(source, SINK, from))
@@ -76,7 +76,7 @@ fn another_way_asks_for_what_was_published_meanwhile_and_no_more() {
             let packets = published(&mut source, bytes(n), false);
             assert_eq!(delivered(&mut sink, &packets).len(), 1);
         }
-        // Nothing was lost: nothing is asked for, and what is half here is completed over the new way.
+        // Nothing was lost: nothing is asked for, and the half message is completed over the new route.
         let large = published(&mut source, bytes(40_000), false);
         delivered(&mut sink, &large[..1]);
         let before = SourceAnnounce { next: 6, ..source.announce() };
@@ -92,7 +92,7 @@ fn another_way_asks_for_what_was_published_meanwhile_and_no_more() {
         assert_eq!(sink.ask(source.id()), Some(7), "depth {depth}");
         let answer = replayed_to(&mut source, id, 7);
         assert_eq!(delivered(&mut sink, &answer), (1..=10).map(bytes).collect::<Vec<_>>());
-        // A grant on the same way says nothing of what is under way.
+        // A grant on the same route tells nothing about packets in flight.
         published(&mut source, bytes(1), false);
         regranted(&mut sink, id, grant_now(&source));
         assert_eq!(sink.unsynced().count(), 0);
@@ -161,7 +161,7 @@ fn messages_that_a_source_no_longer_keeps_are_counted_and_passed_over() {
         }
         assert_eq!(sink.ask(source.id()), Some(2));
         let answer = replayed_to(&mut source, SINK, 2);
-        // The mark that says so, to all and to this sink, is itself one of the four that are kept.
+        // The mark about it, to all and to this sink, is itself one of the four kept messages.
         let first = if live { 19 } else { 18 };
         assert_eq!((answer[0].header.to, answer[1].header.to), (None, Some(SINK)));
         assert_eq!(sink.handle_packet(&answer[1]), Ok(Delivery::Lost(source.id(), first - 2)));
@@ -169,7 +169,7 @@ fn messages_that_a_source_no_longer_keeps_are_counted_and_passed_over() {
         assert_eq!(delivered(&mut sink, &answer[2..]), rest);
         assert_eq!(sink.unsynced().count(), 0);
         assert_eq!(delivered(&mut sink, &published(&mut source, bytes(30), false)), [bytes(30)]);
-        // Asked again, nothing is said twice.
+        // A second question repeats no delivery.
         assert_eq!(delivered(&mut sink, &replayed_to(&mut source, SINK, 2)).len(), 0);
     }
 }
@@ -262,7 +262,7 @@ fn a_best_effort_source_is_asked_for_nothing() {
     assert_eq!(replayed_to(&mut source, SINK, 1).len(), 1, "it keeps nothing");
 }
 
-/// A node that was granted the topic late, and says that it was there before, is told its floor by the owner.
+/// A node that was granted the topic late, and claims to have been there before, gets its floor from the owner.
 #[test]
 fn a_floor_that_rose_is_passed_over_and_counted() {
     let (mut source, mut sink) = ends(100);
