@@ -1,4 +1,4 @@
-//! What labels save, beside packets with their names in the same run: `cargo bench -p sgc-transport --bench labels`.
+//! Savings of labels, beside packets with their names in the same run: `cargo bench -p sgc-transport --bench labels`.
 //!
 //! One name over one link, over loopback, both ends in one process on two threads. Bytes are those of UDP payloads:
 //! QUIC's own, and acknowledgements, included.

@@ -32,7 +32,7 @@ async fn linked() -> (Dialer, Server, AnyLink, AnyLink) {
     (dialer, server, near, far)
 }
 
-/// For each packet: what sending and receiving it allocated, and what all did.
+/// Allocations for each packet: in sending, in receiving, and in all.
 struct AllocationCounts {
     sent: f64,
     received: f64,

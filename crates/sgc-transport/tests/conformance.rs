@@ -1,4 +1,4 @@
-//! What every transport does for its users, over loopback: one suite, run for each scheme.
+//! The promises of every transport to its users, over loopback: one suite, run for each scheme.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 #[macro_use]

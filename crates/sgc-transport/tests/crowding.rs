@@ -149,7 +149,7 @@ async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str
 /// Time without progress after which the far end takes no more.
 const STUCK: Duration = Duration::from_millis(500);
 
-/// However many peers send and are not read, the node holds what its budget says.
+/// However many peers send without being read, the node holds no more than its budget.
 async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     const LINKS: u64 = 12;
     const BUDGET_BYTES: u64 = 8 << 20;
@@ -167,7 +167,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
         let far = server.link().await;
         let sender = near.clone();
         senders.spawn(async move {
-            // Two flows fill what a link may have, since one may have half.
+            // Two flows fill the window of a link, because one may have half.
             let mut taken = 0;
             for _ in 0..2 {
                 let mut flow = sender.open_flow(sgc_wire::Class::Default).await.unwrap();

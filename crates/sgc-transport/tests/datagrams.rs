@@ -105,7 +105,7 @@ async fn a_dialer_that_moves_keeps_its_links(scheme: &str) {
         says(&near, &far, "control").await;
     }
     assert_eq!(server.metrics.accepted(), 1);
-    // An idle link moves, too, and at once: not only with what is sent on it next.
+    // An idle link moves, too, and at once: not only with its next packet.
     let before = far.remote();
     dialer.rebind().unwrap();
     moved(&far, before).await;

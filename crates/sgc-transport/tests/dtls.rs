@@ -444,7 +444,7 @@ async fn talk(near: &AnyLink, far: &AnyLink) {
     }
 }
 
-/// Sends what a member says to the listener from an address that is not the member's, and waits until it was heard.
+/// Sends a member's records to the listener from an address that is not the member's, and waits until they were heard.
 async fn spoof(
     server: &mut Server,
     fleet: &sgc_trust::Fleet,

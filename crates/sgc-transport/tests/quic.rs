@@ -1,4 +1,4 @@
-//! Peers of QUIC links that misbehave, played by bare quinn. What links do for their users: `conformance`.
+//! Peers of QUIC links that misbehave, played by bare quinn. `conformance` tests the links' promises to their users.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;

@@ -149,7 +149,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
     for count in 0..1000 {
         silent.push(soon(TcpStream::connect(server.addr)).await.unwrap());
         if count % 500 == 499 {
-            // Each refusal is told, and has to be taken.
+            // Each refusal is reported, and has to be taken.
             let (arm, url) = (Arc::clone(&arm), server.url.clone());
             let near = tokio::spawn(async move { dial(arm, &url).await.unwrap() });
             loop {
@@ -163,7 +163,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
             drop(near.await.unwrap());
         }
     }
-    // Each is told or counted, and none is kept beyond the places there are.
+    // Each refusal is reported or counted, and none is kept beyond the number of places.
     assert!(server.metrics.handshakes_pending() <= PLACES as u64 + 1);
     assert!(server.metrics.refused(RefusalKind::TooManyFromAddress) >= 1000 - 2 * PLACES as u64);
     let mut ended = 0;

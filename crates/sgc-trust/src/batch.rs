@@ -124,8 +124,8 @@ pub struct BatchVerifier {
     checked: u64,
 }
 
-/// A batch whose signature verified, and the nodes of its tree that follow from it. Whatever node is known,
-/// its sibling, its ancestors and their siblings are.
+/// A batch whose signature verified, and the nodes of its tree that follow from it. With a node, its sibling, its
+/// ancestors and their siblings are known.
 struct KnownBatch {
     count: u16,
     signature: Vec<u8>,

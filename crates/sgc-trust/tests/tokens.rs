@@ -1,4 +1,4 @@
-//! Share tokens: the bytes of the specification, and what is said of texts that are none.
+//! Share tokens: the bytes of the specification, and the errors of texts that are no token.
 
 #![allow(clippy::unwrap_used)]
 
