@@ -72,7 +72,7 @@ fn json(bytes: usize) -> Vec<u8> {
     out
 }
 
-struct Way {
+struct Variant {
     encoding: PayloadEncoding,
     source: Source,
     sink: Sink,
@@ -82,7 +82,7 @@ struct Way {
     rounds: Vec<(usize, Duration, Duration)>,
 }
 
-impl Way {
+impl Variant {
     fn new(encoding: PayloadEncoding) -> Self {
         let config = SourceConfig {
             name: NAME,
@@ -151,7 +151,7 @@ fn main() {
     ] {
         let payload = Bytes::from(payload);
         let kinds = [PayloadEncoding::Plain, PayloadEncoding::Lz4, PayloadEncoding::Zstd];
-        let mut ways = kinds.map(Way::new);
+        let mut ways = kinds.map(Variant::new);
         for _ in 0..ROUNDS {
             ways.iter_mut().for_each(|way| way.round(&payload));
         }

@@ -473,7 +473,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     pub fn handle(&mut self, source: SourceId, kind: MessageKind, number: u64) -> Answering {
         match kind {
             MessageKind::Request => self.request(source, number),
-            MessageKind::Ask => self.what_became(source, number),
+            MessageKind::Ask => self.answer_question(source, number),
             MessageKind::Forget => {
                 self.forget(source, number);
                 Answering::Nothing
@@ -628,7 +628,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         Answering::Ask
     }
 
-    fn what_became(&self, source: SourceId, number: u64) -> Answering {
+    fn answer_question(&self, source: SourceId, number: u64) -> Answering {
         let remembered = self.sources.get(&source);
         match remembered.and_then(|r| r.calls.get(&number)) {
             Some(CallState::Asking | CallState::Asked(_)) => Answering::Nothing,

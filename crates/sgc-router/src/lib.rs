@@ -31,4 +31,4 @@ pub use mapping::MappingKind;
 pub use router::{
     DropReason, LinkClose, LinkId, Output, Router, RouterConfig, RouterDrop, RouterStats, clocks_differ,
 };
-pub use topology::Ways;
+pub use topology::RouteStats;

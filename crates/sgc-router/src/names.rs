@@ -274,14 +274,14 @@ impl Names {
 
 impl Router {
     /// Returns the link towards the owner of `name`, and the cost of the route.
-    pub(crate) fn way(&self, name: &Name) -> Option<(LinkId, u32)> {
+    pub(crate) fn next_hop(&self, name: &Name) -> Option<(LinkId, u32)> {
         let record = self.names.record(name)?;
         let owner = &record.owner.node_id;
         if *owner == self.config.node {
             return Some((LinkId::LOCAL, 0));
         }
         if self.config.transit {
-            return self.way_to(owner);
+            return self.next_hop_to(owner);
         }
         let heard = self.names.heard.get(name)?;
         let over = |(link, cost): &(LinkId, u32)| {
@@ -297,10 +297,10 @@ impl Router {
 
     /// Returns the link towards a node, and the cost of the route, from the topology or from a link of this node
     /// itself.
-    fn way_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
+    fn next_hop_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
         let direct = self.link_to(node);
-        let way = self.topology.way(&self.config.node, node);
-        match (way, direct) {
+        let next_hop = self.topology.next_hop(&self.config.node, node);
+        match (next_hop, direct) {
             (Some((cost, first)), _) if first == *node => Some((direct?.0, cost)),
             (Some((cost, first)), direct) => match (self.link_to(&first), direct) {
                 (Some((link, _)), Some((straight, own))) => {
@@ -314,8 +314,8 @@ impl Router {
     }
 
     /// Returns `true` if `name` may be told over `link`: not back where it is, and others' names only by routers.
-    fn may_tell(&self, way: LinkId, link: LinkId) -> bool {
-        way != link && (way == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
+    fn may_tell(&self, next_hop: LinkId, link: LinkId) -> bool {
+        next_hop != link && (next_hop == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
     }
 
     pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: SignedBody) {
@@ -687,7 +687,7 @@ impl Router {
             for name in news {
                 let record = self.names.record(&name);
                 let is_late = |r: &Record| r.asked.is_some() || r.renewal_due <= now.instant;
-                let needs = self.way(&name).is_none()
+                let needs = self.next_hop(&name).is_none()
                     || record.is_some_and(|r| is_late(r) && r.owner.node_id != self.config.node);
                 // Another waiting node may have an earlier turn, behind many others.
                 let due = self.names.asking.get(&name).copied();
@@ -743,7 +743,7 @@ impl Router {
         }
         self.names.watchers.remove(name);
         self.names.stop_asking(name);
-        if !self.config.transit && self.way(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
+        if !self.config.transit && self.next_hop(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
             self.names.heard.remove(name);
             if let Some(id) = self.names.id(name) {
                 self.names.words.remove(name);
@@ -862,7 +862,7 @@ impl Router {
         let mut watched = BTreeMap::<LinkId, Vec<Name>>::new();
         for name in names {
             self.select(name);
-            self.follow_way(name);
+            self.follow_next_hop(name);
             for link in self.names.watchers.get(name).into_iter().flatten() {
                 watched.entry(*link).or_default().push(*name);
             }
@@ -873,7 +873,7 @@ impl Router {
         if self.config.transit {
             let waited = names.iter().filter(|n| self.names.watchers.contains_key(*n));
             let lost: Vec<_> = waited
-                .filter(|n| !self.names.asking.contains_key(*n) && self.way(n).is_none())
+                .filter(|n| !self.names.asking.contains_key(*n) && self.next_hop(n).is_none())
                 .copied()
                 .collect();
             for name in lost {
@@ -884,29 +884,29 @@ impl Router {
     }
 
     /// Handles possible route changes to these owners. Names without an advertisement have no route before or after.
-    pub(crate) fn ways_to_owners_changed(&mut self, owners: &[NodeId]) {
+    pub(crate) fn owner_routes_changed(&mut self, owners: &[NodeId]) {
         let counts = |n: &&Name| self.names.watchers.contains_key(*n) || self.trees.contains_key(*n);
         let names: BTreeSet<_> =
             owners.iter().flat_map(|owner| self.names.names_of(owner).filter(counts)).copied().collect();
-        self.check_ways(names);
+        self.check_next_hops(names);
         self.answer_asks(owners);
     }
 
     /// Handles changed links of a node that carries nobody else's names.
-    pub(crate) fn ways_changed(&mut self) {
-        self.check_ways(self.names.watchers.keys().chain(self.trees.keys()).copied().collect());
+    pub(crate) fn own_links_changed(&mut self) {
+        self.check_next_hops(self.names.watchers.keys().chain(self.trees.keys()).copied().collect());
     }
 
-    fn check_ways(&mut self, names: BTreeSet<Name>) {
+    fn check_next_hops(&mut self, names: BTreeSet<Name>) {
         self.topology.names_checked += names.len() as u64;
         self.routes_changed(&names.into_iter().collect::<Vec<_>>());
     }
 
     fn select(&mut self, name: &Name) {
         if !self.config.transit {
-            let way = self.way(name).map(|(link, _)| link);
+            let next_hop = self.next_hop(name).map(|(link, _)| link);
             if let Some(heard) = self.names.heard.get_mut(name) {
-                heard.selected = way;
+                heard.selected = next_hop;
             }
         }
     }
@@ -927,9 +927,9 @@ impl Router {
             let Some(told) = self.links.get(&link).and_then(|l| l.interests.get(name)).copied() else {
                 continue;
             };
-            let way = self.way(name).filter(|(way, _)| self.may_tell(*way, link));
+            let next_hop = self.next_hop(name).filter(|(next_hop, _)| self.may_tell(*next_hop, link));
             let id = self.names.id(name);
-            let news = match (told, way.zip(id)) {
+            let news = match (told, next_hop.zip(id)) {
                 (None, None) => continue,
                 (Some(_), None) => {
                     gone.push(*name);
@@ -979,8 +979,8 @@ impl Router {
             if before.is_some_and(|q| q.id == id) {
                 continue;
             }
-            let way = self.way(name).filter(|(way, _)| *way != link);
-            if way.is_some()
+            let next_hop = self.next_hop(name).filter(|(next_hop, _)| *next_hop != link);
+            if next_hop.is_some()
                 && let Some(record) = self.names.record(name)
             {
                 let (owner, from) = (record.owner.node_id, record.from);
@@ -1101,7 +1101,7 @@ impl Router {
             }
         }
         for (link, owner, name) in open {
-            if self.way(&name).is_none_or(|(way, _)| way == link) {
+            if self.next_hop(&name).is_none_or(|(next_hop, _)| next_hop == link) {
                 continue;
             }
             self.answer(link, &owner, &[name]);
@@ -1131,7 +1131,7 @@ impl Router {
         let mut one = BTreeMap::<LinkId, Vec<Name>>::new();
         while let Some((at, name)) = self.names.ask_at.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.ask_at.remove(&(at, name));
-            let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
+            let known = match self.names.record(&name).filter(|_| self.next_hop(&name).is_some()) {
                 None => NameLocation::Unknown,
                 // A router that answered, or told the record unasked, may withhold a later one.
                 Some(record) if record.renewal_due <= now.instant => NameLocation::Unknown,
@@ -1237,13 +1237,13 @@ impl Router {
     pub(crate) fn routed_names(&self) -> usize {
         let reached = |r: &&Record| {
             let owner = &r.owner.node_id;
-            *owner == self.config.node || !self.config.transit || self.way_to(owner).is_some()
+            *owner == self.config.node || !self.config.transit || self.next_hop_to(owner).is_some()
         };
         let heard = |r: &Record| {
             if self.config.transit || r.owner.node_id == self.config.node {
                 return r.live;
             }
-            r.names.iter().filter(|n| self.way(n).is_some()).count()
+            r.names.iter().filter(|n| self.next_hop(n).is_some()).count()
         };
         self.names.records.values().filter(|r| !r.withdraw).filter(reached).map(heard).sum()
     }

@@ -17,7 +17,7 @@ use crate::links::{LinkState, Neighbour};
 use crate::lists::ListAllowances;
 use crate::mapping::{Mapping, MappingKind};
 use crate::names::Names;
-use crate::topology::{Topology, Ways};
+use crate::topology::{RouteStats, Topology};
 use crate::tree::Tree;
 
 /// A link of this node, by number. Numbers are never used again while the process lives.
@@ -548,17 +548,17 @@ impl Router {
 
     /// Returns the link towards the owner of `name`, and the cost of the route, microseconds of round trip.
     pub fn route(&self, name: &Name) -> Option<(LinkId, u32)> {
-        self.way(name)
+        self.next_hop(name)
     }
 
     /// Returns the cost of the route to a router, microseconds of round trip; `None` if it is out of reach.
     pub fn cost_to(&self, router: &NodeId) -> Option<u32> {
-        self.topology.way(&self.config.node, router).map(|(cost, _)| cost)
+        self.topology.next_hop(&self.config.node, router).map(|(cost, _)| cost)
     }
 
     /// Returns the results of the route searches.
-    pub fn ways(&self) -> Ways {
-        self.topology.ways()
+    pub fn route_stats(&self) -> RouteStats {
+        self.topology.route_stats()
     }
 
     /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.

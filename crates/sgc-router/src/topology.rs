@@ -28,7 +28,7 @@ const COST_PART: u32 = 4;
 
 /// Results of a router's searches for routes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Ways {
+pub struct RouteStats {
     /// Routers in reach, this one among them.
     pub routers: usize,
     /// Searches so far.
@@ -95,7 +95,7 @@ pub(crate) struct Topology {
     searched: Option<Instant>,
     searches: u64,
     /// Time of the last search that found other routes.
-    ways_changed: Option<Instant>,
+    routes_changed: Option<Instant>,
     /// Time at which this node signs its next link state.
     pub(crate) originate_at: Option<Instant>,
     originated: Option<Instant>,
@@ -185,7 +185,7 @@ impl Topology {
     }
 
     /// Returns the route from this router to a node: its cost and the first node on it.
-    pub(crate) fn way(&self, own: &NodeId, node: &NodeId) -> Option<(u32, NodeId)> {
+    pub(crate) fn next_hop(&self, own: &NodeId, node: &NodeId) -> Option<(u32, NodeId)> {
         if let Some(path) = self.paths.get(node) {
             return Some((path.cost, path.first));
         }
@@ -200,11 +200,11 @@ impl Topology {
     }
 
     /// Returns the results of the route searches.
-    pub(crate) fn ways(&self) -> Ways {
-        Ways {
+    pub(crate) fn route_stats(&self) -> RouteStats {
+        RouteStats {
             routers: self.paths.len(),
             searches: self.searches,
-            changed: self.ways_changed,
+            changed: self.routes_changed,
             names_checked: self.names_checked,
         }
     }
@@ -238,7 +238,7 @@ impl Topology {
         let paths = shortest_paths(root, &self.paths, edges);
         self.searches += 1;
         if paths != self.paths {
-            self.ways_changed = Some(now);
+            self.routes_changed = Some(now);
         }
         let before = std::mem::replace(&mut self.paths, paths);
         let Changes { mut nodes, attached } = std::mem::take(&mut self.changes);
@@ -476,11 +476,11 @@ impl Router {
         }
         if self.config.transit {
             let owners = self.topology.search(now.instant, self.config.node, self.names.owners());
-            self.ways_to_owners_changed(&owners);
+            self.owner_routes_changed(&owners);
         } else {
             self.topology.search_at = None;
             self.topology.changes = Changes::default();
-            self.ways_changed();
+            self.own_links_changed();
         }
     }
 

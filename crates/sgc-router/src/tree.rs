@@ -122,8 +122,8 @@ impl Router {
             let up = known.up;
             return self.send(up, Control::Join { signed });
         }
-        let way = self.way(&name).filter(|(up, _)| *up != link);
-        let Some(((up, _), owner)) = way.zip(owner) else {
+        let next_hop = self.next_hop(&name).filter(|(up, _)| *up != link);
+        let Some(((up, _), owner)) = next_hop.zip(owner) else {
             return reject(self, RejectReason::NoRoute);
         };
         if !(up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit) {
@@ -259,18 +259,18 @@ impl Router {
 
     /// Follows a possible route change of a name. Sinks with branches over an old route are told to ask again;
     /// unanswered requests are given up, because their answers would come over the old one.
-    pub(crate) fn follow_way(&mut self, name: &Name) {
+    pub(crate) fn follow_next_hop(&mut self, name: &Name) {
         let Some(tree) = self.trees.get(name) else { return };
         let known = self.names.record(name).is_some();
-        let way = self.way(name).map(|(link, _)| link);
+        let next_hop = self.next_hop(name).map(|(link, _)| link);
         let mut moved = Vec::new();
         for (sink, branch) in &tree.branches {
-            match (way, branch.stage) {
+            match (next_hop, branch.stage) {
                 // Withdrawn: the owner itself tells its sinks, unless it died.
                 (None, _) if !known => moved.push((*sink, true)),
                 // The owner is out of reach from here; its neighbours will report it.
                 (None, _) => {}
-                (Some(way), _) if way == branch.up => {}
+                (Some(next_hop), _) if next_hop == branch.up => {}
                 (Some(_), Stage::ExpectAnswer { .. }) => moved.push((*sink, true)),
                 (Some(_), Stage::Granted) => moved.push((*sink, false)),
                 (Some(_), Stage::Draining { .. }) => {}

@@ -1092,7 +1092,7 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
     names.push(bench.name(&A));
     bench.frame(4, Control::Interest { names });
     bench.pass(ms(200));
-    let checked = |bench: &Bench| bench.router.ways().names_checked;
+    let checked = |bench: &Bench| bench.router.route_stats().names_checked;
     let before = checked(&bench);
     let desk = bench.user.clone();
     for n in 0..20 {
@@ -1105,9 +1105,9 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
         }
     }
     assert_eq!((checked(&bench), bench.dropped.as_slice()), (before, [""; 0].as_slice()));
-    let searches = bench.router.ways().searches;
+    let searches = bench.router.route_stats().searches;
     bench.owner_says(1, 0, &[(4, 500)]);
-    assert_eq!((checked(&bench), bench.router.ways().searches), (before, searches), "a renewal");
+    assert_eq!((checked(&bench), bench.router.route_stats().searches), (before, searches), "a renewal");
     bench.owner_says(1, 0, &[(4, 600)]);
     assert_eq!((checked(&bench), bench.route(&A)), (before + 1, Some((1, 6600))));
     bench.says(2, 2, &[(0, 1000), (4, 2000)], false);

@@ -165,7 +165,7 @@ impl TrustAnchors {
         certs.push(CertId::new(issuer, leaf.serial()));
         // With certificates that its path does not need, one chain could be varied without end.
         let is_minimal = certs.len() == chain.len();
-        let peer = VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)?;
+        let peer = VerifiedPeer::from_leaf(&leaf, leaf_der, ca, certs)?;
         if let Some(at) = self.path_revoked_at(&peer.path) {
             return Err(CertError::Revoked { at });
         }
@@ -329,7 +329,7 @@ impl VerifiedPeer {
         self.groups.binary_search(group).is_ok()
     }
 
-    fn of_leaf(
+    fn from_leaf(
         leaf: &EndEntityCert<'_>,
         der: &[u8],
         ca: &Anchor,
