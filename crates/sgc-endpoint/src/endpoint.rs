@@ -457,7 +457,7 @@ impl Endpoint {
             Control::LinkState { .. } => self.unexpected("link state"),
             Control::Query { .. } => self.unexpected("query"),
             Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
-            Control::Pulse { .. } => self.unexpected("pulse"),
+            Control::Probe { .. } => self.unexpected("probe"),
             Control::Clock { .. } => self.unexpected("clock"),
             Control::IdentityInUse { .. } => self.unexpected("identity"),
             Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {

@@ -452,7 +452,7 @@ impl Router {
             Control::Label { .. } | Control::LabelAck { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "label" });
             }
-            Control::Pulse { .. } => self.drop_frame(link, DropReason::Unknown { what: "pulse" }),
+            Control::Probe { .. } => self.drop_frame(link, DropReason::Unknown { what: "probe" }),
             Control::Clock { time } => self.handle_clock(now, link, time),
             // Its content is for the operator alone.
             Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),

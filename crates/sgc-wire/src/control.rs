@@ -150,7 +150,7 @@ pub enum Control {
         label: Label,
     },
     /// A question whether the other end is there, only between the two nodes of a link. The receiver answers at once.
-    Pulse {
+    Probe {
         /// Whether this is the answer.
         answers: bool,
     },
@@ -799,7 +799,7 @@ impl Encode for Control {
                 w.u8(21);
                 label.encode(w);
             }
-            Self::Pulse { answers } => {
+            Self::Probe { answers } => {
                 w.u8(22);
                 w.bool(*answers);
             }
@@ -867,7 +867,7 @@ impl Decode for Control {
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
             21 => Self::LabelAck { label: Label::decode(r)? },
-            22 => Self::Pulse { answers: r.bool("answers")? },
+            22 => Self::Probe { answers: r.bool("answers")? },
             23 => Self::LaneOffer { token: LaneToken::decode(r)?, name: Name::decode(r)? },
             24 => Self::LaneAnswer { token: LaneToken::decode(r)?, accepted: r.bool("accepted")? },
             25 => Self::LaneWanted { name: Name::decode(r)? },
@@ -912,7 +912,7 @@ mod tests {
             Control::Reroute { name, sink },
             Control::Label { label, name },
             Control::LabelAck { label },
-            Control::Pulse { answers: true },
+            Control::Probe { answers: true },
             Control::LaneOffer { token: LaneToken([4; 16]), name },
             Control::LaneAnswer { token: LaneToken([4; 16]), accepted: true },
             Control::LaneWanted { name },
