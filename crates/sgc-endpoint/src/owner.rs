@@ -393,7 +393,7 @@ impl Endpoint {
         self.tell_own(name);
     }
 
-    /// Tells the publishers of a share to its receivers. Only this node receives those of a service.
+    /// Tells every receiver of a share its publishers; this node alone receives those of a service.
     fn publishers_changed(&mut self, name: Name) {
         if self.shares.shares.get(&name).is_some_and(Share::is_service) {
             self.tell_own(name);

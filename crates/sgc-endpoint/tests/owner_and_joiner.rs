@@ -82,7 +82,7 @@ impl Bench {
         self.share(topic, policy).expect("within the bounds")
     }
 
-    /// The advertisements sent: sequence number, whether a withdrawal, how many names.
+    /// Returns the advertisements sent: sequence number, whether a withdrawal, number of names.
     fn adverts(&self) -> Vec<(u64, bool, usize)> {
         self.sent
             .iter()
@@ -150,7 +150,7 @@ fn a_node_with_all_places_of_a_topic_takes_those_of_its_oldest_requests() {
             let expected: Vec<_> = gone.into_iter().chain([(SinkId([n; 16]), None)]).collect();
             assert_eq!(answers, expected, "request {n}");
         }
-        // A router that has them plays them again: those that gave up their places get none from newer ones.
+        // A router replays the refused ones: sinks that lost their places get none from newer ones.
         for n in 1..=4 {
             bench.frame(frames[n - 1].clone());
             assert_eq!(bench.answers(), [(SinkId([n as u8; 16]), Some(RefuseReason::Limit))]);
@@ -306,7 +306,7 @@ fn names_that_come_one_by_one_are_gathered_as_routers_take_no_more() {
     adverts.extend(bench.adverts());
     assert_eq!(adverts.len(), ADVERTS_BURST as usize, "one with all the others");
     assert_eq!(adverts.last().map(|advert| advert.2), Some(count + 1), "and again with those before");
-    // The end is told at once.
+    // The end is announced at once.
     bench.endpoint.withdraw_all(bench.clock.now());
     bench.drain();
     let withdrawn = bench.adverts();
@@ -361,12 +361,12 @@ fn a_topic_shared_again_within_the_same_moment_is_advertised_after_its_withdrawa
     bench.endpoint.unshare(bench.clock.now(), &name);
     assert_eq!(bench.share_with_fleet("/a"), name);
     bench.drain();
-    // Withdrawn and shared between two drains: for the network nothing happened but a renewal.
+    // Withdrawn and shared again between two drains: the network sees only a renewal.
     let adverts = bench.adverts();
     assert!(adverts.last().is_some_and(|a| !a.1), "{adverts:?}");
 }
 
-/// An owner says that it has a name.
+/// Delivers an owner's advertisement of a name.
 fn advertise(bench: &mut Bench, owner: &Identity, blind: sgc_wire::Blind) {
     let body = AdvertBody {
         chain: owner.chain_bytes(),
@@ -379,7 +379,7 @@ fn advertise(bench: &mut Bench, owner: &Identity, blind: sgc_wire::Blind) {
     bench.frame(Control::Advert { cost: 1, signed: owner.sign_advert(&body) });
 }
 
-/// A joiner that was granted `/a` of the robot, with what is needed to go on answering it.
+/// A joiner with a grant of `/a` of the robot, and the keys to answer it further.
 fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let mut bench = Bench::new("desk", Limits::default());
     let arm = identity(&Member::new("arm-1"));

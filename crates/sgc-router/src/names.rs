@@ -777,7 +777,7 @@ impl Router {
     pub(crate) fn next_advert(&self, from: RecordId, end: RecordId) -> Option<RecordId> {
         let all = self.config.transit && self.mapping.tells_unasked();
         let own = self.config.node;
-        // Advertisements from before this withdrawal have no lease left.
+        // Advertisements that an older withdrawal ended have no lease left.
         let oldest = self.now.instant + 2 * CLOCK_SKEW_MAX - self.config.limits.lease_max;
         let told = |record: &Record| match record.withdraw {
             true => all && record.expires > oldest,

@@ -1,5 +1,4 @@
-//! How often a link allocates for a packet that it sends and receives, besides what QUIC does by itself in its own tasks.
-//! `-- --nocapture` prints both.
+//! Allocations of a link for each packet that it sends and receives, besides those of QUIC in its own tasks.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 #![allow(clippy::print_stderr, reason = "what was counted is of use")]
 

@@ -39,7 +39,7 @@ each_transport! {
     ]: quic udp dtls tls tcp ws wss
 }
 
-/// The kernel ends the connections of a program that was killed, and answers where nobody listens.
+/// The kernel ends the connections of a killed program, and refuses connections where nobody listens.
 fn is_tcp(scheme: &str) -> bool {
     matches!(scheme, "tls" | "tcp" | "ws" | "wss")
 }
@@ -57,7 +57,7 @@ async fn both_ends_know_each_other(scheme: &str) {
     assert_eq!(near.remote(), server.addr);
     assert!(near.is_dialer() && !far.is_dialer());
     assert!(near.stats().mtu_bytes >= 1200 && far.stats().received_bytes > 0);
-    // Known at once: ways are weighed by it as soon as there is a link.
+    // Known at once: routing weighs the link as soon as it exists.
     assert!([&near, &far].iter().all(|link| !link.stats().rtt.is_zero()));
     assert_eq!((metrics.dialed(), server.metrics.accepted()), (1, 1));
     assert_eq!(server.metrics.handshakes_pending(), 0);
@@ -228,7 +228,7 @@ async fn flows_do_not_wait_for_each_other(scheme: &str) {
     let mut first = soon(far.accept_flow()).await.unwrap();
     let mut second = soon(far.accept_flow()).await.unwrap();
     assert_eq!(soon(second.recv()).await.unwrap().unwrap().header.seq, 7);
-    // The send that was given up left the flow whole: what it had begun comes first.
+    // The cancelled send left the flow whole: its packet comes first.
     let last = packet(2, Bytes::from_static(b"last"));
     let finish = async {
         stuck.send(&last).await.unwrap();

@@ -35,7 +35,7 @@ fn attacker(host: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(127, 0, 0, 1 + host)), 0)
 }
 
-/// Begins a handshake from this address, as far as makes it count as engaged, and leaves it there.
+/// Begins a handshake from this address until it counts as engaged, and leaves it there.
 async fn stall(
     scheme: &str,
     server: &Server,
@@ -64,7 +64,7 @@ async fn stall(
             socket.bind(from).unwrap();
             let mut tcp = soon(socket.connect(server.addr)).await.unwrap();
             let start: &[u8] = if scheme == "ws" { b"GET /sgc" } else { &[22, 3, 1] };
-            // It may be turned away already.
+            // The peer may have been turned away already.
             let _ = tcp.write_all(start).await;
             StalledHandshake::Tcp(tcp)
         }
@@ -81,7 +81,7 @@ fn crowded_listener(scheme: &str, fleet: &sgc_trust::Fleet) -> Server {
         ..LinkOptions::default()
     };
     let mut server = Server::start_on(scheme, enroll(fleet, "router"), options);
-    // Refusals are for the counters here.
+    // Only the counters of refusals matter here.
     let mut results = std::mem::replace(&mut server.results, tokio::sync::mpsc::channel(1).1);
     tokio::spawn(async move {
         // A link that is dropped says goodbye, perhaps before its dialer has returned.
@@ -146,7 +146,7 @@ async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str
     assert!(server.metrics.refused(RefusalKind::TooMany) >= 1, "one of theirs gave way");
 }
 
-/// Time without progress after which the far end takes no more.
+/// Time without progress after which the far end is full.
 const STUCK: Duration = Duration::from_millis(500);
 
 /// However many peers send without being read, the node holds no more than its budget.
@@ -158,7 +158,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let receive_budget = ReceiveBudget::new(BUDGET_BYTES);
     let options = LinkOptions { receive_budget: receive_budget.clone(), ..LinkOptions::default() };
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options);
-    // Bytes that they have under way count as received here: so they are few.
+    // Bytes in flight count as received here, so there are few.
     let sends = LinkOptions { send_window_bytes: 64 << 10, ..LinkOptions::default() };
     let dialer = Dialer::new(arm, sends, Default::default());
     let (mut links, mut senders) = (Vec::new(), tokio::task::JoinSet::new());
@@ -189,7 +189,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let granted = receive_budget.granted_bytes();
     // 8 + 4 + 2.7 + 2 + 1.6 + 1.3 + 1.1 + 5 · 1 MiB.
     assert!(granted < 27 << 20, "{granted} bytes granted");
-    // Bytes that wait at the senders are theirs: those under way, and the queue of each flow.
+    // Bytes that wait at the senders count for them: those in flight, and the queue of each flow.
     let waiting = LINKS * (1 << 20);
     assert!(taken <= granted + waiting, "{taken} bytes taken of {granted} granted");
     drop((links, dialer));

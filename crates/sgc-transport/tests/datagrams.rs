@@ -33,7 +33,7 @@ fn image(bytes: u32) -> Bytes {
     (0..bytes).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect()
 }
 
-/// A link through a relay, which is fair at first.
+/// Makes a link through a relay, which is fair at first.
 async fn relayed(scheme: &str, options: LinkOptions) -> (Dialer, AnyLink, AnyLink, Relay) {
     let fleet = fleet(1);
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options.clone());
@@ -85,7 +85,7 @@ async fn a_nat_that_changes_its_port_costs_nothing(scheme: &str) {
     says(&near, &far, "there").await;
     says(&far, &near, "and back").await;
     moved(&far, before).await;
-    // The other way round: the listener sends, and only the dialer's acknowledgements tell of its address.
+    // In the other direction: the listener sends, and only the dialer's acknowledgements show its address.
     let before = far.remote();
     flow_with(&far, &near, image(3_000_000), async || relay.change_port()).await;
     moved(&far, before).await;
@@ -111,7 +111,7 @@ async fn a_dialer_that_moves_keeps_its_links(scheme: &str) {
     moved(&far, before).await;
 }
 
-/// Waits until the peer is seen elsewhere.
+/// Waits until the peer has another address.
 async fn moved(link: &AnyLink, before: SocketAddr) {
     soon(async {
         while link.remote() == before {
@@ -164,7 +164,7 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
 }
 
 async fn altered_datagrams_are_dropped(scheme: &str) {
-    // Nothing else that is as long is to be on the way.
+    // No other packet of this length should be on the way.
     let options = LinkOptions { mtu_discovery: false, ..LinkOptions::default() };
     let (_dialer, near, far, relay) = relayed(scheme, options).await;
     relay.impairment.tap.store(true, Relaxed);

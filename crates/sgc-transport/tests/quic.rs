@@ -13,7 +13,7 @@ use sgc_trust::CertError;
 use sgc_wire::{DecodeError, Encode};
 use support::*;
 
-// Where a link leads.
+// Destinations of links.
 
 #[tokio::test]
 async fn a_link_moves_to_a_fresh_socket_and_loses_nothing() {

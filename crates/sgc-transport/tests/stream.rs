@@ -35,8 +35,8 @@ async fn bare_stream(
 
 const SETTINGS: [u8; 13] = [0, 0x80, 1, 0, 0, 0x80, 1, 0, 0, 0x80, 0, 1, 0];
 
-/// A bare connection that has greeted and said its settings, and the link at the listener. The listener's settings are
-/// read, and its first bytes after them are next.
+/// A bare connection that has sent greeting and settings, and the link at the listener. The listener's settings are
+/// read; its later bytes come next.
 async fn greeted_stream(server: &mut Server, identity: &Identity) -> (TlsStream<TcpStream>, AnyLink) {
     let mut tls = bare_stream(server.addr, Some(identity), "sgc-tls/1").await.unwrap();
     tls.write_all(&frame(&GREETING)).await.unwrap();
@@ -47,7 +47,7 @@ async fn greeted_stream(server: &mut Server, identity: &Identity) -> (TlsStream<
     (tls, server.link().await)
 }
 
-/// Everything until the far side ends the connection.
+/// Reads everything until the far side ends the connection.
 async fn rest(tls: &mut TlsStream<TcpStream>) -> Vec<u8> {
     let mut all = Vec::new();
     // It ends in one way or another.
@@ -482,7 +482,7 @@ async fn only_requested_links_are_in_the_clear() {
 async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else() {
     let (ours, other) = (fleet(1), fleet(2));
     let mut server = Server::start_on("ws", enroll(&ours, "router"), LinkOptions::default());
-    // Its certificate is of nobody's.
+    // Its certificate is of no known CA.
     let proxy = enroll(&other, "proxy");
     let tls =
         rustls::ServerConfig::builder_with_provider(Arc::new(rustls::crypto::aws_lc_rs::default_provider()))
@@ -510,7 +510,7 @@ async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else(
     assert_eq!(soon(far.recv_control()).await.unwrap(), "through");
 }
 
-/// A relay between two ends of TCP whose owner decides, piece by piece, what reaches the listener.
+/// A relay between two ends of TCP whose owner decides, piece by piece, which bytes reach the listener.
 struct Interceptor {
     /// The bytes that the dialer sent.
     sent: tokio::sync::mpsc::Receiver<Vec<u8>>,
@@ -519,7 +519,7 @@ struct Interceptor {
 }
 
 impl Interceptor {
-    /// Lets one dialer through until `made`, and then passes what it says to the owner.
+    /// Lets one dialer through until `made`, and then passes its bytes to the owner.
     async fn dial(scheme: &str, server: &mut Server, identity: Arc<Identity>) -> (Self, AnyLink, AnyLink) {
         let front = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let addr = front.local_addr().unwrap();

@@ -23,7 +23,7 @@ const NAME: Name = Name([1; 32]);
 const SINK: SinkId = SinkId([9; 16]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
-/// A key that the suite signs with; made once, since RSA keys take their time.
+/// A key for the suite's signatures; made once, because RSA keys take their time.
 fn message_key(suite: Suite) -> MessageKey {
     static KEYS: OnceLock<[MessageKey; 4]> = OnceLock::new();
     let kinds = [Suite::Group, Suite::Standard, Suite::Paper, Suite::Paper3072];
@@ -57,7 +57,7 @@ fn source_with(suite: Suite, config: SourceConfig) -> Source {
     Source::new(config, &grant(suite, 1, &[]), message_key(suite)).expect("the key is of the suite")
 }
 
-/// A source whose messages stay lost if they are, and are delivered in any order.
+/// A source whose lost messages stay lost, and whose messages are delivered in any order.
 fn unrecovered(suite: Suite, id: u8) -> Source {
     source_with(suite, SourceConfig { recovery: RecoveryLimits::NONE, ..config(id, 0) })
 }

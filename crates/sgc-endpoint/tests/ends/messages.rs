@@ -126,14 +126,15 @@ fn a_source_cannot_take_the_room_for_incomplete_messages_of_others() {
     for packets in &greedy {
         assert_eq!(sink.handle_packet(&packets[0]), Ok(Delivery::Incomplete));
     }
-    // Alone it may have all. Two that come have their shares, and its oldest messages give way.
+    // Alone a source may use all the room. When two come, each has its share, and the oldest messages of the first give
+    // way.
     let first = published(&mut sources[1], bytes(60_000), false);
     assert_eq!(sink.handle_packet(&first[0]), Ok(Delivery::Incomplete));
     assert_eq!(sink.incomplete(), 2);
     let second = published(&mut sources[2], bytes(60_000), false);
     assert_eq!(sink.handle_packet(&second[0]), Ok(Delivery::Incomplete));
     assert_eq!(sink.incomplete(), 3);
-    // It takes nothing back of them.
+    // The source does not displace them in return.
     for packets in &greedy[..3] {
         assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::PartialsFull));
     }

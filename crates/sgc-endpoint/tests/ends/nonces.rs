@@ -34,7 +34,7 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut dice = move |n: u32| rng.next_u32() % n;
         let (mut sealed, mut epoch, mut incarnation) = (SealedTexts::default(), 1, 0u8);
-        // So few that marks of what is gone go ahead of many an answer.
+        // So few that marks about lost messages precede many answers.
         let recovery = RecoveryLimits { messages_max: 6, bytes_max: 1 << 20 };
         let config = |id| SourceConfig { recovery, ..config(id, 4) };
         let mut source = source_with(suite, config(incarnation));

@@ -54,10 +54,10 @@ fn a_message_of_which_a_part_was_lost_is_asked_for_from_its_beginning() {
     assert_eq!(delivered(&mut sink, &large[..3]).len(), 0);
     let next = published(&mut source, bytes(1), false);
     assert_eq!(sink.handle_packet(&next[0]), Ok(Delivery::NeedsHistory(source.id())));
-    // The rest comes late over another way, while the answer is under way.
+    // The rest comes late over another route, while the answer is in flight.
     assert_eq!(sink.handle_packet(&large[3]), Err(SinkDrop::AwaitingHistory));
     assert_eq!(recovered(&mut source, &mut sink), [bytes(100_000), bytes(1)]);
-    // A part of the next is no gap as long as nothing came after it.
+    // A part of the next message is no gap as long as nothing came after it.
     let large = published(&mut source, bytes(50_000), false);
     assert_eq!(sink.handle_packet(&large[1]), Ok(Delivery::Incomplete));
     assert_eq!(delivered(&mut sink, &large), [bytes(50_000)]);
@@ -109,11 +109,11 @@ fn a_late_joiner_gets_its_depth_though_more_is_kept() {
     let mut sink =
         Sink::new(NAME, SINK, grant(SUITE, 1, &announced(&[&source])), true, SinkLimits::default());
     assert_eq!(recovered(&mut source, &mut sink), [4, 5].map(bytes));
-    // Nor more to one that begins anew.
+    // A sink that begins anew gets no more either.
     sink.forget(&source.id());
     assert_eq!(sink.ask(source.id()), Some(0));
     assert_eq!(delivered(&mut sink, &replayed(&mut source)), [4, 5].map(bytes));
-    // Of a volatile topic it is nothing.
+    // A volatile topic has no history.
     let mut source = source_with(SUITE, config(6, 0));
     published(&mut source, bytes(1), false);
     let mut fresh = self::sink(SUITE, &[&source]);
@@ -186,7 +186,7 @@ fn an_answer_with_a_hole_is_asked_for_again() {
     assert_eq!(sink.unsynced().count(), 1, "its end says nothing");
     assert_eq!(sink.ask_again(source.id()), AskAgain::From(4));
     assert_eq!(recovered(&mut source, &mut sink), [4, 5, 6, 7, 8].map(bytes));
-    // One of which the end was lost shows with the next message.
+    // A message whose last fragment was lost shows with the next message.
     for n in 9..=12 {
         published(&mut source, bytes(n), false);
     }

@@ -1,8 +1,8 @@
-//! One association: DTLS with one peer, the verdict on its certificate, and the few words that are exchanged before QUIC.
+//! One association: DTLS with one peer, the verdict on its certificate, and the few messages before QUIC.
 //!
-//! Callers give it records and the time, and take what it put into the [`Sink`]. It knows no socket and no other
-//! association; which datagrams are its own is decided in [`super::mux`]. Nothing that a peer sends is handed on before
-//! its certificate was verified.
+//! Callers give it records and the time, and take its output from the [`Sink`]. It knows no socket and no other
+//! association; [`super::mux`] decides which datagrams belong to it. Nothing that a peer sends is handed on before its
+//! certificate was verified.
 
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
@@ -28,22 +28,23 @@ const FLIGHT_BYTES_MAX: usize = 1150;
 /// First wait for an answer to a flight; it doubles.
 const FLIGHT_RTO: Duration = Duration::from_millis(400);
 const FLIGHT_RETRIES: usize = 8;
-/// dimpl's own limit, which ours comes before.
+/// dimpl's own limit; ours comes first.
 const DIMPL_TIMEOUT: Duration = Duration::from_secs(120);
-/// How often a dialer asks for its id at first; it doubles.
+/// First interval of a dialer's questions for its id; it doubles.
 const ASK_INTERVAL: Duration = Duration::from_millis(200);
-/// How long a dialer that is refused may take to say that it refuses, too: whose word comes first is what is reported.
+/// Time that a refused dialer may take to send its own refusal: the first of the two is reported.
 const WORD_PATIENCE: Duration = Duration::from_secs(1);
-/// How often the clock of DTLS is set where no timer is due.
+/// Interval of setting the clock of DTLS where no timer is due.
 const CLOCK_INTERVAL: Duration = Duration::from_millis(20);
-/// How often a refusal is said: it is not acknowledged.
+/// Number of copies of a refusal, which is not acknowledged.
 const REFUSAL_COPIES: usize = 2;
-/// Longest datagram that is given to dimpl, bytes. A node's own flights have at most [`FLIGHT_BYTES_MAX`], and a sealed
-/// packet of QUIC is shorter than 1500.
+/// Longest datagram for dimpl, bytes. A node's own flights have at most [`FLIGHT_BYTES_MAX`], and a sealed packet of
+/// QUIC is shorter than 1500.
 const DATAGRAM_BYTES_MAX: usize = 2048;
-/// Most datagrams that dimpl keeps of messages that are not complete.
+/// Most datagrams of incomplete messages that dimpl keeps.
 const QUEUE_RX_DATAGRAMS: usize = 30;
-/// Most datagrams of a flight of ours. A peer's cookie, which a dialer repeats, fills any number of them with a record each.
+/// Most datagrams of a flight of ours. A dialer repeats a peer's cookie, which fills any number of them with a record
+/// each.
 const QUEUE_TX_DATAGRAMS: usize = 10;
 /// Most records of a flight of ours: one more, and dimpl panics (`dtls13/engine.rs`, `flight_saved_records`).
 const FLIGHT_RECORDS_MAX: usize = 12;

@@ -365,8 +365,8 @@ impl Mux {
             let tables = lock(&self.tables);
             (tables.pending.get(&remote).cloned(), tables.routes.get(&remote).cloned())
         };
-        // A hello that anybody can send in a peer's name does not disturb an established association. Records of an
-        // established association start no handshake.
+        // Anybody can send a hello in a peer's name, so it does not disturb an established association. Nor do records of
+        // that association disturb a handshake from the same address.
         let peer = match (pending, route) {
             (Some(pending), Some(route)) if !front::has_plaintext(records) => {
                 if self.feed(&route, records, meta, now, sink, data) {

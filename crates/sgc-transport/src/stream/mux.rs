@@ -658,7 +658,7 @@ impl Mux {
         }
     }
 
-    /// Returns `true` if a transmission would announce credit for read bytes.
+    /// Returns `true` if a transmission would carry news of read data: credit, ended flows, or room for flows.
     pub(crate) fn has_news(&self) -> bool {
         let Limits { link_window, flows_max, .. } = self.limits;
         !self.news.is_empty()

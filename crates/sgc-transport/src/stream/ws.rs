@@ -149,7 +149,7 @@ async fn read_head(wire: &mut Wire) -> io::Result<Option<(String, BytesMut)>> {
             bytes.advance(END.len());
             return Ok(String::from_utf8(head.to_vec()).ok().map(|head| (head, bytes)));
         }
-        // A peer that speaks another protocol, TLS for instance, sends no head.
+        // A peer that speaks another protocol, TLS for instance, sends no head; it is not waited for.
         if bytes.len() >= HTTP_HEAD_BYTES_MAX || bytes.first().is_some_and(|b| !b.is_ascii_uppercase()) {
             return Ok(None);
         }

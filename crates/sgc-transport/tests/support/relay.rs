@@ -11,7 +11,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-/// How many datagrams later one that is reordered comes.
+/// Number of datagrams by which a reordered one is late.
 const REORDER_DEPTH: usize = 4;
 
 /// The relay's treatment of datagrams from now on; permille.
@@ -23,7 +23,7 @@ pub struct Impairment {
     pub longest: AtomicU32,
     /// Alters one byte of the next long datagram towards the dialer.
     pub flip: AtomicBool,
-    /// Keeps what goes by.
+    /// Keeps the passing datagrams.
     pub tap: AtomicBool,
     pub seen: Mutex<Vec<Vec<u8>>>,
     pub forwarded: AtomicU64,
@@ -49,7 +49,7 @@ impl Relay {
         Self { addr, impairment, new_port, _tasks: tasks }
     }
 
-    /// The listener sees another port from now on, and what it sends to the old one is lost.
+    /// The listener sees another port from now on, and its datagrams to the old one are lost.
     pub fn change_port(&self) {
         self.new_port.notify_one();
     }

@@ -37,7 +37,7 @@ impl LongCertificate {
     }
 }
 
-/// A meeting of a stranger with a dialer or listener.
+/// A stranger's observations of one handshake.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct HandshakeLog {
     /// The certificate that it was shown, DER.
@@ -126,7 +126,7 @@ pub fn visit(
     end.met
 }
 
-/// A listener that is nobody, for as long as it lives.
+/// A listener without an identity, for as long as it lives.
 pub struct FakeListener {
     pub addr: SocketAddr,
     stop: Arc<AtomicBool>,
@@ -166,7 +166,7 @@ impl FakeListener {
         Self { addr, stop, thread: Some(thread) }
     }
 
-    /// Returns its encounters.
+    /// Stops it, and returns its observations.
     pub fn stop(mut self) -> Vec<HandshakeLog> {
         self.stop.store(true, Relaxed);
         self.thread.take().unwrap().join().unwrap()
