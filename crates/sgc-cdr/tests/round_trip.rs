@@ -1,4 +1,4 @@
-//! Random types with random values: whatever way a message takes, it is the same behind it.
+//! Random types with random values: every conversion of a message gives the same message back.
 #![allow(clippy::unwrap_used)]
 
 use std::fmt::Write as _;
@@ -133,7 +133,7 @@ impl Random {
                 let mut units: Vec<u16> = (0..self.below(bound.unwrap_or(8).min(8) + 1))
                     .map(|_| self.pick(&[0x61, 0, 0xfc, 0xd83d, 0xde00, 0xdc80, 0xffff]))
                     .collect();
-                // One at the end would be taken for what ends it.
+                // A NUL at the end would be taken for the terminator.
                 while units.last() == Some(&0) {
                     units.pop();
                 }
@@ -146,7 +146,7 @@ impl Random {
     }
 }
 
-/// Equal in every bit: `==` of floats is not.
+/// Equal in every bit, unlike `==` of floats.
 fn same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Float32(a), Value::Float32(b)) => a.to_bits() == b.to_bits(),
@@ -238,7 +238,7 @@ fn large_messages_take_no_more_than_their_bytes() {
     let payload = Bytes::from(image.encode(&value).unwrap());
     let Some(Value::Octets(found)) = image.decode(&payload).unwrap().at("data") else { panic!("octets") };
     assert_eq!(found, data);
-    // It is the payload's memory.
+    // The value shares the payload's memory.
     assert!(payload.as_ptr_range().contains(&found.as_ptr()));
     let cbor = Bytes::from(value.to_cbor());
     assert_eq!(image.from_cbor(&cbor).unwrap(), value);
@@ -270,7 +270,7 @@ fn a_false_size_takes_no_memory() {
     assert!(matches!(problem("[".repeat(1 << 20)), ValueProblem::Syntax(_)));
     assert!(matches!(problem(format!("{{\"data\":{}", "[".repeat(1 << 20))), ValueProblem::Syntax(_)));
     assert!(matches!(problem("{\"layout\":".repeat(1 << 18)), ValueProblem::Unknown(_)));
-    // Few bytes of what is left out become many values.
+    // A few bytes with missing members become many values.
     let objects = format!("{{\"layout\":{{\"dim\":[{}{{}}]}}}}", "{},".repeat(VALUES_MAX / 3));
     assert!(matches!(problem(objects), ValueProblem::TooManyValues | ValueProblem::TooLarge));
     // Deep CBOR ends where the type does.

@@ -19,7 +19,7 @@ use sgc_wire::{
 const NAME: Name = Name([1; 32]);
 const ROUNDS: usize = 41;
 
-/// Numbers that look random and are the same each time.
+/// Returns numbers that look random and are the same each time.
 struct Dice(u64);
 
 impl Dice {

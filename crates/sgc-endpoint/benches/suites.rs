@@ -13,7 +13,7 @@ use sgc_wire::{Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkI
 
 const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
-/// How long one configuration is measured, of all suites together.
+/// Time for which one configuration is measured, of all suites together.
 const MEASURE: Duration = Duration::from_millis(1500);
 const ROUNDS_MIN: usize = 5;
 

@@ -275,7 +275,7 @@ pub enum EndpointDrop {
     #[error("grant not usable: {0}")]
     Grant(#[from] GrantError),
     /// A frame without a purpose here.
-    #[error("{what} that concerns nothing here")]
+    #[error("unexpected {what}")]
     Unexpected {
         /// Kind of frame.
         what: &'static str,

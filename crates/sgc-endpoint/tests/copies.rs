@@ -17,7 +17,7 @@ use sgc_wire::{
 #[global_allocator]
 static COUNTING: CountingAllocator = CountingAllocator;
 
-/// Bytes that were allocated meanwhile.
+/// Returns the bytes that were allocated meanwhile.
 fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
     let (taken, result) = allocations(work);
     (taken.bytes, result)
@@ -66,7 +66,7 @@ fn deliver(sink: &mut Sink, packets: &[Packet]) -> Vec<Bytes> {
     packets.iter().filter_map(payload).collect()
 }
 
-/// Bytes taken at the source and at the sink, a message.
+/// Bytes allocated at the source and at the sink, per message.
 fn measure(suite: Suite, bytes: usize, at_once: usize, history: usize) -> (usize, usize) {
     let (mut source, mut sink) = ends(suite, history);
     let payload = Bytes::from(vec![7; bytes]);

@@ -134,13 +134,13 @@ pub enum LinkClose {
     #[error("the peer's certificate is revoked")]
     Revoked,
     /// The node's certificate has expired.
-    #[error("the peer's certificate has ended")]
+    #[error("the peer's certificate has expired")]
     Expired,
     /// The node has too many links.
     #[error("the peer has too many links")]
     TooMany,
     /// The peer sent too many bodies that do not verify.
-    #[error("the peer keeps sending what does not verify")]
+    #[error("the peer keeps sending bodies that do not verify")]
     Forgeries,
 }
 
@@ -167,14 +167,14 @@ pub enum DropReason {
         why: SignedError,
     },
     /// A node that carries nobody else's names advertised for another owner.
-    #[error("advertises names of {owner:?}, which is another node")]
+    #[error("advertises names of another node, {}", owner.short())]
     NotOwner {
         /// The owner in the advertisement.
         owner: NodeId,
     },
     /// An answer that no known key of the owner signed. Its sink asks again, and the neighbour is asked for the owner's
     /// advertisement: the owner may have another certificate by now.
-    #[error("answer is not signed with a key of {owner:?} that is known here")]
+    #[error("answer is not signed with a known key of node {}", owner.short())]
     OwnerKey {
         /// The owner of the name.
         owner: NodeId,
@@ -201,10 +201,10 @@ pub enum DropReason {
     #[error("too many questions for names are under way")]
     QuestionsFull,
     /// The neighbour has brought too many announcements without news; this one was not looked at.
-    #[error("brings too many announcements that are old")]
+    #[error("brings too many old announcements")]
     StaleFlood,
     /// A frame for an unknown name or sink.
-    #[error("{what} for a name or sink that is unknown here")]
+    #[error("{what} for an unknown name or sink")]
     Unknown {
         /// Kind of frame.
         what: &'static str,

@@ -56,7 +56,7 @@ fn main() {
     });
 }
 
-/// CPU time of the process's threads until now, nanoseconds: less than the clock's it depends on what else runs.
+/// Returns the CPU time of the process's threads until now, nanoseconds: other load affects it less than the clock.
 fn cpu_ns() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").unwrap().flatten();
     let times = tasks.filter_map(|t| std::fs::read_to_string(t.path().join("schedstat")).ok());

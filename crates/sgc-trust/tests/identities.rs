@@ -331,7 +331,7 @@ fn a_node_whose_certificate_is_a_cas_is_refused_and_so_is_what_it_signs() {
     let forged = leaf.signed_by(&KeyPair::generate().unwrap(), &robot_as_ca).unwrap().into();
     assert_eq!(ca.anchors.verify(&[forged, robot], NOW).unwrap_err(), CertError::NodeIsCa);
 
-    // A CA that names no node is one that its owner may have made.
+    // The owner of a CA that names no node may have made it.
     let (below, below_as_ca) = ca_below(&top, &["https://example.com"]);
     let good = leaf.signed_by(&KeyPair::generate().unwrap(), &below_as_ca).unwrap().into();
     assert_eq!(ca.anchors.verify(&[good, below], NOW).unwrap().pseudonym, Pseudonym([1; 32]));
@@ -439,7 +439,7 @@ fn debug_output_tells_no_secret() {
     for line in text.lines().filter(|l| l.len() == 64) {
         assert!(!shown.contains(line));
     }
-    // Errors of broken files tell none either.
+    // Errors of broken files reveal no secret either.
     let broken = text.replace("SGC FLEET SECRET", "SGC NOBODY KNOWS");
     let error = format!("{:?}", Identity::parse(&broken).unwrap_err());
     assert_eq!(error, "UnknownBlock(\"SGC NOBODY KNOWS\")");

@@ -96,7 +96,7 @@ fn sealed_packets_match_the_vectors() {
         assert!(vector.headers.last().is_some_and(|h| h.to == Some(SINK)));
         let random = matches!(vector.suite.name().split('-').next(), Some("paper"));
         for ((header, ours), theirs) in vector.headers.iter().zip(payloads(&vector)).zip(&vector.payloads) {
-            // RSASSA-PSS is random: all but the signature, whose length is that of the modulus.
+            // RSASSA-PSS is random: everything but the signature is compared, whose length is that of the modulus.
             let signature = if !random {
                 0
             } else if vector.suite.name().contains("3072") {
