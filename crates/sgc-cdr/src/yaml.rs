@@ -12,7 +12,7 @@ pub struct YamlStyle {
 }
 
 impl Default for YamlStyle {
-    /// As `ros2 topic echo` does without `--full-length`.
+    /// Returns the style of `ros2 topic echo` without `--full-length`.
     fn default() -> Self {
         Self { elements: Some(128) }
     }

@@ -154,7 +154,7 @@ impl CallLoss {
     }
 }
 
-/// A call that is not answered, and whose it was: a local call at the node that called, a source at the owner.
+/// A call that is not answered, with its caller: a local call at the calling node, a source at the owner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LostCall<W> {
     /// The reason.
@@ -163,7 +163,7 @@ pub struct LostCall<W> {
     pub of: W,
 }
 
-/// Why a local call is not taken.
+/// The reason why a local call is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CallRefusal {
     /// Too many of this client wait for their answers.
@@ -203,7 +203,7 @@ struct Open<L> {
 pub enum Outcome<L> {
     /// The message belongs to no open call, or is its second answer.
     Nothing,
-    /// It answers this local call.
+    /// The answer of this local call.
     Answers(L),
     /// The call has to be published again.
     Again(Bytes),
@@ -725,7 +725,7 @@ mod tests {
         Answerer::new(CallLimits::default())
     }
 
-    /// The only server.
+    /// Returns the only server.
     fn one() -> BTreeSet<u8> {
         BTreeSet::from([0])
     }

@@ -19,7 +19,7 @@ const LZ4_RATIO_MAX: usize = 255;
 /// The reason why a payload was not decompressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CompressionError {
-    /// It claims to be longer than any message.
+    /// The payload claims to be longer than any message.
     #[error("a compressed payload that claims {0} bytes")]
     TooLong(u32),
     /// Malformed data, or another length than claimed.

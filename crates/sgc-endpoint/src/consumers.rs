@@ -26,7 +26,7 @@ pub(crate) struct ConsumerAsker {
     told: Option<Vec<Consumer>>,
 }
 
-/// Name at which `node` is asked for its consumers.
+/// Returns the name at which `node` is asked for its consumers.
 pub(crate) fn consumers_name(node: &NodeId) -> (Name, Blind) {
     let blind = consumers_blind(node);
     (name_of(node, &blind), blind)

@@ -1,7 +1,7 @@
-//! How often a payload is copied on its way: once at the source, into the packets, and once at the sink, into the message.
+//! Copies of a payload on its way: one at the source, into the packets, and one at the sink, into the message.
 //!
-//! A copy needs a place. An allocator that counts sees each that is made, on this thread; so what a message takes beyond
-//! its own length says whether there is a second one. `-- --nocapture` prints it.
+//! Every copy is an allocation, and a counting allocator sees those of this thread; so the memory of a message beyond
+//! its own length shows whether there is a second copy. `-- --nocapture` prints it.
 #![allow(clippy::print_stderr, reason = "what was counted is of use")]
 
 use bytes::Bytes;
@@ -26,7 +26,7 @@ fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
 const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
-/// So many small messages share a piece of memory at the source: with fewer than these it would count once too often, or
+/// Number of small messages that share a piece of memory at the source: with fewer it would count once too often, or
 /// not at all.
 const ROUNDS: usize = 8;
 /// Bytes of a packet and a message besides their payload: header, head, tag, counters of references, a signature and

@@ -8,7 +8,7 @@ use crate::LinkId;
 /// The compiled trees of one name at this node: one, and for a while a second one after a route change.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FibEntry {
-    /// By the link towards the owner, ascending.
+    /// The trees, ascending by their link towards the owner.
     pub trees: SmallVec<[Tree; 1]>,
     /// The link towards each sink, ascending by sink, for packets to one sink.
     pub sinks: Vec<(SinkId, LinkId)>,

@@ -315,7 +315,7 @@ pub struct Router {
     /// The links to each neighbour, ascending.
     pub(crate) links_of: BTreeMap<NodeId, SmallVec<[LinkId; 2]>>,
     allowances: BTreeMap<NodeId, Allowance>,
-    /// With this many allowances the router looks for unused ones.
+    /// Number of allowances at which the router looks for unused ones.
     allowances_max: usize,
     pub(crate) topology: Topology,
     pub(crate) names: Names,

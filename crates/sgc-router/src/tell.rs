@@ -47,9 +47,9 @@ impl Room {
 }
 
 impl Router {
-    /// Tells a router that just greeted what is known of the network and of names.
+    /// Begins to tell a router that just greeted the state of the network and of names.
     pub(crate) fn begin_sync(&mut self, link: LinkId) {
-        // This node's own link state comes first: ways to it wait for that.
+        // This node's own link state comes first: routes to it wait for that.
         if let Some(record) = self.topology.node(&self.config.node) {
             let signed = record.signed.clone();
             self.send(link, Control::LinkState { signed });
@@ -61,7 +61,7 @@ impl Router {
         self.continue_sync(link);
     }
 
-    /// Tells the next part, and asks to hear when the link has taken it if there is more.
+    /// Tells the next part, and asks for a notice when the link has taken it if there is more.
     pub(crate) fn continue_sync(&mut self, link: LinkId) {
         let Some(mut sync) = self.links.get_mut(&link).and_then(|state| state.sync.take()) else {
             return;
@@ -98,7 +98,7 @@ impl Router {
         }
     }
 
-    /// The next link state that a neighbour is told unasked.
+    /// Returns the next link state for a neighbour that did not ask.
     fn next_node(&self, after: Option<NodeId>) -> Option<(NodeId, SignedBody)> {
         if !self.config.transit {
             return None;
@@ -114,7 +114,7 @@ impl Router {
         told.map(|(node, record)| (*node, record.signed.clone()))
     }
 
-    /// Passes on an advertisement or withdrawal that is news, now or when the allowance of its owner permits.
+    /// Passes on a new advertisement or withdrawal, now or when the allowance of its owner permits.
     pub(crate) fn pass_on_or_wait(&mut self, link: LinkId, owner: &NodeId, id: RecordId) {
         let now = self.now.instant;
         if link == LinkId::LOCAL || self.allowance(owner).may_announce(now) {
@@ -126,7 +126,7 @@ impl Router {
         }
     }
 
-    /// Passes on a link state that is news, now or when the allowance of its node permits.
+    /// Passes on a new link state, now or when the allowance of its node permits.
     pub(crate) fn pass_on_node_or_wait(&mut self, link: LinkId, node: &NodeId) {
         let now = self.now.instant;
         if self.allowance(node).may_announce(now) {
@@ -138,7 +138,7 @@ impl Router {
         }
     }
 
-    /// Passes on what waited for the allowance of its signer.
+    /// Passes on announcements that waited for the allowance of their signer.
     pub(crate) fn pass_on_late(&mut self, now: Now) {
         if self.late_at.take_if(|at| *at <= now.instant).is_none() {
             return;

@@ -209,7 +209,7 @@ impl PieceJoiner {
     }
 }
 
-/// A packet in one piece, as a datagram carries it, in memory of `slab`.
+/// Returns a packet in one piece, as a datagram carries it, in memory of `slab`.
 pub(crate) fn datagram(packet: &Packet, label: Option<Label>, slab: &mut Slab) -> Bytes {
     let mut out = slab.room(packet.encoded_bytes_as(label));
     packet.header.put_as(label, &mut out);
@@ -276,7 +276,7 @@ mod tests {
         Packet::new(header, Bytes::copy_from_slice(payload).into()).unwrap()
     }
 
-    /// The stream in pieces of `size` bytes.
+    /// Returns the stream in pieces of `size` bytes.
     fn pieces(stream: &[u8], size: usize) -> Pieces {
         let mut out = Pieces::default();
         stream.chunks(size).for_each(|c| out.push(Bytes::copy_from_slice(c)));

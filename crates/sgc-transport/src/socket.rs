@@ -151,7 +151,7 @@ impl BatchSocket {
     }
 }
 
-/// Has the runtime told of one direction of a socket only.
+/// Registers a socket with the runtime for one direction only.
 #[expect(
     deprecated,
     reason = "what replaces it is unsafe, for descriptors that close early; this one is the socket's own"

@@ -26,7 +26,7 @@ pub enum LabelError {
         /// Its length.
         bytes: usize,
     },
-    /// It starts with a dot, a dash or an underscore.
+    /// The name starts with a dot, a dash or an underscore.
     #[error("{kind} name {found:?} has to start with a letter or a digit")]
     Start {
         /// Node, group or fleet.

@@ -46,7 +46,7 @@ fn two_copies(nodes: &[&str]) -> (Fleet, Fleet) {
     (fleet, old)
 }
 
-/// With a list, if it is news.
+/// Returns the anchors with a list, if it is news.
 fn with(anchors: &TrustAnchors, list: &[u8], hours: u64) -> TrustAnchors {
     anchors.with_crl(list, at(hours)).unwrap().unwrap_or_else(|| anchors.clone())
 }

@@ -320,7 +320,7 @@ impl AssociationPair<'_> {
     }
 }
 
-/// A record of the script's own.
+/// Returns a record of the script's own.
 fn record(script: &mut Script<'_>) -> Vec<u8> {
     let mut record = vec![20 + script.byte() % 7, 0xfe, 0xfd, 0, script.byte() % 3, 0, 0, 0, 0, 0];
     record.push(script.byte());
@@ -330,7 +330,7 @@ fn record(script: &mut Script<'_>) -> Vec<u8> {
     record
 }
 
-/// The records of a datagram that have the head of unencrypted ones; the rest in one piece.
+/// Returns the records of a datagram that have the head of unencrypted ones; the rest in one piece.
 fn records(mut datagram: &[u8]) -> Vec<&[u8]> {
     let mut records = Vec::new();
     while !datagram.is_empty() {
@@ -347,7 +347,7 @@ fn records(mut datagram: &[u8]) -> Vec<&[u8]> {
     records
 }
 
-/// An unencrypted handshake record in pieces of so many bytes; any other as it is.
+/// Returns an unencrypted handshake record in pieces of this many bytes; any other unchanged.
 fn pieces(record: &[u8], bytes: usize) -> Vec<Vec<u8>> {
     let is_handshake = record.first() == Some(&22) && record.get(3..5) == Some(&[0, 0]);
     let whole = || vec![record.to_vec()];

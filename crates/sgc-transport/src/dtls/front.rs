@@ -7,7 +7,7 @@
 const ID: u8 = 0xc1;
 /// Asks the peer to prove that it receives at its address.
 const CHALLENGE: u8 = 0xc2;
-/// In front of a record: the proof.
+/// In front of a record: the token that proves the address.
 const TICKET: u8 = 0xc3;
 /// The association is not known here.
 const RESET: u8 = 0xc4;
@@ -53,7 +53,7 @@ pub(super) enum DatagramKind<'a> {
     Challenge(Token, Echo),
     Reset(Token),
     Busy(Echo),
-    /// With an alert (RFC 8446, 6.2).
+    /// A refusal with an alert (RFC 8446, 6.2).
     Refusal(u8, Echo),
 }
 

@@ -26,7 +26,7 @@ pub(crate) enum Flavor {
     Quic,
     /// Inside of DTLS.
     Dtls,
-    /// With packets that are authenticated and not encrypted.
+    /// Plain QUIC with packets that are authenticated and not encrypted.
     Udp,
 }
 

@@ -38,7 +38,7 @@ pub struct Relay {
 }
 
 impl Relay {
-    /// For one dialer.
+    /// Starts a relay for one dialer.
     pub async fn start(listener: SocketAddr, seed: u64) -> Self {
         let front = Arc::new(bind().await);
         let addr = front.local_addr().unwrap();
